@@ -29,6 +29,7 @@ from hybridkin import (
     load_model,
     save_model,
 )
+from hybridkin.hybrid._wrapped import in_columns
 from hybridkin.plots import BackboneDisplay
 from hybridkin.workflow import open_model, path_limits
 
@@ -302,8 +303,8 @@ def test_parts_add_up(crossing):
 
 
 def test_the_core_agrees_with_torch(crossing):
-    _, (model, _, log, _) = crossing
-    module = model.module_.rows()
+    case, (model, _, log, _) = crossing
+    module = in_columns(model.module_, case["output"])
     q = torch.from_numpy(model._effective(log.q, log.groups))
     with torch.no_grad():
         x, J = module.forward_and_jacobian(q)

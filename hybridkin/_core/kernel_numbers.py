@@ -23,7 +23,8 @@ KINDS = (
     "hybrid",
     "ik",
     "group_distance",
-    "adapted",
+    "moved",
+    "shifted",
     "projected",
 )
 ACTIVATIONS = ("logistic", "tanh", "sin", "gaussian")

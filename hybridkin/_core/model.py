@@ -187,6 +187,11 @@ class ForwardModel(PortableModule):
         return 0.0
 
     @property
+    def has_pose(self) -> bool:
+        """Whether the model has poses of the tip, as a `PoseModel`."""
+        return False
+
+    @property
     def robot(self) -> ForwardModel:
         """The model with the geometry: the mechanical model of a hybrid, else the model itself."""
         return self
@@ -269,6 +274,11 @@ class PoseModel(ForwardModel):
     """A forward model of the tip position that can also return the tip pose."""
 
     n_outputs: int = 3
+
+    @property
+    def has_pose(self) -> bool:
+        """Whether the model has poses of the tip."""
+        return True
 
     def pose(self, q: Tensor) -> Tensor:
         """Return the tip's pose in the measuring frame, shape (..., 4, 4)."""

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from typing_extensions import Self
 
 from hybridkin._core.arrays import identity
+from hybridkin._core.model import ForwardModel
 from hybridkin._core.rotations import (
     cross_matrix,
     nearest_rotation,
@@ -17,11 +21,16 @@ from hybridkin._core.rotations import (
     rotation_vector,
 )
 from hybridkin.chains.chain import Chain
-from hybridkin.hybrid._adapted import AdaptedModel, AdaptedPoseModel
 from hybridkin.hybrid._drift import MISFITS, SWITCH, too_far
 from hybridkin.hybrid._module import Hybrid
-from hybridkin.hybrid._pose import PoseHybrid
 from hybridkin.hybrid._rows import Rows
+from hybridkin.hybrid._wrapped import (
+    in_columns,
+    moved,
+    moved_points,
+    pose_difference,
+    shifted,
+)
 from hybridkin.native.library import evaluate
 
 PARAMETERS = ("base", "actuator_zeros")
@@ -34,14 +43,54 @@ _LARGE = 3.0  # ratio of remaining errors to those of the fit that gives a warni
 _SINGULAR = np.linalg.LinAlgError, torch.linalg.LinAlgError  # pyright: ignore
 
 
-def adapted(
+class Change(NamedTuple):
+    """A change of a robot since the fit: its model f(q) becomes T f(q + shift).
+
+    Attributes
+    ----------
+    shift : ndarray of shape (n,)
+        Shift of the actuator zeros [unit of q].
+    motion : ndarray of shape (4, 4)
+        T, the motion of the base in the measuring frame.
+    """
+
+    shift: NDArray
+    motion: NDArray
+
+    @classmethod
+    def none(cls, n: int) -> Self:
+        """Return the change of a robot of n actuators that has not changed."""
+        return cls(np.zeros(n), np.eye(4))
+
+    def after(self, model: ForwardModel) -> ForwardModel:
+        """Return a model after the change."""
+        return shifted(
+            moved(model, torch.from_numpy(self.motion)), torch.from_numpy(self.shift)
+        )
+
+    def before(self, rows: Rows, output: str) -> Rows:
+        """Return rows as they were before the change."""
+        tips = torch.from_numpy(rows.tips)
+        if not np.array_equal(self.motion, np.eye(4)):
+            motion = torch.linalg.inv(torch.from_numpy(self.motion))
+            if output == "pose":
+                turns = motion[:3, :3] @ rotation(tips[:, 3:])[0]
+                positions = moved_points(tips[:, :3], motion)
+                tips = torch.cat([positions, rotation_vector(turns)], dim=1)
+            else:
+                tips = moved_points(tips, motion)
+        X = rows.q.numpy() + self.shift
+        return replace(rows, X=X, y=tips.numpy().reshape(rows.y.shape))
+
+
+def likeliest_change(
     fitted: Hybrid,
     rows: Rows,
     noise: float,
     scale: NDArray,
     parameters: Sequence[str],
-) -> tuple[Hybrid, str | None]:
-    """Return the model after the most probable change, given new rows, and a warning or None.
+) -> tuple[Change, str | None]:
+    """Return the most probable change, given new rows, and a warning or None.
 
     The change theta = (rotation, translation, shift) is in natural units: a rotation about the base
     in radians, a translation of the base in reaches of the robot, a shift of an actuator zero in
@@ -68,16 +117,16 @@ def adapted(
     problem = _Problem(fitted, rows, scale)
     try:
         with np.errstate(over="raise", invalid="raise"):
-            theta, residual = _likeliest_change(problem, rows.groups, noise, parameters)
+            theta, residual = _least_cost(problem, rows.groups, noise, parameters)
             rms = float(np.sqrt(np.mean(residual**2)))
     except (ArithmeticError, *_SINGULAR) as error:
         raise too_far() from error
     if not np.isfinite(theta).all():
         raise too_far()
-    return (problem.model(theta) if theta.any() else fitted), _misfit(rms, noise)
+    return problem.change(theta), _misfit(rms, noise)
 
 
-def _likeliest_change(
+def _least_cost(
     problem: _Problem, groups: NDArray | None, noise: float, parameters: Sequence[str]
 ) -> tuple[NDArray, NDArray]:
     """Return the most probable change theta, and the residual after it, relative to the noise."""
@@ -133,6 +182,7 @@ class _Problem:
 
     def __init__(self, fitted: Hybrid, rows: Rows, scale: NDArray) -> None:
         self.fitted = fitted
+        self.output = "pose" if fitted.has_pose else "position"
         self.q = rows.q
         self.y = torch.from_numpy(rows.tips)
         self.measured = ~np.isnan(rows.tips)
@@ -144,17 +194,15 @@ class _Problem:
             self.reach = float(robot.reach)
         self.scale = torch.from_numpy(scale)
 
-    def model(self, theta: NDArray) -> AdaptedModel:
-        """Return the model after a change theta (6 + n,)."""
-        change = torch.from_numpy(theta)
-        R = rotation(change[:3])[0]
-        motion = identity(4, change)
+    def change(self, theta: NDArray) -> Change:
+        """Return the change for theta (6 + n,)."""
+        theta_in_torch = torch.from_numpy(theta)
+        R = rotation(theta_in_torch[:3])[0]
+        motion = identity(4, R)
         motion[:3, :3] = R
-        motion[:3, 3] = self.pivot - R @ self.pivot + self.reach * change[3:6]
-        shift = self.scale * change[6:]
-        if isinstance(self.fitted, PoseHybrid):
-            return AdaptedPoseModel(self.fitted, shift, motion)
-        return AdaptedModel(self.fitted, shift, motion)
+        way = self.pivot - R @ self.pivot + self.reach * theta_in_torch[3:6]
+        motion[:3, 3] = way
+        return Change((self.scale * theta_in_torch[6:]).numpy(), motion.numpy())
 
     def registered(self, noise: float) -> NDArray:
         """Return the best change of the base alone, as a start.
@@ -180,7 +228,7 @@ class _Problem:
         Both are zero for missing markers. Orientation errors of poses are in metres: one radian
         counts as the reach of the robot.
         """
-        model = self.model(theta).rows()
+        model = in_columns(self.change(theta).after(self.fitted), self.output)
         x, J = map(torch.from_numpy, evaluate(model, self.q.numpy(), jacobian=True))
         residual = self.y - x
         J = J * self.scale
@@ -192,9 +240,8 @@ class _Problem:
             arm = x.unflatten(1, (K, 3)) - centre
             A[..., :3] = (-cross_matrix(arm) @ spin).flatten(1, 2)
             A[..., 3:6] = self.reach * identity(3, x).repeat(K, 1)
-        if isinstance(self.fitted, PoseHybrid):
-            turn = rotation(self.y[:, 3:])[0] @ rotation(x[:, 3:])[0].mT
-            residual[:, 3:] = self.reach * rotation_vector(turn)
+        if self.output == "pose":
+            residual[:, 3:] = self.reach * pose_difference(x, self.y)[:, 3:]
             A[:, 3:, :3] = spin
             A[:, 3:, 3:6] = 0.0
             A[:, 3:] *= self.reach

@@ -42,6 +42,8 @@ class Drift(NamedTuple):
         Their weighted products with the residuals [m].
     squares : ndarray of shape ()
         Weighted sum of the squared residuals [m^2].
+    alpha : float
+        The penalty; infinite: no correction.
     """
 
     center: NDArray
@@ -49,6 +51,7 @@ class Drift(NamedTuple):
     gram: NDArray
     moment: NDArray
     squares: NDArray
+    alpha: float = inf
 
     @classmethod
     def of_range(cls, q: Tensor, n_outputs: int) -> Drift:
@@ -84,7 +87,7 @@ class Drift(NamedTuple):
 
     def emptied(self) -> Drift:
         """Return the drift before any measurement."""
-        return Drift(*self[:2], *(0.0 * part for part in self[2:]))
+        return Drift(*self[:2], *(0.0 * part for part in self[2:5]))
 
     def likeliest_alpha(self, noise: float) -> float:
         """Return the penalty of largest evidence, infinite if no correction is as likely.
@@ -107,13 +110,13 @@ class Drift(NamedTuple):
         evidence -= 2.0 * SWITCH * (_ALPHAS < inf)  # offset and slope
         return float(_ALPHAS[evidence.max(0).argmax()])
 
-    def correction(self, alpha: float) -> AffineModule:
-        """Return the correction as a torch module q (..., n) -> (..., m)."""
-        readout = 0.0 * self.moment
-        if alpha < inf:
-            largest = self.gram.trace(axis1=1, axis2=2).max()
-            least = np.finfo(float).eps * largest + np.finfo(float).tiny
-            system = self.gram + max(alpha, least) * np.eye(len(readout))
-            readout = np.linalg.solve(system, self.moment.T[..., None])[..., 0].T
+    def correction(self) -> AffineModule | None:
+        """Return the correction as a torch module q (..., n) -> (..., m), None if it is zero."""
+        if self.alpha == inf:
+            return None
+        largest = self.gram.trace(axis1=1, axis2=2).max()
+        least = np.finfo(float).eps * largest + np.finfo(float).tiny
+        system = self.gram + max(self.alpha, least) * np.eye(len(self.moment))
+        readout = np.linalg.solve(system, self.moment.T[..., None])[..., 0].T
         coef = readout[1:].T / self.scale
         return AffineModule(coef, readout[0] - coef @ self.center)

@@ -37,7 +37,6 @@ from hybridkin.hybrid._guards import fit_guard
 from hybridkin.hybrid._kernel import tuned_kernel
 from hybridkin.hybrid._linearised import Pair
 from hybridkin.hybrid._module import (
-    Correction,
     HybridModule,
     InnerCorrection,
     TipCorrection,
@@ -85,7 +84,7 @@ class FittedError:
     ----------
     result : estimator, ReadoutFit, Blend, tuple or None
         What `HybridForwardModel.error_model_` shows; a tuple holds one for each marker.
-    corrections : tuple of (float, Correction)
+    corrections : tuple of (float, TipCorrection)
         Weights and guarded corrections.
     settled : ErrorModel
         The error model with the settings that were chosen, for fits to other rows.
@@ -95,7 +94,7 @@ class FittedError:
     """
 
     result: Any
-    corrections: tuple[tuple[float, Correction], ...]
+    corrections: tuple[tuple[float, TipCorrection], ...]
     settled: ErrorModel
     noise: float = nan
 
@@ -193,8 +192,7 @@ class FeatureModel(ErrorModel):
     def _fitted(self, fit: ReadoutFit, residuals: Residuals) -> FittedError:
         module = _on_moved_directions(fit.readout, residuals.directions)
         if self.coupling == "serial":
-            assert residuals.mechanical is not None
-            correction = InnerCorrection(residuals.mechanical, module)
+            correction = InnerCorrection(module)
         else:
             correction = TipCorrection(module)
         noise = fit.rmse / points(fit.residual).shape[2] ** 0.5
@@ -495,8 +493,8 @@ def _on_moved_directions(module: ForwardModel, directions: Directions) -> Forwar
 
 
 def _guarded(
-    correction: Correction, module: ForwardModel, residuals: Residuals
-) -> tuple[tuple[float, Correction], ...]:
+    correction: TipCorrection, module: ForwardModel, residuals: Residuals
+) -> tuple[tuple[float, TipCorrection], ...]:
     """Return the correction with its guard; without a mechanical model nothing would remain."""
     if residuals.mechanical is not None:
         q = residuals.rows.q

@@ -24,9 +24,8 @@ from hybridkin.hybrid._drift import too_far
 from hybridkin.hybrid._error_models import ErrorModel, FittedError, PerMarker, Residuals
 from hybridkin.hybrid._guards import GroupDistance, Plane
 from hybridkin.hybrid._module import Hybrid, HybridModule
-from hybridkin.hybrid._pose import WithPose, pose_errors
 from hybridkin.hybrid._rows import Rows, rare_marker
-from hybridkin.hybrid._stacked import Stacked
+from hybridkin.hybrid._wrapped import Stacked, WithPose, pose_errors
 
 _NEVER = 1e-9  # part of an actuator in the moved directions, if it never moves
 _COUNTS = 1e12  # largest ratio of weights; a smaller weight is lost in a float64 sum
@@ -68,7 +67,7 @@ class FittedHybrid(NamedTuple):
     def predict(self, X: NDArray) -> NDArray:
         """Return the tips (N, m) at actuator vectors (N, n) [m]."""
         with torch.no_grad():
-            return self.module.rows()(torch.from_numpy(X.astype(np.float64))).numpy()
+            return self.module(torch.from_numpy(X.astype(np.float64))).numpy()
 
 
 def fit_hybrid(spec: Spec, rows: Rows) -> FittedHybrid:

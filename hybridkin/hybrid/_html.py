@@ -24,8 +24,7 @@ def fitted_rows(model: Any) -> dict[str, object]:
     mechanical = model.mechanical_model_
     calibration = model.calibration_
     play = model.play_
-    fitted = model.module_.as_fitted
-    changed = fitted is not model.module_ or fitted.drift is not None
+    tested = model.fitted_module_.tested
     domain = {None: "everywhere (no guard)", "box": "the training range of q"}
     domain = domain.get(model.guard, "close to the training rows (guard by leverage)")
     return {
@@ -36,11 +35,11 @@ def fitted_rows(model: Any) -> dict[str, object]:
         **_error(model),
         "training rows": f"{len(model._fitted_rows)} different rows",
         "domain": domain
-        + ", as far as held-out groups tested it" * (fitted.tested is not None),
+        + ", as far as held-out groups tested it" * (tested is not None),
         "radius": None if model.radius_ is None else _radius(model),
         "backlash": None if play is None else f"{numbers(play.width)} (unit of q)",
         "adapted": "after the fit; the errors are those of the fit"
-        if changed
+        if model.module_ is not model.fitted_module_
         else None,
         "calibration": None if calibration is None else {"": repr(calibration)},
         "geometry": None if mechanical is None else mechanical.html_rows(),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import cast
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
@@ -13,9 +13,7 @@ from typing_extensions import Self
 from hybridkin._core.blocks import in_blocks
 from hybridkin._core.model import ForwardModel, PortableModule
 from hybridkin._core.plan import CHAINS, NoKernel, Plan
-from hybridkin._core.plausible import PlausibleRows
 from hybridkin._core.stored import Layout, Stored
-from hybridkin.chains.chain import Chain
 from hybridkin.hybrid._guards import GroupDistance, Guard, LeverageGuard, Plane
 from hybridkin.learning.regressor_modules import AffineModule
 
@@ -40,8 +38,28 @@ class Inside:
         return self.mechanical.from_coordinates_and_jacobian(self.z)[1] @ self.slope
 
 
-# The weight g(q) of a correction (N, 1), if it is less than one anywhere, and dg/dq (N, 1, n).
-Fading = tuple[Tensor, Tensor]
+class Fading(NamedTuple):
+    """The weight g(q) of a correction (N, 1), and its slope dg/dq (N, 1, n)."""
+
+    weight: Tensor
+    slope: Tensor
+
+    @classmethod
+    def of(cls, guard: Guard, q: Tensor, distance: Tensor) -> Self | None:
+        """Return the fading at rows q (N, n) at this distance (N,), None if all weights are 1."""
+        fades = ~(distance <= guard.FULL)  # written so that NaN is included
+        rows = fades.nonzero()[:, 0]
+        if not len(rows):
+            return None
+        weight, slope = guard.weight_and_jacobian(q[rows])
+        weights = q.new_ones(len(q), 1).index_copy(0, rows, weight)
+        slopes = q.new_zeros(len(q), 1, q.shape[1]).index_copy(0, rows, slope)
+        return cls(weights, slopes)
+
+    def times(self, x: Tensor, J: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the weight times x (N, m), and its derivative from J = dx/dq (N, m, n)."""
+        return self.weight * x, self.weight[..., None] * J + x[..., None] * self.slope
+
 
 # A correction, its derivative and its fading.
 Guarded = tuple[Tensor, Tensor, Fading | None]
@@ -61,6 +79,7 @@ class TipCorrection(PortableModule):
     """
 
     layout = Layout("tip_correction", {}, parts=("module", "guard"))
+    inside = False
 
     def __init__(self, module: ForwardModel, guard: Guard | None = None) -> None:
         super().__init__()
@@ -68,7 +87,7 @@ class TipCorrection(PortableModule):
         self.guard = guard
 
     def value(self, q: Tensor, inside: Inside | None) -> Tensor:
-        """Return eps(q) at rows q (N, n), shape (N, m) [m]."""
+        """Return c(q) at rows q (N, n), shape (N, m) [m]."""
         return self.module(q)
 
     def guarded_and_jacobian(self, q: Tensor, inside: Inside | None) -> Guarded:
@@ -77,49 +96,39 @@ class TipCorrection(PortableModule):
         if guard is None:
             return *self.module.forward_and_jacobian(q), None
         if isinstance(guard, LeverageGuard) and guard.model is self.module:
+            # Value and leverage share the features.
             x, J, leverage = guard.model.forward_jacobian_and_leverage(q)
             distance = leverage / guard.limit.to(q)
         else:
             x, J = self.module.forward_and_jacobian(q)
             distance = guard.domain_distance(q)
-        fading = _fading(guard, q, distance)
+        fading = Fading.of(guard, q, distance)
         if fading is not None:
-            x, J = _weighed(x, J, *fading)
+            x, J = fading.times(x, J)
         return *guard.shortened_with_jacobian(x, J), fading
 
 
-class InnerCorrection(PortableModule):
+class InnerCorrection(TipCorrection):
     """A learned correction inside the robot, c(q) = F(z(q) + W phi(q)) - f(q); serial coupling.
 
     z and F are `coordinates` and `from_coordinates` of the mechanical model, so f(q) = F(z(q)).
 
     Parameters
     ----------
-    mechanical : ForwardModel
-        f, the same object as that of the hybrid.
-    readout : ForwardModel
+    module : ForwardModel
         W phi(q), the change of the inner coordinates [unit of z].
     guard : Guard or None
         Its weight and largest length. None: no limits.
     """
 
-    layout = Layout("inner_correction", {}, parts=("mechanical", "readout", "guard"))
-
-    def __init__(
-        self,
-        mechanical: ForwardModel,
-        readout: ForwardModel,
-        guard: Guard | None = None,
-    ) -> None:
-        super().__init__()
-        self.mechanical = mechanical
-        self.readout = readout
-        self.guard = guard
+    layout = Layout("inner_correction", {}, parts=("module", "guard"))
+    inside = True
 
     def value(self, q: Tensor, inside: Inside | None) -> Tensor:
         """Return F(z + W phi) - f at rows q (N, n), shape (N, m) [m]."""
         assert inside is not None
-        return self.mechanical.from_coordinates(inside.z + self.readout(q)) - inside.x
+        moved = inside.mechanical.from_coordinates(inside.z + self.module(q))
+        return moved - inside.x
 
     def guarded_and_jacobian(self, q: Tensor, inside: Inside | None) -> Guarded:
         """Return f + s (N, m) and its derivative (N, m, n) at rows q (N, n), and the fading.
@@ -127,24 +136,58 @@ class InnerCorrection(PortableModule):
         If no row fades or is too long, f + s = F(z + W phi) and df/dq is not needed.
         """
         assert inside is not None
-        delta, turn = self.readout.forward_and_jacobian(q)
-        x, columns = self.mechanical.from_coordinates_and_jacobian(inside.z + delta)
+        delta, turn = self.module.forward_and_jacobian(q)
+        x, columns = inside.mechanical.from_coordinates_and_jacobian(inside.z + delta)
         J = columns @ (inside.slope + turn)
         guard = self.guard
         if guard is None:
             return x, J, None
-        fading = _fading(guard, q, guard.domain_distance(q))
+        fading = Fading.of(guard, q, guard.domain_distance(q))
         if fading is None and not guard.is_long(x - inside.x).any():
             return x, J, None
         x = x - inside.x
         J = J - inside.jacobian
         if fading is not None:
-            x, J = _weighed(x, J, *fading)
+            x, J = fading.times(x, J)
         x, J = guard.shortened_with_jacobian(x, J)
         return inside.x + x, inside.jacobian + J, fading
 
 
-Correction = TipCorrection | InnerCorrection
+class Hybrid(ForwardModel):
+    """A mechanical model f plus what was learned of its residual, as it was fitted.
+
+    Attributes
+    ----------
+    mechanical : ForwardModel or None
+        f; None: zero.
+    tested : GroupDistance or None
+        Distance up to which held-out groups have tested the model.
+    """
+
+    mechanical: ForwardModel | None
+    tested: GroupDistance | None
+
+    @property
+    def robot(self) -> ForwardModel:
+        """The mechanical model, or the module itself without one."""
+        return self if self.mechanical is None else self.mechanical
+
+    @property
+    def corrects_inside(self) -> bool:
+        """Whether a correction acts inside the robot, see `InnerCorrection`."""
+        return False
+
+    def with_drift(self, drift: AffineModule) -> Self:
+        """Return the same model with another drift; this model does not change."""
+        raise NotImplementedError
+
+    def error_part(self, q: Tensor) -> Tensor:
+        """Return what was learned, corrections and drift, in the form of the residuals [m]."""
+        raise NotImplementedError
+
+    def error_weight(self, q: Tensor) -> Tensor:
+        """Return the weight of the learned part, shape (...)."""
+        raise NotImplementedError
 
 
 def _write_plan(plan: Plan, stored: Stored) -> int:
@@ -160,138 +203,36 @@ def _write_plan(plan: Plan, stored: Stored) -> int:
         raise NoKernel(
             f"the mechanical part {stored.part('mechanical').kind!r} is not a chain"
         )
-    corrections = stored.part("corrections").parts.values()
-    inside = [correction.kind == "inner_correction" for correction in corrections]
     entries = []
-    for correction, acts_inside in zip(corrections, inside, strict=True):
-        entries += _entries_of(plan, correction, acts_inside)
+    acts_inside = []
+    for correction in stored.part("corrections").parts.values():
+        acts_inside.append(correction.kind == "inner_correction")
+        entries += [acts_inside[-1], *_places_of(plan, correction)]
     weights = stored.array("weights")
-    left = 1.0 - weights[inside].sum()  # weight of f beside inner corrections
-    numbers = [weights, [left * (left > _ROUNDING), any(inside)]]
+    left = 1.0 - weights[acts_inside].sum()  # weight of f beside inner corrections
+    numbers = [weights, [left * (left > _ROUNDING), any(acts_inside)]]
     n, m = plan.lengths(base if base >= 0 else entries[1])
     return plan.node(
-        "hybrid", n, m, numbers, base, drift, tested, len(inside), *entries
+        "hybrid", n, m, numbers, base, drift, tested, len(weights), *entries
     )
 
 
-def _entries_of(
-    plan: Plan, correction: Stored, acts_inside: bool
-) -> tuple[bool, int, int]:
-    """Return whether a correction acts inside, and the places of its regressor and its guard."""
-    regressor = correction.part("readout" if acts_inside else "module")
+def _places_of(plan: Plan, correction: Stored) -> tuple[int, int]:
+    """Return the places of the regressor of a correction and of its guard; -1: no guard."""
+    regressor = correction.part("module")
     if "guard" not in correction.parts:
-        return acts_inside, plan.node_of(regressor), -1
+        return plan.node_of(regressor), -1
     guard = correction.part("guard")
     place = plan.node_of(guard)
     if [_content(part) for part in guard.parts.values()] == [_content(regressor)]:
-        # Value and leverage share the features.
-        return False, plan.entry(place, 0), place
-    return acts_inside, plan.node_of(regressor), place
+        return plan.entry(place, 0), place  # value and leverage share the features
+    return plan.node_of(regressor), place
 
 
 def _content(stored: Stored) -> tuple:
     """Return a tuple that is equal for equal descriptions without parts."""
     arrays = {name: array.tobytes() for name, array in stored.arrays.items()}
     return stored.kind, stored.settings, arrays
-
-
-class Hybrid(ForwardModel):
-    """A mechanical model f plus what was learned of its residual; the interface of all hybrids.
-
-    Attributes
-    ----------
-    mechanical : ForwardModel or None
-        f; None: zero.
-    drift : AffineModule or None
-        The change of the robot since the fit.
-    tested : GroupDistance or None
-        Distance up to which held-out groups have tested the model.
-    """
-
-    mechanical: ForwardModel | None
-    drift: AffineModule | None
-    tested: GroupDistance | None
-
-    @property
-    def robot(self) -> ForwardModel:
-        """The mechanical model, or the module itself without one."""
-        return self if self.mechanical is None else self.mechanical
-
-    @property
-    def tip_model(self) -> Hybrid:
-        """The hybrid of the tip alone: the last one of several markers, else this one."""
-        return self
-
-    @property
-    def corrects_inside(self) -> bool:
-        """Whether a correction acts inside the robot, see `InnerCorrection`."""
-        raise NotImplementedError
-
-    @property
-    def as_fitted(self) -> Hybrid:
-        """The model of the fit: this one, since the robot has not changed; see `AdaptedModel`."""
-        return self
-
-    @property
-    def shift_of_zeros(self) -> Tensor:
-        """Shift of the actuator zeros since the fit [unit of q]."""
-        return torch.zeros((), dtype=torch.float64, device="cpu")
-
-    @property
-    def longest_correction(self) -> Tensor | float:
-        """Upper bound of the distance from f(q) to x, infinite without guards, () [m]."""
-        raise NotImplementedError
-
-    def misses(self, x: Tensor, largest: Tensor) -> Tensor:
-        """Return how much farther targets are than f reaches with the longest correction."""
-        if self.mechanical is None:
-            return super().misses(x, largest)
-        return self.mechanical.misses(x, largest) - self.longest_correction
-
-    def after_change(self, fitted: Hybrid) -> Hybrid:
-        """Return another hybrid after the same change of the robot: none."""
-        return fitted
-
-    def before(self, q: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        """Return rows q (N, n) and y (N, m) as they were before the change."""
-        return q, y
-
-    def with_drift(self, drift: AffineModule | None) -> Self:
-        """Return the same model with another drift; this model does not change."""
-        raise NotImplementedError
-
-    def without_learned(self) -> Hybrid:
-        """Return the mechanical model alone, as a hybrid."""
-        raise NotImplementedError
-
-    @cached_property
-    def plausible_rows(self) -> PlausibleRows | None:
-        """Bounds of rows that the mechanical model does not warn about, if known."""
-        if isinstance(self.mechanical, Chain):
-            return self.mechanical.plausible_rows()
-        return None
-
-    def rows(self) -> Hybrid:
-        """Return the module whose outputs are the columns of measured y; for tips this module."""
-        return self
-
-    def mechanical_part(self, q: Tensor) -> Tensor:
-        """Return f(q), zero without a mechanical model, shape (..., m) [m]."""
-        if self.mechanical is None:
-            return 0.0 * self.error_part(q)
-        return self.mechanical(q)
-
-    def error_part(self, q: Tensor) -> Tensor:
-        """Return what is added to f(q), shape (..., m) [m]."""
-        raise NotImplementedError
-
-    def learned_error(self, q: Tensor) -> Tensor:
-        """Return the learned part in the form of `residuals`, poses as six numbers [m]."""
-        return self.error_part(q)
-
-    def error_weight(self, q: Tensor) -> Tensor:
-        """Return the weight of the learned part, shape (...)."""
-        raise NotImplementedError
 
 
 class HybridModule(Hybrid):
@@ -330,7 +271,7 @@ class HybridModule(Hybrid):
     def __init__(
         self,
         mechanical: ForwardModel | None,
-        corrections: Sequence[Correction],
+        corrections: Sequence[TipCorrection],
         weights: Tensor,
         drift: AffineModule | None = None,
         tested: GroupDistance | None = None,
@@ -343,17 +284,14 @@ class HybridModule(Hybrid):
         self.drift = drift
         self.tested = tested
         self.log_plane = log_plane
-        shape = mechanical
-        if shape is None and isinstance(corrections[0], TipCorrection):
-            shape = corrections[0].module
-        if shape is not None:
-            self.n_actuators = shape.n_actuators
-            self.n_outputs = shape.n_outputs
+        sized = corrections[0].module if mechanical is None else mechanical
+        self.n_actuators = sized.n_actuators
+        self.n_outputs = sized.n_outputs
 
     @property
     def corrects_inside(self) -> bool:
         """Whether a correction acts inside the robot, see `InnerCorrection`."""
-        return any(isinstance(c, InnerCorrection) for c in self.corrections)
+        return any(correction.inside for _, correction in self._parts())
 
     @property
     def plane(self) -> tuple[Tensor, Tensor] | None:
@@ -373,15 +311,17 @@ class HybridModule(Hybrid):
             longest = longest + weight * guard.MOST * guard.largest
         return longest
 
-    def with_drift(self, drift: AffineModule | None) -> Self:
+    def misses(self, x: Tensor, largest: Tensor) -> Tensor:
+        """Return how much farther targets are than f reaches with the longest correction."""
+        if self.mechanical is None:
+            return super().misses(x, largest)
+        return self.mechanical.misses(x, largest) - self.longest_correction
+
+    def with_drift(self, drift: AffineModule) -> Self:
         """Return the same model with another drift; this model does not change."""
         corrections = [correction for _, correction in self._parts()]
         arguments = self.weights, drift, self.tested, self.log_plane
         return type(self)(self.mechanical, corrections, *arguments)
-
-    def without_learned(self) -> HybridModule:
-        """Return the mechanical model alone, as a hybrid."""
-        return HybridModule(self.mechanical, [], self.weights[:0])
 
     def forward(self, q: Tensor) -> Tensor:
         """Return x of shape (..., m) [m]."""
@@ -404,9 +344,9 @@ class HybridModule(Hybrid):
         """Return the largest distance from the training rows of guards and groups, (...)."""
         return in_blocks(lambda rows: (self._distance(rows),), q)[0][..., 0]
 
-    def _parts(self) -> list[tuple[float, Correction]]:
+    def _parts(self) -> list[tuple[float, TipCorrection]]:
         """Return pairs of weight and correction."""
-        corrections = cast("list[Correction]", [*self.corrections])
+        corrections = cast("list[TipCorrection]", [*self.corrections])
         # Not tolist: before torch 2.5 it does not work in functional transforms.
         return [*zip(map(float, self.weights), corrections, strict=True)]
 
@@ -426,9 +366,9 @@ class HybridModule(Hybrid):
         return (learned,)
 
     def _learned(self, q: Tensor, inside: Inside | None) -> Tensor:
-        """Return the sum of corrections and drift at rows q, shape (N, m) [m]."""
+        """Return the sum of corrections and drift at rows q, (N, m); zero (N, 1) without [m]."""
         trust = q.new_ones(len(q), 1)
-        terms = []
+        total = q.new_zeros(len(q), 1)
         for weight, correction in self._parts():
             value = correction.value(q, inside)
             guard = correction.guard
@@ -436,12 +376,10 @@ class HybridModule(Hybrid):
                 inside_domain = guard(q)
                 value = guard.shortened(inside_domain * value)
                 trust = trust - weight * (1.0 - inside_domain)
-            terms.append(weight * value)
+            total = total + weight * value
         if self.drift is not None:
-            terms.append(trust * self.drift(q))
-        if not terms:
-            return 0.0 * self.mechanical_part(q)
-        return sum(terms[1:], terms[0])
+            total = total + trust * self.drift(q)
+        return total
 
     def _trust(self, q: Tensor) -> Tensor:
         """Return the error weight t(q) at rows q, shape (N, 1)."""
@@ -463,17 +401,17 @@ class HybridModule(Hybrid):
     def _forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         inside = self._inside(q)
         total = self._mechanical_and_jacobian(q, inside)
-        fadings: list[tuple[float, Fading]] = []
+        trust = Fading(q.new_ones(1, 1), q.new_zeros(1, 1, 1))
         for weight, correction in self._parts():
             x, J, fading = correction.guarded_and_jacobian(q, inside)
             total = _plus(total, weight, x, J)
             if fading is not None:
-                fadings.append((weight, fading))
+                trust = Fading(
+                    trust.weight + weight * (fading.weight - 1.0),
+                    trust.slope + weight * fading.slope,
+                )
         if self.drift is not None:
-            x, J = self.drift.forward_and_jacobian(q)
-            if fadings:
-                x, J = _weighed(x, J, *_trust_of(fadings))
-            total = _plus(total, 1.0, x, J)
+            total = _plus(total, 1.0, *trust.times(*self.drift.forward_and_jacobian(q)))
         assert total is not None, "a hybrid needs a mechanical model or a correction"
         return total
 
@@ -484,36 +422,14 @@ class HybridModule(Hybrid):
         if inside is None:
             f = self.mechanical
             return None if f is None else f.forward_and_jacobian(q)
-        rest = 1.0
+        left = 1.0
         for weight, correction in self._parts():
-            if isinstance(correction, InnerCorrection):
-                rest -= weight
+            if correction.inside:
+                left -= weight
         # df/dq is needed only if the weights of inner corrections sum to less than 1.
-        if rest <= _ROUNDING:
+        if left <= _ROUNDING:
             return None
-        return rest * inside.x, rest * inside.jacobian
-
-
-def _fading(guard: Guard, q: Tensor, distance: Tensor) -> Fading | None:
-    """Return the weights of a correction and their slopes at rows q (N, n), None if all are 1."""
-    fades = ~(distance <= guard.FULL)  # written so that NaN is included
-    rows = fades.nonzero()[:, 0]
-    if not len(rows):
-        return None
-    weight, slope = guard.weight_and_jacobian(q[rows])
-    weights = q.new_ones(len(q), 1).index_copy(0, rows, weight)
-    return weights, q.new_zeros(len(q), 1, q.shape[1]).index_copy(0, rows, slope)
-
-
-def _trust_of(fadings: Sequence[tuple[float, Fading]]) -> Fading:
-    """Return the error weight of corrections with these weights and fadings, and its slope."""
-    weight, (fading, slope) = fadings[0]
-    trust = 1.0 + weight * (fading - 1.0)
-    total_slope = weight * slope
-    for weight, (fading, slope) in fadings[1:]:
-        trust = trust + weight * (fading - 1.0)
-        total_slope = total_slope + weight * slope
-    return trust, total_slope
+        return left * inside.x, left * inside.jacobian
 
 
 def _plus(
@@ -523,10 +439,3 @@ def _plus(
     if total is None:
         return weight * x, weight * J
     return torch.add(total[0], x, alpha=weight), torch.add(total[1], J, alpha=weight)
-
-
-def _weighed(
-    x: Tensor, J: Tensor, weight: Tensor, slope: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Return x (k, m) and J (k, m, n) times a weight (k, 1) of slope (k, 1, n)."""
-    return weight * x, weight[..., None] * J + x[..., None] * slope

@@ -14,18 +14,21 @@ from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.metrics import r2_score
 from sklearn.utils.validation import check_is_fitted
 
-from hybridkin._core.arrays import as_array
 from hybridkin._core.html import html_table
 from hybridkin._core.model import ForwardModel, as_forward_model
+from hybridkin._core.plausible import PlausibleRows
 from hybridkin._core.units import motion_message
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.play import PlayOperator
+from hybridkin.hybrid._adapt import Change
+from hybridkin.hybrid._drift import Drift
 from hybridkin.hybrid._fit import known_tips
 from hybridkin.hybrid._html import fitted_rows
 from hybridkin.hybrid._module import Hybrid
 from hybridkin.hybrid._radius import Radius
 from hybridkin.hybrid._range import TrainingRange
 from hybridkin.hybrid._rows import Rows
+from hybridkin.hybrid._wrapped import in_columns, pose_difference
 from hybridkin.learning.hidden_layer import check_inputs
 from hybridkin.native.library import evaluate
 
@@ -34,12 +37,16 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     """The prediction methods of a `HybridForwardModel`; they use only the results of `fit`."""
 
     output: str
-    module_: Hybrid
+    module_: ForwardModel
+    fitted_module_: Hybrid
+    change_: Change
     mechanical_model_: ForwardModel | None
     play_: PlayOperator | None
     radius_: Radius | None
     _single_output: bool
     _fitted_range: TrainingRange
+    _drift: Drift
+    _plausible_rows: PlausibleRows | None
 
     def predict(
         self, X: object, return_radius: bool = False, groups: ArrayLike | None = None
@@ -66,56 +73,56 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             the domain (`in_domain`), and everywhere if the fit had too few groups.
         """
         if not return_radius:
-            return self._evaluated(evaluate, X, groups)[0]
+            return self._evaluated(self._tips, X, groups)[0]
         check_is_fitted(self)
         if self.radius_ is None:
             raise ValueError(
                 "`return_radius` needs a model that was fitted with `coverage`, for example "
                 "HybridForwardModel(..., coverage=0.9); this one was fitted without."
             )
-        x, inside = self._evaluated(_with_domain, X, groups)
-        return x, self.radius_.at(inside).astype(x.dtype)
+        x, distance = self._evaluated(partial(self._tips, distance=True), X, groups)
+        return x, self.radius_.at(distance <= 1.0).astype(x.dtype)
 
     def predict_mechanical(
         self, X: ArrayLike, groups: ArrayLike | None = None
     ) -> NDArray:
         """Return the mechanical part f_mech(q), shaped like `predict` [m]."""
-        chain = None if self.output == "pose" else self.mechanical_model_
-        if chain is None:
-            return self._evaluated(_method("mechanical_part"), X, groups)[0]
-        return self._evaluated(lambda m, q: evaluate(chain, q), X, groups)[0]
+        return self._evaluated(self._mechanical_tips, X, groups)[0]
 
     def predict_error(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray:
         """Return the learned part w(q) eps(q), shaped like `predict` [m], rotations [rad]."""
-        return self._evaluated(_method("error_part"), X, groups, warn=False)[0]
+        return self._evaluated(self._tip_errors, X, groups, warn=False)[0]
 
     def score(
         self, X: ArrayLike, y: ArrayLike, sample_weight: ArrayLike | None = None
     ) -> float:
         """Return R^2 of `predict`, averaged over the columns of y, without missing markers."""
         x = self.predict(X)
-        n = len(np.asarray(y))
-        weights = np.ones(n) if sample_weight is None else np.asarray(sample_weight)
-        both = (np.asarray(values, dtype=float).reshape(n, -1).T for values in (y, x))
-        columns = [(a, b, ~np.isnan(a)) for a, b in zip(*both, strict=True)]
-        return float(
-            np.mean(
-                [r2_score(a[k], b[k], sample_weight=weights[k]) for a, b, k in columns]
-            )
+        measured = np.asarray(y, dtype=float).reshape(len(x), -1)
+        predicted = x.reshape(measured.shape)
+        weights = (
+            np.ones(len(x)) if sample_weight is None else np.asarray(sample_weight)
         )
+        scores = []
+        for column, expected in zip(measured.T, predicted.T, strict=True):
+            rows = ~np.isnan(column)
+            scores.append(
+                r2_score(column[rows], expected[rows], sample_weight=weights[rows])
+            )
+        return float(np.mean(scores))
 
     def jacobian(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray:
         """Return the full Jacobian dx/dq of the sum, shape (N, m, n) or, for 1-D y, (N, n).
 
         For poses, the last three rows give the angular velocity in the measuring frame.
         """
-        return self._evaluated(partial(evaluate, jacobian=True), X, groups)[1]
+        return self._evaluated(partial(self._tips, jacobian=True), X, groups)[1]
 
     def predict_and_jacobian(
         self, X: ArrayLike, groups: ArrayLike | None = None
     ) -> tuple[NDArray, NDArray]:
         """Return `predict(X)` and `jacobian(X)` in one pass."""
-        x, J = self._evaluated(partial(evaluate, jacobian=True), X, groups)
+        x, J = self._evaluated(partial(self._tips, jacobian=True), X, groups)
         return x, J
 
     def in_domain(
@@ -140,18 +147,20 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         inside : ndarray of bool of shape (N,)
             Without a guard all True, except along those directions.
         """
-        return self._evaluated(
-            partial(_with_domain, value=False), X, groups, warn=False
-        )[0]
+        distance = partial(self._tips, value=False, distance=True)
+        return self._evaluated(distance, X, groups, warn=False)[0] <= 1.0
 
     def error_weight(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray:
         """Return the weight w(q) in [0, 1] of the error model at each row, shape (N,)."""
-        return self._evaluated(_method("error_weight"), X, groups, warn=False)[0]
+        weight = as_forward_model(self.fitted_module_.error_weight)
+        return self._evaluated(
+            lambda q: evaluate(weight, q + self.change_.shift), X, groups, warn=False
+        )[0]
 
     @property
     def training_range_(self) -> TrainingRange:
         """The range of q in the fit, where it lies after `adapt` [unit of q]."""
-        return self._fitted_range.moved(-as_array(self.module_.shift_of_zeros))
+        return self._fitted_range.moved(-self.change_.shift)
 
     @property
     def _repr_html_(self) -> Callable[[], str]:
@@ -189,7 +198,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Negative lengths are extrapolation, no error.
         """
         chain = self.mechanical_model_
-        plausible = self.module_.plausible_rows
+        plausible = self._plausible_rows
         if not isinstance(chain, Chain) or (plausible and plausible.hold(q)):
             return []
         rows = torch.from_numpy(q)
@@ -204,14 +213,48 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             X, np.zeros(len(X)) if groups is None else groups
         )
 
+    def _follow_robot(self) -> None:
+        """Set the module and its mechanical model after the change and the drift of the robot."""
+        hybrid = self.fitted_module_
+        mechanical = hybrid.mechanical
+        drift = self._drift.correction()
+        if drift is not None:
+            hybrid = hybrid.with_drift(drift)
+        self.module_ = self.change_.after(hybrid)
+        if mechanical is not None:
+            mechanical = self.change_.after(mechanical)
+        self.mechanical_model_ = mechanical
+        self._plausible_rows = None
+        if isinstance(mechanical, Chain):
+            self._plausible_rows = mechanical.plausible_rows()
+
+    def _tips(self, q: NDArray, **results: bool) -> tuple[NDArray, ...]:
+        """Return the tips of rows q (N, n), or other `results` of `evaluate`."""
+        return evaluate(in_columns(self.module_, self.output), q, **results)
+
+    def _mechanical_tips(self, q: NDArray) -> tuple[NDArray, ...]:
+        """Return f_mech(q) of rows q (N, n), zero without a mechanical model."""
+        if self.mechanical_model_ is None:
+            return (0.0 * self._tips(q)[0],)
+        return evaluate(in_columns(self.mechanical_model_, self.output), q)
+
+    def _tip_errors(self, q: NDArray) -> tuple[NDArray, ...]:
+        """Return the way from f_mech(q) to the tips of rows q (N, n)."""
+        before = self._mechanical_tips(q)[0]
+        after = self._tips(q)[0]
+        if self.output == "pose":
+            ways = pose_difference(torch.from_numpy(before), torch.from_numpy(after))
+            return (ways.numpy(),)
+        return (after - before,)
+
     def _evaluated(
         self,
-        function: Callable[[Hybrid, NDArray], Sequence[NDArray]],
+        function: Callable[[NDArray], Sequence[NDArray]],
         X: object,
         groups: ArrayLike | None,
         warn: bool = True,
     ) -> list[NDArray]:
-        """Return the results of a function of the module for the rows of X, in the dtype of X."""
+        """Return the results of a function of rows q for the rows of X, in the dtype of X."""
         if "module_" not in vars(self):
             check_is_fitted(self, "module_")
         X = check_inputs(self, X)
@@ -219,21 +262,10 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if warn:
             for message in self._doubts(q):
                 warnings.warn(message, stacklevel=3)
-        arrays = [*function(self.module_.rows(), q)]
-        if any(a.dtype not in (X.dtype, bool) for a in arrays):
+        arrays = [*function(q)]
+        if X.dtype != np.float64:
             with np.errstate(over="ignore"):  # too large for float32
-                arrays = [a if a.dtype == bool else a.astype(X.dtype) for a in arrays]
+                arrays = [array.astype(X.dtype) for array in arrays]
         if self._single_output:
-            arrays = [a[:, 0] if a.ndim > 1 else a for a in arrays]
+            arrays = [array[:, 0] if array.ndim > 1 else array for array in arrays]
         return arrays
-
-
-def _method(name: str) -> Callable[[Hybrid, NDArray], Sequence[NDArray]]:
-    """Return a function that evaluates a method of a module at rows q."""
-    return lambda module, q: evaluate(as_forward_model(getattr(module, name)), q)
-
-
-def _with_domain(module: Hybrid, q: NDArray, value: bool = True) -> list[NDArray]:
-    """Return x of rows q if `value`, and whether they lie in the domain."""
-    *x, distance = evaluate(module, q, value, distance=True)
-    return [*x, distance <= 1.0]

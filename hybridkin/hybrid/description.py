@@ -26,13 +26,14 @@ from hybridkin._core.stored import (
 # Their chains are among the kinds that a description may hold.
 from hybridkin.chains import constant_curvature, elastic_tendons, rigid  # noqa: F401
 from hybridkin.chains.play import PlayOperator
+from hybridkin.hybrid._adapt import Change
 from hybridkin.hybrid._drift import Drift
 from hybridkin.hybrid._error_models import Blend
-from hybridkin.hybrid._pose import PoseHybrid
 from hybridkin.hybrid._radius import Radius
 from hybridkin.hybrid._range import TrainingRange
 from hybridkin.hybrid._readout_fit import ReadoutFit
 from hybridkin.hybrid._settings import check_settings
+from hybridkin.hybrid._wrapped import WithPose, in_columns
 from hybridkin.hybrid.estimator import HybridForwardModel
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.elm_cv import ELMRegressorCV
@@ -78,13 +79,14 @@ def stored_hybrid(model: HybridForwardModel) -> Stored:
             **{
                 f"drift_{name}": array for name, array in model._drift._asdict().items()
             },
+            **model.change_._asdict(),
             "training_range": model._fitted_range,
             "play_width": None if model.play_ is None else model.play_.width,
             "radius": model.radius_,
             "fitted_rows": model._fitted_rows,
         },
         {
-            "module": model.module_.stored(),
+            "module": model.fitted_module_.stored(),
             "nominal": None if nominal is None else as_forward_model(nominal).stored(),
             "error_model": _stored_error(model.error_model_),
         },
@@ -109,32 +111,32 @@ def hybrid_of(stored: Stored, training: object) -> HybridForwardModel:
     setting = stored.value("error_model", (str, dict, None))
     model.error_model = _estimator(setting) if isinstance(setting, dict) else setting
     check_settings(model)
-    model.module_ = restore(stored.part("module"))
-    if isinstance(model.module_, PoseHybrid) != (model.output == "pose"):
+    model.fitted_module_ = restore(stored.part("module"))
+    if isinstance(model.fitted_module_, WithPose) != (model.output == "pose"):
         raise ValueError(
             f"`output` {model.output!r} does not fit {stored.part('module').kind!r}"
         )
-    model.mechanical_model_ = model.module_.mechanical
     model.error_model_ = _restored_error(stored.parts.get("error_model"), restore, n)
     restore_columns(model, stored, n)
     model._single_output = stored.value("single_output", bool)
-    center = torch.tensor(stored.array("drift_center", (n,)), device="cpu")
+    model.change_ = Change(stored.array("shift", (n,)), stored.array("motion", (4, 4)))
+    center = stored.array("drift_center", (n,))
+    q = torch.tensor(center[None], device="cpu")
     try:  # arrays that do not fit together fail here, not in use
+        columns = in_columns(model.fitted_module_, model.output)
         with torch.no_grad():
-            x, J = model.module_.rows().forward_and_jacobian(center[None])
-            model.module_.in_domain(center[None])
-    except RuntimeError as error:
+            m = columns(q).shape[1]
+        model._drift = _restored_drift(stored, Drift.of_range(q, m))
+        model._follow_robot()
+        with torch.no_grad():
+            columns = in_columns(model.module_, model.output)
+            x, J = columns.forward_and_jacobian(q)
+            model.module_.in_domain(q)
+    except (RuntimeError, np.linalg.LinAlgError) as error:
         raise ValueError("the arrays do not fit together") from error
     if not (torch.isfinite(x).all() and torch.isfinite(J).all()):
         raise ValueError("the arrays do not give finite numbers")
     model._fitted_range = TrainingRange(*stored.array("training_range", (2, n)))
-    empty = Drift.of_range(center[None], x.shape[1])
-    arrays = [
-        stored.array(f"drift_{name}", a.shape) for name, a in empty._asdict().items()
-    ]
-    model._drift = Drift(*arrays)
-    if not (model._drift.scale > 1.0 / LARGEST).all():
-        raise ValueError(f"`drift_scale` must be positive, over {1.0 / LARGEST:g}")
     model.calibration_ = model.play_ = model.radius_ = model._play_state = None
     model.candidates_ = None
     if "play_width" in stored.arrays:
@@ -161,6 +163,20 @@ def hybrid_of(stored: Stored, training: object) -> HybridForwardModel:
         model.cv_results_ = None
     model._noise = stored.value("noise", float)
     return model
+
+
+def _restored_drift(stored: Stored, empty: Drift) -> Drift:
+    """Return the drift of a description, with arrays shaped like those of an empty one."""
+    arrays = {}
+    for name, array in empty._asdict().items():
+        shape = np.shape(array)
+        arrays[name] = stored.array(f"drift_{name}", shape, finite=name != "alpha")
+    drift = Drift(**arrays)
+    if not (drift.scale > 1.0 / LARGEST).all():
+        raise ValueError(f"`drift_scale` must be positive, over {1.0 / LARGEST:g}")
+    if not drift.alpha > 0.0:
+        raise ValueError("`drift_alpha` must be positive")
+    return drift._replace(alpha=float(drift.alpha))
 
 
 def training_of(model: HybridForwardModel) -> dict[str, Any]:

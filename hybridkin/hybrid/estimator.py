@@ -22,7 +22,12 @@ from hybridkin.calibration.choice import GeometryChoice
 from hybridkin.calibration.measured import check_finite, check_unscaled
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.play import PlayState
-from hybridkin.hybrid._adapt import PARAMETERS, adapted, check_parameters
+from hybridkin.hybrid._adapt import (
+    PARAMETERS,
+    Change,
+    check_parameters,
+    likeliest_change,
+)
 from hybridkin.hybrid._drift import Drift
 from hybridkin.hybrid._error_models import error_model_of
 from hybridkin.hybrid._fit import (
@@ -119,6 +124,11 @@ class HybridForwardModel(HybridPredictor):
         q -> tip position, also with ``pose``, ``pose_jacobian`` and ``tip_transform``.
     mechanical_model_ : ForwardModel or None
         The mechanical model, calibrated if asked; `adapt` moves its base and its actuator zeros.
+    fitted_module_ : nn.Module
+        `module_` of the fit, without what `adapt` and `partial_fit` have learned since.
+    change_ : Change
+        What `adapt` has found: the ``shift`` of the actuator zeros (n,) [unit of q], and the
+        ``motion`` of the base (4, 4); zero and the identity after a fit.
     error_model_ : estimator, ReadoutFit, Blend or None
         The fitted error model. A blend has ``weights`` and ``error_models``. With serial coupling
         or named features it holds the chosen ``alphas`` and the ``residual`` of every row from a
@@ -275,13 +285,14 @@ class HybridForwardModel(HybridPredictor):
         if spec.error_model is None:
             spec, self.cv_results_, self.candidates_ = select(spec, rows, progress)
         fitted = fit_hybrid(spec, rows)
-        self.mechanical_model_ = fitted.mechanical
         self.calibration_ = fitted.calibration
         self.error_model_ = fitted.error.result
-        self.module_ = fitted.module
+        self.fitted_module_ = fitted.module
+        self.change_ = Change.none(rows.X.shape[1])
         self._single_output = rows.y.ndim == 1
         self._fitted_range = TrainingRange.of(rows.X)
         self._drift = Drift.of_range(rows.q, rows.tips.shape[1])
+        self._follow_robot()
         self._noise = fitted.error.noise
         if self.cv_results_ is not None:
             self._noise = float(self.cv_results_["expected_distance"]) / _MEAN_LENGTH
@@ -342,19 +353,17 @@ class HybridForwardModel(HybridPredictor):
             X, self._play_state = self.play_.apply(rows.X, self._play_state)
             rows = replace(rows, X=X)
         self._warn_of_units(rows)
-        q, tips = self.module_.before(rows.q, torch.from_numpy(rows.tips))
-        rows = replace(rows, X=q.numpy(), y=tips.numpy().reshape(rows.y.shape))
-        fitted = self.module_.as_fitted.with_drift(None)
+        rows = self.change_.before(rows, self.output)
+        fitted = self.fitted_module_
         with torch.no_grad():
             error = residuals(fitted.mechanical, rows.q, rows.y, self.output)
-            learned = fitted.learned_error(rows.q).numpy()
+            learned = fitted.error_part(rows.q).numpy()
         residual = error.reshape(rows.tips.shape) - learned
-        self._drift = self._drift.learned(rows.q.numpy(), residual, rows.counts, decay)
+        drift = self._drift.learned(rows.q.numpy(), residual, rows.counts, decay)
         if alpha is None:
-            alpha = self._drift.likeliest_alpha(self._noise)
-        # A module that a caller already holds does not change.
-        drifted = fitted.with_drift(self._drift.correction(alpha))
-        self.module_ = self.module_.after_change(drifted)
+            alpha = drift.likeliest_alpha(self._noise)
+        self._drift = drift._replace(alpha=float(alpha))
+        self._follow_robot()
         return self
 
     def adapt(
@@ -410,23 +419,22 @@ class HybridForwardModel(HybridPredictor):
         >>> model = HybridForwardModel(robots.bionic_handling_assistant(), "linear")
         >>> model = model.fit(data.q[:200], data.x[:200])
         >>> today = data.q[200:205], data.x[200:205] + [0.05, 0.0, 0.0]  # the base has moved
-        >>> model.adapt(*today, parameters=["base"]).module_.motion[0, 3] > 0.04
-        tensor(True)
+        >>> bool(model.adapt(*today, parameters=["base"]).change_.motion[0, 3] > 0.04)
+        True
         """
         check_is_fitted(self, "module_")
-        fitted = self.module_.as_fitted.with_drift(None)
         rows = self._checked_rows(X, y, None, groups, reset=False)
         check_parameters(parameters, rows.tips.shape[1] % 3 == 0)
         rows = replace(rows, X=self._effective(rows.X, rows.groups))
         self._warn_of_units(rows)
-        self.module_, message = adapted(
-            fitted, rows, self._noise, self._drift.scale, parameters
+        self.change_, message = likeliest_change(
+            self.fitted_module_, rows, self._noise, self._drift.scale, parameters
         )
         if message is not None:
             warnings.warn(message, stacklevel=2)
-        self.mechanical_model_ = self.module_.mechanical
         self._drift = self._drift.emptied()
         self._play_state = None
+        self._follow_robot()
         return self
 
     def _checked_rows(

@@ -252,7 +252,7 @@ class PoseTask(Task):
         self._follow(model)
 
     def _suitable(self, model: ForwardModel) -> ForwardModel:
-        if not isinstance(model, PoseModel):
+        if not model.has_pose:
             raise TypeError(
                 "`model` must be a PoseModel, which returns the pose of the tip, got "
                 f"{type(model).__name__}; use a chain, or fit a hybrid with output='pose'."

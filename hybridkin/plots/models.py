@@ -64,7 +64,9 @@ def body_of(
         drawn = drawn & np.isfinite(ends).all(axis=1)
     elif isinstance(model, Predictor):
         predicted_tips = _spread(_predicted_tips(model, chain, q[drawn]), drawn)
-        leads = cast(Any, model).module_.corrects_inside  # of a HybridForwardModel
+        leads = cast(
+            Any, model
+        ).fitted_module_.corrects_inside  # of a HybridForwardModel
         if leads:
             ends = predicted_tips
     rows = torch.from_numpy(q[drawn])

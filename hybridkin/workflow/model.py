@@ -174,9 +174,9 @@ class LoadedModel:
         }
         promise = Promise(**self._training.get("promise", constant))
         far = np.zeros(len(q))
-        tested = None if self.hybrid is None else self.hybrid.module_.tested
+        tested = None if self.hybrid is None else self.hybrid.fitted_module_.tested
         if self.hybrid is not None and tested is not None:
-            far = distances(tested, q + as_array(self.hybrid.module_.shift_of_zeros))
+            far = distances(tested, q + self.hybrid.change_.shift)
         mean = promise.mean(far)
         return {"mean": mean, "p95": promise.p95 * mean}
 

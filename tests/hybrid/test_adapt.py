@@ -6,22 +6,17 @@ import numpy as np
 import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
-from sklearn.exceptions import NotFittedError
 from torch.testing import assert_close
 
 from hybridkin import (
     ConstantCurvatureChain,
     ELMRegressor,
     HybridForwardModel,
-    InverseKinematics,
     RigidChain,
     datasets,
-    jacobian,
-    native,
     robots,
 )
 from hybridkin._core.rotations import rotation, rotation_vector
-from hybridkin.hybrid._adapted import AdaptedModel
 
 SHIFT = 0.006 * np.array([1.0, -0.5, 0.8, -1.2, 0.3, 0.9, -1.0, 0.6, -0.7])
 TURN, WAY = torch.tensor([0.1, -0.06, 0.08], dtype=torch.float64), np.array([0.03, -0.05, 0.02])
@@ -75,7 +70,7 @@ def test_five_rows_find_a_change(trunk, change):
 def test_a_robot_that_has_not_changed_stays_as_it_is(trunk):
     fitted, five, (q, _) = trunk
     model = copy.deepcopy(fitted).adapt(*five)
-    assert model.module_.state_dict().keys() == fitted.module_.state_dict().keys()
+    assert model.module_ is model.fitted_module_
     assert_array_equal(model.predict(q), fitted.predict(q))
 
 
@@ -83,7 +78,7 @@ def test_many_rows_find_the_change_itself(trunk):
     fitted, _, (q, x) = trunk
     x = moved(fitted.predict(q))
     model = copy.deepcopy(fitted).adapt(q - SHIFT, x)
-    assert_allclose(model.module_.shift, SHIFT, rtol=0, atol=1e-3)
+    assert_allclose(model.change_.shift, SHIFT, rtol=0, atol=1e-3)
     assert_allclose(model.predict(q - SHIFT), x, rtol=0, atol=1e-3)
 
 
@@ -134,33 +129,23 @@ def test_any_model_is_adapted_and_adapted_back(case):
 def test_an_adapted_model_is_the_fit_moved_and_shifted(case):
     fitted, q, x, _ = case
     model = copy.deepcopy(fitted).adapt(q, x)
-    if fitted.play_ is not None:
-        q = fitted.play_.apply(q)[0]
-        fitted.play_ = model.play_ = None
-    module, q = model.module_, q[:20]
-    assert isinstance(module, AdaptedModel)
-    turn, shifted = module.motion[:3, :3].numpy(), q + module.shift.numpy()
-    expected = fitted.predict(shifted)
-    tips = expected[:, :3] @ turn.T + module.motion[:3, 3].numpy()
-    assert_allclose(model.predict(q)[:, :3], tips, rtol=0, atol=1e-13)
-    J, J_then = model.jacobian(q), fitted.jacobian(shifted)
-    assert_allclose(J[:, :3], turn @ J_then[:, :3], rtol=1e-12, atol=1e-12)
-    assert_array_equal(model.error_weight(q), fitted.error_weight(shifted))
-    assert_array_equal(model.in_domain(q), fitted.in_domain(shifted))
-    rows, at = module.rows(), torch.from_numpy(q)
-    assert_close(rows.forward_and_jacobian(at)[0], torch.from_numpy(model.predict(q)))
-    assert_close(module.jacobian(at), jacobian(lambda q: module(q), at), rtol=1e-9, atol=1e-9)
-    single = copy.deepcopy(module).float()(at.float())
+    shift, motion = model.change_
+    turn = motion[:3, :3]
+    q = model._effective(q, None)[:20]
+    model.play_ = None
+    at = torch.from_numpy(q)
+    then = torch.from_numpy(q + shift)
+    x, J = model.module_.forward_and_jacobian(at)
+    x_then, J_then = fitted.module_.forward_and_jacobian(then)
+    assert_allclose(x, x_then.numpy() @ turn.T + motion[:3, 3], rtol=0, atol=1e-13)
+    assert_allclose(J, turn @ J_then.numpy(), rtol=1e-12, atol=1e-12)
+    assert_close(model.module_.domain_distance(at), fitted.module_.domain_distance(then))
+    assert_allclose(model.error_weight(q), fitted.module_.error_weight(then))
+    single = copy.deepcopy(model.module_).float()(at.float())
     assert single.dtype == torch.float32
-    assert_close(single.double(), module(at), rtol=0, atol=1e-4)
+    assert_close(single.double(), x, rtol=0, atol=1e-4)
     if model.output == "pose":
-        assert_close(module.pose(at)[:, :3, 3], module(at))
-        assert_close(module.pose_and_jacobian(at)[1][:, :3], module.jacobian(at))
-        turns = torch.from_numpy(turn) @ rotation(torch.from_numpy(expected[:, 3:]))[0]
-        assert_close(module.pose(at)[:, :3, :3], turns)
-    else:
-        parts = model.predict_mechanical(q) + model.predict_error(q)
-        assert_allclose(parts, model.predict(q), rtol=0, atol=1e-12)
+        assert_allclose(model.module_.pose(at), motion @ fitted.module_.pose(then).numpy())
 
 
 def test_a_drift_is_learned_on_top_of_a_change_and_forgotten_by_the_next(case):
@@ -177,16 +162,12 @@ def test_a_drift_is_learned_on_top_of_a_change_and_forgotten_by_the_next(case):
     assert_allclose(model.adapt(q, x).predict(q), adapted_only, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("parameters", "still"), [(["base"], "shift"), (["actuator_zeros"], "motion")]
-)
-def test_only_what_may_have_changed_is_adapted(trunk, parameters, still):
-    fitted, five, _ = trunk
-    q, x = five
-    rows = (q, moved(x)) if still == "shift" else (q - SHIFT, x)
-    model = copy.deepcopy(fitted).adapt(*rows, parameters=parameters)
-    none = {"shift": torch.zeros(9), "motion": torch.eye(4)}[still]
-    assert_close(getattr(model.module_, still), none.double(), rtol=0, atol=0)
+def test_only_what_may_have_changed_is_adapted(trunk):
+    fitted, (q, x), _ = trunk
+    model = copy.deepcopy(fitted).adapt(q, moved(x), parameters=["base"])
+    assert_array_equal(model.change_.shift, np.zeros(9))
+    model.adapt(q - SHIFT, x, parameters=["actuator_zeros"])
+    assert_array_equal(model.change_.motion, np.eye(4))
 
 
 def test_a_single_row_moves_the_model_towards_it(trunk):
@@ -207,15 +188,8 @@ def test_the_rows_of_one_motion_count_as_fewer(trunk):
     q, x = q[:30], x[:30] + np.array([0.004, 0.0, 0.0])
     free = copy.deepcopy(fitted).adapt(q, x)
     one = copy.deepcopy(fitted).adapt(q, x, groups=np.zeros(30))
-    assert isinstance(free.module_, AdaptedModel)
-    assert not isinstance(one.module_, AdaptedModel)
-
-
-@pytest.mark.parametrize("wrong", ["base", [], ["tool"], ["base", "radii"]])
-def test_wrong_parameters_are_refused(trunk, wrong):
-    fitted, five, _ = trunk
-    with pytest.raises(ValueError, match="`parameters` must be one or both"):
-        fitted.adapt(*five, parameters=wrong)
+    assert free.module_ is not free.fitted_module_
+    assert one.module_ is one.fitted_module_
 
 
 def test_outputs_that_are_not_in_space_have_no_base():
@@ -227,25 +201,8 @@ def test_outputs_that_are_not_in_space_have_no_base():
         model.adapt(q, y)
     shifted = q[:40] - [0.1, -0.2, 0.05]
     model.adapt(shifted, y[:40], parameters=["actuator_zeros"])
-    assert_allclose(model.module_.shift, [0.1, -0.2, 0.05], rtol=0, atol=0.02)
-    x, J = model.predict_and_jacobian(shifted)
-    assert_allclose(x, y[:40], rtol=0, atol=0.05)
-    assert J.shape == (40, 2, 3)
-
-
-def test_a_model_that_was_not_fitted_is_refused(trunk):
-    with pytest.raises(NotFittedError):
-        HybridForwardModel(robots.bionic_handling_assistant()).adapt(*trunk[1])
-
-
-def test_the_tracker_runs_an_adapted_model_in_the_compiled_core(trunk):
-    fitted, (q, x), _ = trunk
-    model = copy.deepcopy(fitted).adapt(q - SHIFT, moved(x))
-    ik = InverseKinematics(model, q_min=0.15, q_max=0.35, q_pref=0.25)
-    target = model.predict(q[:1])[0]
-    found = ik.solve(target, q0=np.full(9, 0.25))
-    assert_allclose(model.predict(found.q[None])[0], target, rtol=0, atol=1e-4)
-    assert ik.tracker(found.q).backend.startswith("compiled") == native.available()
+    assert_allclose(model.change_.shift, [0.1, -0.2, 0.05], rtol=0, atol=0.02)
+    assert_allclose(model.predict(shifted), y[:40], rtol=0, atol=0.05)
 
 
 class Squares(torch.nn.Module):

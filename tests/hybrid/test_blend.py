@@ -55,7 +55,7 @@ def test_all_is_the_mean_of_the_parts(blend, parts, q):
     assert_close(blend(q), mean(parts, lambda part: part(q)))
     assert_close(blend.jacobian(q), mean(parts, lambda part: part.jacobian(q)))
     assert_close(blend.error_weight(q), mean(parts, lambda part: part.error_weight(q)))
-    assert_close(blend.mechanical_part(q) + blend.error_part(q), blend(q))
+    assert_close(blend.mechanical(q) + blend.error_part(q), blend(q))
     trusted = blend.in_domain(q)
     assert (trusted == torch.stack([part.in_domain(q) for part in parts]).all(0)).all()
     assert trusted.any()

@@ -23,11 +23,11 @@ from hybridkin.hybrid._error_models import (
 from hybridkin.hybrid._features import Features
 from hybridkin.hybrid._fit import Spec
 from hybridkin.hybrid._kernel import tuned_kernel
-from hybridkin.hybrid._pose import WithPose
 from hybridkin.hybrid._readout_fit import _Problem as ReadoutProblem
 from hybridkin.hybrid._readout_fit import fit_readout
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._selection import _chosen, _HeldOut
+from hybridkin.hybrid._wrapped import PoseRows, WithPose
 
 CHAIN = ConstantCurvatureChain([0.05])
 N, M = 40, 10  # held-out and outer rows
@@ -269,7 +269,8 @@ def test_the_derivative_of_a_pose_by_a_change_of_the_robot():
     theta = rng.uniform(-0.2, 0.2, 9)
     scale = np.full(3, 0.01)
     with torch.no_grad():
-        y = _Problem(fitted, rows, scale).model(theta).rows()(q).numpy()
+        change = _Problem(fitted, rows, scale).change(theta)
+        y = PoseRows(change.after(fitted))(q).numpy()
     problem = _Problem(fitted, dataclasses.replace(rows, y=y), scale)
     residual, A = problem.linearised(theta)
     assert_allclose(residual, 0.0, atol=1e-9)

@@ -70,7 +70,7 @@ def test_module_jacobian_and_parts_in_and_out_of_the_domain(fitted, trunk):
     tips, J = module.forward_and_jacobian(q)
     assert_close(tips, module(q), rtol=0, atol=1e-12)
     assert_close(J, torch.func.vmap(torch.func.jacrev(module))(q), rtol=1e-7, atol=1e-8)
-    assert_close(tips, module.mechanical_part(q) + module.error_part(q))
+    assert_close(tips, module.mechanical(q) + module.error_part(q))
     assert not module.in_domain(q).all()
     assert module.in_domain(torch.from_numpy(trunk[0][:200])).all()
     assert_allclose(

@@ -39,7 +39,7 @@ every_robot = pytest.mark.parametrize("robot", ROBOTS)
 
 
 def hybrid(chain, readout):
-    correction = InnerCorrection(chain, readout)
+    correction = InnerCorrection(readout)
     return HybridModule(chain, [correction], torch.ones(1, dtype=torch.float64))
 
 

@@ -57,7 +57,7 @@ def read_out(chain, features, q, x, sample_weight=None, groups=None, **options):
 def hybrid(chain, readout, coupling="serial"):
     """Return the chain with an unguarded readout, inside or at the tip."""
     inside = coupling == "serial"
-    correction = InnerCorrection(chain, readout) if inside else TipCorrection(readout)
+    correction = InnerCorrection(readout) if inside else TipCorrection(readout)
     return HybridModule(chain, [correction], torch.ones(1, dtype=torch.float64))
 
 

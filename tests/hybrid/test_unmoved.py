@@ -80,7 +80,7 @@ def test_corrections_are_constant_where_no_row_moves(coupling, error_model, kind
     q = log(kind)
     model = fitted(q, error_model, coupling=coupling, guard=guard)
     (correction,) = model.module_.corrections
-    learned = correction.module if coupling == "parallel" else correction.readout
+    learned = correction.module
     rows = torch.from_numpy(q[::5])
     for step in across(q):
         assert_close(learned(rows + torch.from_numpy(3 * step)), learned(rows), rtol=0, atol=1e-11)

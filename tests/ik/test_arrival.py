@@ -6,7 +6,7 @@ import torch
 from torch.testing import assert_close
 
 from hybridkin import ElasticTendonChain, HybridForwardModel, InverseKinematics
-from hybridkin.hybrid._adapted import AdaptedModel
+from hybridkin.hybrid._wrapped import Shifted
 from hybridkin.ik.results import IKStatus
 from hybridkin.native import available
 
@@ -87,5 +87,5 @@ def test_which_actuators_only_pull():
     model = HybridForwardModel(chain(), "linear").fit(q, x)
     assert (InverseKinematics(model).settings.pulls == -1.0).all()
     model.adapt(q[:8] + 1e-4, model.predict(q[:8]))
-    assert isinstance(model.module_, AdaptedModel)
+    assert isinstance(model.module_, Shifted)
     assert (InverseKinematics(model).settings.pulls == -1.0).all()

@@ -152,7 +152,7 @@ def hybrid(kind, coupling="parallel", trust=None, drifting=False, weight=1.0):
     mechanical = chain()
     if coupling == "serial":
         module = regressor(kind, 6)
-        correction = InnerCorrection(mechanical, module, guard(trust, module))
+        correction = InnerCorrection(module, guard(trust, module))
     else:
         module = regressor(kind)
         correction = TipCorrection(module, guard(trust, module))

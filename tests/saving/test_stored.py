@@ -54,9 +54,8 @@ def test_shared_parts_are_shared_again(tmp_path, fitted):
     assert correction.guard.model is correction.module is network.error_model_.module_
     serial = load_model(tmp_path / "serial_pose")
     correction = serial.module_.corrections[0]
-    assert correction.mechanical is serial.module_.mechanical is serial.mechanical_model_
-    assert correction.readout is serial.error_model_.readout
-    assert correction.readout.features.chain is serial.mechanical_model_
+    assert correction.module is serial.error_model_.readout
+    assert correction.module.features.chain is serial.mechanical_model_
     assert serial.mechanical_model is not serial.mechanical_model_
 
 

@@ -15,7 +15,7 @@
     ((n) + HK_CHAIN_WORK(n, S) + HK_REGRESS_WORK(n, S, powers) +                                   \
      HK_HYBRID_WORK(n, S, m, features, powers))
 
-/* The q (n) of the fit for one of a robot that has changed since, and the place of the fit. */
+/* q + shift (n), where the actuator zeros have shifted, and the place of the model within. */
 static inline int HK(before)(const hk_plan *p, int at, const V *q, V *then) {
     const real *shift = hk_numbers(p, at);
     for (int j = 0; j < p->code[at + HK_N]; j++) then[j] = q[j] + shift[j];
@@ -31,17 +31,20 @@ static inline void HK(turn)(int n, const real *R, V *a) {
     }
 }
 
-/* x (m) of q (n); the Jacobian J (m, n) and the domain distance where not NULL. Of a robot that has
-   changed since the fit it is x = R f(q + shift) + p. */
+/* x (m) of q (n); the Jacobian J (m, n) and the domain distance where not NULL. x is R f(q + shift)
+   + p, where base and actuator zeros have changed. */
 static inline void HK(model)(const hk_plan *p, int at, const V *q, V *x, V *J, V *distance,
                              V *work) {
     const int n = p->code[at + HK_N], m = p->code[at + HK_M];
-    const int adapted = HK_IS(p, at, HK_ADAPTED);
-    const real *R = adapted && m % 3 == 0 ? hk_numbers(p, at) + n : NULL;
+    const real *R = NULL;
     V *then = HK(take)(&work, n);
-    if (adapted) {
+    if (HK_IS(p, at, HK_SHIFTED)) {
         at = HK(before)(p, at, q, then);
         q = then;
+    }
+    if (HK_IS(p, at, HK_MOVED)) {
+        R = hk_numbers(p, at);
+        at = p->code[at + HK_MORE];
     }
     if (distance) *distance = SPLAT(0.0);
     if (HK_IS(p, at, HK_HYBRID))
@@ -62,9 +65,10 @@ static inline void HK(model)(const hk_plan *p, int at, const V *q, V *x, V *J, V
 static inline void HK(domain)(const hk_plan *p, int at, const V *q, V *distance, V *slope,
                               V *work) {
     V *then = HK(take)(&work, p->code[at + HK_N]);
-    if (HK_IS(p, at, HK_ADAPTED)) {
+    if (HK_IS(p, at, HK_SHIFTED)) {
         at = HK(before)(p, at, q, then);
         q = then;
     }
+    if (HK_IS(p, at, HK_MOVED)) at = p->code[at + HK_MORE];
     HK(farthest)(p, at, q, distance, slope, work);
 }
