@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import warnings
 from collections.abc import Sequence
@@ -12,13 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hybridkin._core.arrays import Numbers, Transform, one_of, real_array, shaped
-from hybridkin._core.stored import Stored
+from hybridkin._core.arrays import Numbers, Transform, real_array, shaped
 from hybridkin._core.units import warn_millimetres
-from hybridkin.chains._arcs import bend_readings
 
-_ROUTINGS = ("segment", "base")
-_DETERMINED = 1e-6  # smallest relative reading that determines a direction of bending
 _MOST_UNLIKE = (
     1000.0  # ratio of radii; more leave too few digits with the routing "base"
 )
@@ -105,80 +100,6 @@ def arc_geometry(
     if not geometry["gains"].all():
         raise ValueError(f"`gains` must not be zero [m per unit of q], got {gains}.")
     return counts, extensible, geometry
-
-
-def path_starts(
-    routing: str, counts: Sequence[int], extensible: Sequence[bool]
-) -> tuple[int, ...]:
-    """Return the first segment that the actuators of each segment run through.
-
-    Actuators carried by a rigid stage start after it.
-    """
-    one_of(routing, "routing", _ROUTINGS)
-    S = len(counts)
-    if routing == "segment":
-        return (*range(S),)
-    stages = [extensible[k] and counts[k] == 1 for k in range(S)]
-    if len({extensible[k] for k in range(S) if not stages[k]}) > 1:
-        raise ValueError(
-            "`routing` must be 'segment' if tendons would run through extensible segments of "
-            "several actuators, or the reverse, got 'base'; their lengths would not be defined."
-        )
-    return tuple(itertools.accumulate((k * stages[k - 1] for k in range(S)), max))
-
-
-def bend_counts(
-    angles: Sequence[Tensor], extensible: Sequence[bool]
-) -> tuple[int, ...]:
-    """Return the number of directions in which each segment bends: 2, or 1 in a plane.
-
-    It is 0 for an extensible segment with a single actuator.
-    """
-    bends = []
-    for own, stretches in zip(angles, extensible, strict=True):
-        singular = torch.linalg.svdvals(bend_readings(own, stretches))
-        most, least = torch.nn.functional.pad(singular, (0, 1))[:2].tolist()
-        planar = least <= 64.0 * torch.finfo(own.dtype).eps * most
-        if stretches and len(own) == 1:
-            bends.append(0)
-        elif most > _DETERMINED and (planar or least > _DETERMINED * most):
-            bends.append(1 if planar else 2)
-        else:
-            raise ValueError(
-                "`angles` must determine the bending of every segment, got "
-                f"{[row.tolist() for row in angles]}; give the actuators of a segment clearly "
-                "different angles [rad], or exactly planar ones: psi and psi + math.pi."
-            )
-    return tuple(bends)
-
-
-def stored_arguments(stored: Stored, names: Sequence[str]) -> dict[str, Any]:
-    """Return the constructor arguments of a stored chain, from its entries of these names."""
-    counts = stored.list_of(int, "actuators_per_segment")
-    may_lack = ("lengths", "gains")
-    arguments: dict[str, Any] = {
-        name: stored.array(name)
-        for name in names
-        if name not in may_lack or name in stored.arrays
-    }
-    if sum(counts) != len(arguments["angles"]):
-        raise ValueError(
-            f"`actuators_per_segment` must sum to the angles, got {counts!r:.60}"
-        )
-    arguments["angles"] = np.split(arguments["angles"], np.cumsum(counts)[:-1])
-    if "stage" in stored.settings:  # older files have neither stages nor planes
-        lengths = iter(arguments.pop("lengths", ()))
-        flags = stored.list_of(bool, "extensible")
-        arguments["lengths"] = [
-            None if own else next(lengths, math.nan) for own in flags
-        ]
-        arguments["stage"] = stored.value("stage", (str, None))
-        # Planar actuators stay planar, although calibration has moved their angles slightly.
-        pairs = zip(arguments["angles"], stored.list_of(int, "bends"), strict=True)
-        arguments["angles"] = [
-            math.pi * (np.arange(len(a)) % 2) if n == 1 else a for a, n in pairs
-        ]
-    return {**arguments, "routing": stored.value("routing", str), "n_actuators": counts}
 
 
 def numeric(

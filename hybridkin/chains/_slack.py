@@ -25,6 +25,10 @@ class Elasticity(NamedTuple):
     zeros: Tensor  # (n,)
     gains: Tensor  # (n,)
 
+    def to(self, like: Tensor | torch.dtype) -> Elasticity:
+        """Return it in the dtype and on the device of a tensor, or in a dtype."""
+        return Elasticity(*(part.to(like) for part in self))
+
 
 class Responses(NamedTuple):
     """Linear responses to (q, 1) for M sets of taut tendons."""
@@ -32,6 +36,10 @@ class Responses(NamedTuple):
     shape: Tensor  # (M, 3 S, n + 1)
     stretch: Tensor  # (M, n, n + 1), negative if slack
     compliance: Tensor  # (M, 3 S, 3 S), shape per generalised force
+
+    def at(self, places: Tensor) -> Responses:
+        """Return the responses of some of the sets."""
+        return Responses(*(part.index_select(0, places) for part in self))
 
 
 class Balance(NamedTuple):
@@ -44,28 +52,34 @@ class Balance(NamedTuple):
 
 
 def responses_of(taut: Tensor, elasticity: Elasticity) -> Responses:
-    """Return the linear responses for M sets of taut tendons (M, n)."""
+    """Return the linear responses for M sets of taut tendons (M, n).
+
+    With the readings B of the taut tendons and the stiffness K of the backbone the shape is
+    ``a = (K + B' B)^-1 (K a0 + B' (gains * q - zeros))``.
+    """
     readings, units, stiffness, rest, zeros, gains = elasticity
-    pulling = readings.T * taut[:, None]  # (M, 3 S, n)
+    pulling = readings.mT * taut[:, None]  # (M, 3 S, n)
     hessian = torch.diag(stiffness) + pulling @ readings
-    scaled = units[:, None] * hessian * units
-    force = torch.cat(
-        [pulling * gains, (stiffness * rest - pulling @ zeros)[..., None]], dim=-1
-    )
+    by_q = pulling * gains
+    constant = stiffness * rest - pulling @ zeros
+    unit_forces = identity(len(stiffness), readings).expand(len(taut), -1, -1)
     # Solved for the forces: a product with the inverse loses digits of a soft backbone.
-    unit_forces = identity(len(stiffness), force).expand(len(force), -1, -1)
-    forces = units[:, None] * torch.cat([force, unit_forces], dim=-1)
-    solved = units[:, None] * torch.linalg.solve_ex(scaled, forces).result
-    shape, compliance = solved.split([force.shape[-1], len(stiffness)], dim=-1)
-    loads = torch.cat([torch.diag(gains), -zeros[:, None]], dim=-1)
-    return Responses(shape, readings @ shape - loads, compliance)
+    forces = torch.cat([by_q, constant[..., None], unit_forces], dim=-1)
+    scaled = units[:, None] * hessian * units
+    solution = torch.linalg.solve_ex(scaled, units[:, None] * forces).result
+    solution = units[:, None] * solution
+    shape, compliance = solution.split([len(gains) + 1, len(stiffness)], dim=-1)
+    commanded = torch.cat([torch.diag(gains), -zeros[:, None]], dim=-1)
+    return Responses(shape, readings @ shape - commanded, compliance)
 
 
 def extended(rows: Tensor) -> Tensor:
+    """Return (q, 1) for rows q (N, n), shape (N, n + 1)."""
     return nn.functional.pad(rows, (0, 1), value=1.0)
 
 
 def applied(maps: Tensor, vectors: Tensor) -> Tensor:
+    """Return linear maps (N, m, n) of vectors (N, n)."""
     return torch.matmul(maps, vectors[..., None])[..., 0]
 
 

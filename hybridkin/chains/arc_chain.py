@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -18,17 +18,17 @@ from hybridkin._core.blocks import check_vectors, in_blocks
 from hybridkin._core.plan import NoKernel, Plan
 from hybridkin._core.plausible import PlausibleRows
 from hybridkin._core.stored import Restore, Stored
-from hybridkin._core.stumpff import stumpff
 from hybridkin._core.units import LONGEST_PULL, millimetres_message
 from hybridkin.chains._arcs import (
-    levers,
-    reading_matrix,
+    Segments,
     rolled,
+    segments_of,
     tip,
     tip_and_columns,
     transforms,
 )
-from hybridkin.chains._checks import arc_geometry, path_starts, stored_arguments
+from hybridkin.chains._checks import arc_geometry
+from hybridkin.chains._paths import bend_matrix, path_starts, reading_matrix
 from hybridkin.chains.markers import MarkedChain
 
 if TYPE_CHECKING:
@@ -37,14 +37,10 @@ if TYPE_CHECKING:
 ALIASES = {"turns": "angles", "tool": "offsets", "gain": "gains"}
 """Parameters of `calibrate` that change a part of an entry of the geometry, and that entry."""
 
-Change = Callable[[Tensor, Mapping[str, Tensor]], Tensor]
+Change = Callable[[Tensor], Tensor]
 _LONGEST = 10.0  # largest plausible length of an extensible segment [m]
-STRUCTURE = {
-    "actuators_per_segment": list,
-    "tip_at": float,
-    "markers": list,
-    "routing": str,
-}
+STRUCTURE = {"actuators_per_segment": list, "markers": list, "routing": str}
+"""Settings of every chain of arcs in files."""
 
 
 def frame_numbers(plan: Plan, stored: Stored, reach: float) -> tuple[NDArray, NDArray]:
@@ -54,9 +50,8 @@ def frame_numbers(plan: Plan, stored: Stored, reach: float) -> tuple[NDArray, ND
     """
     base = stored.array("base")
     offsets = stored.array("offsets")
-    tip_at = stored.value("tip_at", float)
-    markers = stored.settings.get("markers", [[tip_at, 0.0, 0.0, 0.0]])
-    _, x, y, z = markers[0]
+    markers = stored.value("markers", list)
+    tip_at, x, y, z = markers[0]
     if len(markers) > 1 or x or y:
         raise NoKernel(
             "several markers, or a marker beside the backbone, have no kernel"
@@ -72,7 +67,7 @@ def frame_numbers(plan: Plan, stored: Stored, reach: float) -> tuple[NDArray, ND
 def write_whole_chain(plan: Plan, stored: Stored) -> int:
     """Write the node of a chain of arcs up to the robot's end, wherever its tip is."""
     end = float(len(stored.array("offsets")))
-    settings = {**stored.settings, "tip_at": end, "markers": [[end, 0.0, 0.0, 0.0]]}
+    settings = {**stored.settings, "markers": [[end, 0.0, 0.0, 0.0]]}
     return plan.node_of(replace(stored, settings=settings))
 
 
@@ -81,10 +76,9 @@ class Frames(NamedTuple):
 
     axes: Tensor  # (3, 3, S, N): axis, component
     points: Tensor  # (3, S, N) origins [m]
-    moves: (
-        Tensor  # (3, 3, S, N): velocity of the robot's end per length, x- and y-bending
-    )
-    spins: Tensor  # (3, 3, S, N): its angular velocity per the same
+    # Velocity and angular velocity of the robot's end by the lengths, x- and y-bendings.
+    moves: Tensor  # (3, 3, S, N)
+    spins: Tensor  # (3, 3, S, N)
     slope: Tensor  # d arcs / dq, (3 S, n) or (3 S, n, N)
 
 
@@ -107,7 +101,6 @@ class ArcChain(MarkedChain):
     routing: str
     extensible: tuple[bool, ...]  # for each segment; the others have lengths
     starts: tuple[int, ...]  # first segment that each segment's actuators run through
-    stage: str | None = None  # "rotation" if the first segment is a rotation stage
     radii: Tensor  # (S,)
     angles: Tensor  # (n,)
     offsets: Tensor  # (S,)
@@ -141,23 +134,22 @@ class ArcChain(MarkedChain):
     @property
     def rest(self) -> Tensor:
         """The q (n,) at which tendons are not displaced and chambers have length 0."""
-        zeros = self._buffers.get("actuator_zeros")
-        return 0.0 * self.gains if zeros is None else zeros
+        return torch.zeros_like(self.gains)
 
     def metres(self, q: Tensor) -> Tensor:
         """Return q (..., n) in metres: lengths, or changes of length."""
         check_vectors(q, self.n_actuators, "q", self._why_shape())
         return self.gains.to(q) * (q - self.rest.to(q))
 
-    def _checked(self, routing: str, *given: Any) -> dict[str, Tensor]:
+    def _checked(self, routing: str, **arguments: Any) -> dict[str, Tensor]:
         """Set the structure of the chain, and return the `arc_geometry` of the arguments."""
-        counts, self.extensible, geometry = arc_geometry(*given)
+        counts, self.extensible, geometry = arc_geometry(**arguments)
         self.actuators_per_segment = counts
         self.starts = path_starts(routing, counts, self.extensible)
-        self.n_segments = len(geometry["radii"])
-        self.n_actuators = len(geometry["angles"])
+        self.n_segments = len(counts)
+        self.n_actuators = sum(counts)
         self.routing = routing
-        self._set_markers([(self.n_segments, 0.0, 0.0, 0.0)])
+        self._set_markers([(float(self.n_segments), 0.0, 0.0, 0.0)])
         return geometry
 
     def _set_geometry(self, geometry: Mapping[str, Tensor | None]) -> None:
@@ -177,28 +169,43 @@ class ArcChain(MarkedChain):
         Tensor of shape (..., 3)
             Tip position in the measuring frame [m].
         """
-        return in_blocks(self._forward, q, 8192)[0]
+        return in_blocks(self._forward, q, 8192 // len(self.markers))[0]
 
     def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return the tip (..., 3) [m] and its Jacobian (..., 3, n_actuators) [-] in one pass."""
         check_vectors(q, self.n_actuators, "q", self._why_shape())
-        x, J = in_blocks(self._forward_and_jacobian, q)
+        size = 4096 // len(self.markers)
+        x, J = in_blocks(self._forward_and_jacobian, q, size)
         return x, J
+
+    def _forward(self, q: Tensor) -> tuple[Tensor]:
+        arcs = self.up_to_markers(self._arcs(q))
+        return (self._x_of(arcs).reshape(*q.shape[:-1], self.n_outputs),)
+
+    def _forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        arcs, slope = self._arcs_and_slope(self._rows(q))
+        x, columns = self._x_and_columns(self.up_to_markers(arcs))
+        J = self._along(self.by_arcs(columns), slope)
+        x = self._in_measuring_frame(x)
+        lead = q.shape[:-1]
+        return x.reshape(*lead, *x.shape[1:]), J.reshape(*lead, *J.shape[1:])
 
     def pose_jacobian(self, q: Tensor) -> Tensor:
         """Return the tip's linear [-] and angular [rad/m] Jacobian, shape (..., 6, n_actuators).
 
         The angular rows give the angular velocity in the measuring frame.
         """
+        if len(self.markers) > 1:
+            return self.tip_model.pose_jacobian(q)
         arcs, slope = self._arcs_and_slope(self._rows(q))
-        _, columns = tip_and_columns(
-            *self._to_point(self.up_to_tip(arcs)), angular=True
-        )
-        parts = [self._by_actuators(part, slope, q) for part in columns.chunk(2, dim=1)]
-        J = torch.cat(parts, dim=-2)
+        segments = self._segments(self.up_to_markers(arcs))
+        _, columns = tip_and_columns(segments, self._beside(arcs), angular=True)
+        linear, angular = columns.chunk(2, dim=1)
+        both = torch.cat([self.by_arcs(linear), self.by_arcs(angular)], dim=2)
+        J = self._along(both, slope)
         if self.stage is not None:  # the stage turns the tip's frame too
-            J[..., 3:, 0] = (self.gains[0] * self.base[:3, 2]).to(q)
-        return J
+            J[:, 3:, 0] = (self.gains[0] * self.base[:3, 2]).to(q)
+        return J.reshape(*q.shape[:-1], 6, self.n_actuators)
 
     def geometry_jacobian(self, q: Tensor, tangents: Mapping[str, Tensor]) -> Tensor:
         """Return the derivative of the tip along changes of the geometry, in closed form.
@@ -225,35 +232,29 @@ class ArcChain(MarkedChain):
         tensor([0., 0., 1.], dtype=torch.float64)
         """
         self._check_tangents(tangents)
-        self._rows(q)  # checks it
+        check_vectors(q, self.n_actuators, "q", self._why_shape())
         tangents = {name: value.to(q) for name, value in tangents.items()}
-        tips = self.tips()
 
-        def along(rows: Tensor) -> tuple[Tensor]:
-            arcs, change = self._arcs_and_change(rows)
-            return (
-                torch.cat([one._along(arcs, change, tangents) for one in tips], dim=1),
-            )
+        def along(q: Tensor) -> tuple[Tensor]:
+            J = self._along_geometry(self._rows(q), tangents)
+            return (J.reshape(*q.shape[:-1], *J.shape[1:]),)
 
-        return in_blocks(along, q)[0]
+        return in_blocks(along, q, 4096 // len(self.markers))[0]
 
-    def _along(
-        self, arcs: Tensor, change: Change, tangents: Mapping[str, Tensor]
-    ) -> Tensor:
-        """Return the derivative (N, 3, P) of the tip along P changes, at arcs (3 S, N)."""
-        place = self._to_point(self.up_to_tip(arcs))
-        tail, columns = tip_and_columns(*place, rigid=True)
-        columns = self._turned(columns).permute(2, 0, 1).contiguous()
-        S = len(place[0])
-        by_arcs, by_offsets = columns.split([3 * S, S], dim=2)
-        J = change(
-            by_arcs @ self.up_to_tip(identity(3 * self.n_segments, arcs)), tangents
-        )
+    def _along_geometry(self, rows: Tensor, tangents: Mapping[str, Tensor]) -> Tensor:
+        """Return the derivative (N, 3 K, P) of x along P changes of the geometry."""
+        arcs, change = self._arcs_and_change(rows, tangents)
+        arcs = self.up_to_markers(arcs)
+        x, columns = self._x_and_columns(arcs, rigid=True)
+        by_arcs, by_offsets = columns.split([len(arcs), len(arcs) // 3], dim=1)
+        J = change(self._turned(self.by_arcs(by_arcs)))
         if "offsets" in tangents:
-            J = J + by_offsets @ self._tip_offsets(tangents["offsets"]).T
+            by_offsets = self._turned(self.by_offsets(by_offsets))
+            J = J + by_offsets @ tangents["offsets"].T
         if "base" in tangents:
-            turned = tail.T @ tangents["base"][:, :3, :3].permute(2, 1, 0).flatten(1)
-            J = J + turned.unflatten(1, J.shape[1:]) + tangents["base"][:, :3, 3].T
+            base = tangents["base"]
+            turned = torch.einsum("pij,jkn->nkip", base[:, :3, :3], x)
+            J = J + (turned + base[:, :3, 3].T).flatten(1, 2)
         return J
 
     def arcs(self, q: Tensor) -> tuple[Tensor, Tensor]:
@@ -292,12 +293,10 @@ class ArcChain(MarkedChain):
     def pose(self, q: Tensor) -> Tensor:
         """Return the tip's pose in the measuring frame, shape (..., 4, 4)."""
         arcs = self._leading(self.up_to_tip(self._arcs(q)), q)
+        offsets = self.offsets_to_markers(self.offsets)[:, -1]
         beside = identity(4, q)
         beside[:3, 3] = q.new_tensor(self.markers[-1][1:])
-        return (
-            self._poses(*arcs, self._tip_offsets(self.offsets), q)[..., -1, :, :]
-            @ beside
-        )
+        return self._poses(*arcs, offsets, q)[..., -1, :, :] @ beside
 
     def pose_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return `pose(q)` and `pose_jacobian(q)`."""
@@ -306,20 +305,25 @@ class ArcChain(MarkedChain):
     def frames_and_moves(self, rows: Tensor) -> Frames:
         """Return the frames after all segments at rows q (N, n), with derivatives of the end."""
         arcs, slope = self._arcs_and_slope(rows)
-        length, bending = self._split(arcs)
-        S = len(length)
-        offsets = self.offsets.to(arcs)
-        columns = tip_and_columns(length, bending, offsets, angular=True, rigid=True)[1]
-        moves, spins, z = columns.split([3 * S, 3 * S, S], dim=1)
+        S = self.n_segments
+        segments = segments_of(arcs, self.offsets.to(arcs)[:, None])
+        at_end = arcs.new_zeros(3, 1)
+        _, columns = tip_and_columns(segments, at_end, angular=True, rigid=True)
+        moves, spins, tangents = columns.split([3 * S, 3 * S, S], dim=1)
         # An arc of length l and bending b moves the end by l c, where c is its derivative with
         # respect to the length, and changes the transverse axes by -b c.
-        along = moves[:, :S]
-        x, y = identity(3, arcs)[:2, :, None, None] - (bending[:, None] * along).cumsum(
-            2
+        by_length = moves[:, :S]
+        points = (segments.length * by_length + segments.offset * tangents).cumsum(1)
+        x_axis, y_axis, _ = identity(3, arcs)[..., None, None]
+        x_axis = x_axis - (segments.x * by_length).cumsum(1)
+        y_axis = y_axis - (segments.y * by_length).cumsum(1)
+        return Frames(
+            torch.stack([x_axis, y_axis, tangents]),
+            points,
+            moves.unflatten(1, (3, S)),
+            spins.unflatten(1, (3, S)),
+            slope,
         )
-        points = (length * along + offsets[:, None] * z).cumsum(1)
-        moves, spins = (part.unflatten(1, (3, S)) for part in (moves, spins))
-        return Frames(torch.stack([x, y, z]), points, moves, spins, slope)
 
     def backbone(self, q: Tensor, n_points: int = 20) -> Tensor:
         """Return points along the whole backbone, base to end.
@@ -339,17 +343,15 @@ class ArcChain(MarkedChain):
         n_points = whole(n_points, "n_points", most=10**6)
         length, bending = self.arcs(q)
         poses = self._poses(length, bending, self.offsets)
-        t = torch.linspace(0.0, 1.0, n_points + 1, dtype=q.dtype, device=q.device)[
-            1:, None
-        ]
-        f, g = stumpff((t * bending[..., None, :]).square().sum(-1))[1:3]
-        bend = (g[..., None] * t) * bending[..., None, :]
-        arc = (t * length[..., None, None]) * torch.cat([bend, f[..., None]], dim=-1)
-        start = poses[..., :-1, :, :]
-        end = poses[..., 1:, None, :3, 3]
-        points = arc @ start[..., :3, :3].mT + start[..., None, :3, 3]
-        points = torch.cat([points[..., :-1, :], end], dim=-2)
-        return torch.cat([poses[..., 0, None, :3, 3], points.flatten(-3, -2)], dim=-2)
+        # A part of an arc is an arc of that part of its length and of its bending.
+        part = torch.arange(1, n_points + 1).to(q) / n_points
+        steps = transforms(
+            part * length[..., None], part[:, None] * bending[..., None, :], 0.0 * part
+        )
+        points = (poses[..., :-1, None, :, :] @ steps)[..., :3, 3]
+        ends = poses[..., 1:, None, :3, 3]  # after the offsets
+        points = torch.cat([points[..., :-1, :], ends], dim=-2).flatten(-3, -2)
+        return torch.cat([poses[..., :1, :3, 3], points], dim=-2)
 
     def extra_repr(self) -> str:
         """Return the summary shown by repr()."""
@@ -395,31 +397,38 @@ class ArcChain(MarkedChain):
         """
         raise NotImplementedError
 
-    def _arcs_and_change(self, rows: Tensor) -> tuple[Tensor, Change]:
-        """Return arcs (3 S, N), and a function from slopes (N, 3, 3 S) by arcs to (N, 3, P)."""
+    def _arcs_and_change(
+        self, rows: Tensor, tangents: Mapping[str, Tensor]
+    ) -> tuple[Tensor, Change]:
+        """Return arcs (3 S, N), and what P changes of the geometry change through the arcs.
+
+        That is a function from derivatives by the arcs (N, 3 K, 3 S) to those along the changes
+        (N, 3 K, P).
+        """
         raise NotImplementedError
 
-    def _changes(
-        self, rows: Tensor, tangents: Mapping[str, Tensor]
-    ) -> tuple[dict[str, Tensor], Tensor]:
-        """Return the changes (P, ...) of all entries, and of the actuator paths.
+    def _all_changes(self, tangents: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return the changes (P, ...) of all entries of the geometry, zero if not given."""
+        first = next(iter(tangents.values()))
+        changes = {}
+        for name, entry in self.geometry().items():
+            none = first.new_zeros(len(first), *entry.shape)
+            changes[name] = tangents.get(name, none)
+        return changes
 
-        The latter are changes of d path / d bending, for all segments, (P, n, 2 S).
-        """
-        counts = self.actuators_per_segment
-        P = len(next(iter(tangents.values())))
-        change = {
-            name: tangents.get(
-                name, torch.zeros_like(value).expand(P, *value.shape)
-            ).to(rows)
-            for name, value in self.geometry().items()
-        }
-        at = levers(self.radii, self.angles, counts).to(rows)
-        turned = torch.stack([-at[1], at[0]]) * change["angles"][:, None]
-        moved = turned + levers(change["radii"], self.angles.to(rows), counts)
-        return change, reading_matrix(moved, counts, self.starts)[
-            ..., self.n_segments :
-        ]
+    def _readings(self) -> Tensor:
+        return reading_matrix(
+            self.radii, self.angles, self.actuators_per_segment, self.starts
+        )
+
+    def _changes_of_bends(self, changes: Mapping[str, Tensor]) -> Tensor:
+        """Return the changes (P, n, 2 S) of the readings of the bendings."""
+        radii = self.radii.to(changes["radii"])
+        angles = self.angles.to(radii)
+        paths = self.actuators_per_segment, self.starts
+        along_angles = bend_matrix(radii, angles + 0.5 * math.pi, *paths)
+        along_radii = bend_matrix(changes["radii"], angles, *paths)
+        return along_radii + along_angles * changes["angles"][..., None]
 
     def coordinates(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return the arcs (N, 3 m) up to the tip and d arcs / dq, (3 m, n) or (N, 3 m, n).
@@ -435,25 +444,18 @@ class ArcChain(MarkedChain):
 
     def from_coordinates(self, z: Tensor) -> Tensor:
         """Return the tip (N, 3), or all markers (N, 3 K), at `coordinates` (N, C)."""
-        if len(self.markers) == 1:
-            return self._tip_of(z.mT, z)
-        tips = [one.from_coordinates(one.up_to_tip(z.mT).mT) for one in self.tips()]
-        return torch.cat(tips, dim=-1)
+        return self._x_of(self._coordinates_to_markers(z.mT))
 
     def from_coordinates_and_jacobian(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """Return `from_coordinates` (N, 3 K) and its derivative (N, 3 K, C)."""
-        if len(self.markers) == 1:
-            tail, columns = tip_and_columns(*self._to_point(z.mT))
-            return self._in_measuring_frame(tail, z), self._turned(columns).permute(
-                2, 0, 1
-            )
-        pairs = []
-        for one in self.tips():
-            to_tip = one.up_to_tip(identity(3 * self.n_segments, z))
-            x, J = one.from_coordinates_and_jacobian(z @ to_tip.mT)
-            pairs.append((x, J @ to_tip))
-        x, J = (torch.cat(part, dim=1) for part in zip(*pairs, strict=True))
-        return x, J
+        x, columns = self._x_and_columns(self._coordinates_to_markers(z.mT))
+        if len(self.markers) > 1:
+            columns = self.by_arcs(columns)
+        return self._in_measuring_frame(x), self._turned(columns)
+
+    def _coordinates_to_markers(self, z: Tensor) -> Tensor:
+        """Return coordinates (C, ...) as arcs up to each marker, (3 m, K, ...)."""
+        return z[:, None] if len(self.markers) == 1 else self.up_to_markers(z)
 
     def _rows(self, q: Tensor) -> Tensor:
         check_vectors(q, self.n_actuators, "q", self._why_shape())
@@ -466,16 +468,17 @@ class ArcChain(MarkedChain):
     def _arcs(self, q: Tensor) -> Tensor:
         return self._arcs_and_slope(self._rows(q))[0]
 
-    def _to_point(self, arcs: Tensor) -> tuple[Tensor, Tensor, Tensor, Sequence[float]]:
-        """Return lengths, bendings and rigid offsets up to the tip, and the tip's own offset."""
-        offsets = self._tip_offsets(self.offsets).to(arcs)
-        return *self._split(arcs), offsets, self.markers[-1][1:]
+    def _segments(self, arcs: Tensor) -> Segments:
+        """Return the segments (m, K, N) of arcs (3 m, K, N) up to the markers."""
+        offsets = self.offsets_to_markers(self.offsets).to(arcs)
+        return segments_of(arcs, offsets[..., None])
 
-    @staticmethod
-    def _split(arcs: Tensor) -> tuple[Tensor, Tensor]:
-        """Return lengths (S, N) and bending vectors (2, S, N)."""
-        parts = arcs.unflatten(0, (3, -1))
-        return parts[0], parts[1:]
+    def _beside(self, like: Tensor) -> Tensor:
+        """Return the offsets (3, K, 1) of the markers from the backbone [m]."""
+        beside = [offset for _, *offset in self.markers]
+        # Not new_tensor: before torch 2.5 it fails in functional transforms.
+        offsets = torch.tensor(beside, dtype=like.dtype, device=like.device)
+        return offsets.mT[..., None]
 
     def _leading(self, arcs: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return lengths (..., S) and bending vectors (..., S, 2)."""
@@ -494,61 +497,56 @@ class ArcChain(MarkedChain):
         turned = None if self.stage is None else q
         return poses if turned is None else rolled(poses, self.metres(turned)[..., :1])
 
-    def _forward(self, q: Tensor) -> tuple[Tensor]:
-        arcs = self._arcs(q)
-        tips = [one._tip_of(one.up_to_tip(arcs), q) for one in self.tips()]
-        return (tips[0] if len(tips) == 1 else torch.cat(tips, dim=-1),)
+    def _x_of(self, arcs: Tensor) -> Tensor:
+        """Return x (N, 3 K) at arcs (3 m, K, N) up to the markers."""
+        return self._in_measuring_frame(tip(self._segments(arcs), self._beside(arcs)))
 
-    def _forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        arcs, slope = self._arcs_and_slope(self._rows(q))
-        pairs = []
-        for one in self.tips():
-            tail, columns = tip_and_columns(*one._to_point(one.up_to_tip(arcs)))
-            tip = one._in_measuring_frame(tail, q)
-            pairs.append((tip, one._by_actuators(columns, slope, q)))
-        if len(pairs) == 1:
-            return pairs[0]
-        x, J = zip(*pairs, strict=True)
-        return torch.cat(x, dim=-1), torch.cat(J, dim=-2)
+    def _x_and_columns(
+        self, arcs: Tensor, rigid: bool = False
+    ) -> tuple[Tensor, Tensor]:
+        """Return the markers (3, K, N) in the base frame at arcs up to them, and derivatives."""
+        return tip_and_columns(self._segments(arcs), self._beside(arcs), rigid=rigid)
 
-    def _tip_of(self, arcs: Tensor, q: Tensor) -> Tensor:
-        """Return the tips (..., 3) of arcs (3 m, N) up to the tip, in the batch shape of q."""
-        return self._in_measuring_frame(tip(*self._to_point(arcs)), q)
+    def _in_measuring_frame(self, points: Tensor) -> Tensor:
+        """Return points (3, K, N) of the base frame in the measuring frame, (N, 3 K)."""
+        base = self.base.to(points)
+        placed = torch.tensordot(base[:3, :3], points, 1) + base[:3, 3, None, None]
+        return placed.permute(2, 1, 0).flatten(1)
+
+    def _along(self, columns: Tensor, slope: Tensor) -> Tensor:
+        """Return the derivative (N, 3 K, P) of x along changes of the arcs, (3 S, P[, N])."""
+        if slope.ndim == 3:
+            return self._turned(columns) @ slope.permute(2, 0, 1)
+        moved = slope.mT @ columns.flatten(2)
+        return self._turned(moved.unflatten(2, columns.shape[2:]))
 
     def _turned(self, columns: Tensor) -> Tensor:
-        """Return columns (3, k, N), given in the base frame, in the measuring frame."""
+        """Return derivatives (3, C, K, N) of points in the base frame as (N, 3 K, C), measured."""
         base = self.base.to(columns)[:3, :3]
-        return (base @ columns.flatten(1)).unflatten(1, columns.shape[1:])
+        return torch.tensordot(base, columns, 1).permute(3, 2, 0, 1).flatten(1, 2)
 
-    def _in_measuring_frame(self, tail: Tensor, q: Tensor) -> Tensor:
-        base = self.base.to(q)
-        return (base[:3, :3] @ tail + base[:3, 3:]).T.reshape(*q.shape[:-1], 3)
-
-    def _by_actuators(self, columns: Tensor, slope: Tensor, q: Tensor) -> Tensor:
-        """Return the Jacobian by q from columns (3, 3 m, N) by arcs and the slope of the arcs."""
-        columns = self._turned(columns)
-        slope = self.up_to_tip(slope)
-        if slope.ndim == 3:
-            J = torch.matmul(columns.permute(2, 0, 1), slope.permute(2, 0, 1))
-            return J.reshape(*q.shape[:-1], 3, self.n_actuators)
-        J = torch.matmul(slope.T, columns)  # (3, n, N)
-        return J.permute(2, 0, 1).reshape(*q.shape[:-1], 3, self.n_actuators)
+    @classmethod
+    def _arguments(cls, stored: Stored) -> dict[str, Any]:
+        """Return the constructor's arguments, except dtype, from a description."""
+        optional = () if "lengths" in stored.arrays else ("lengths",)
+        arguments: dict[str, Any] = {
+            name: stored.array(name) for name in cls._entries if name not in optional
+        }
+        counts = stored.list_of(int, "actuators_per_segment")
+        arguments["n_actuators"] = counts
+        arguments["angles"] = np.split(arguments["angles"], np.cumsum(counts)[:-1])
+        arguments["routing"] = stored.value("routing", str)
+        return arguments
 
     @classmethod
     def from_stored(cls, stored: Stored, restore: Restore) -> Self:
         """Return the chain built from a description."""
-        arguments = stored_arguments(stored, cls._entries)
-        chain = cls(**arguments, dtype=torch.from_numpy(arguments["base"]).dtype)
-        angles = stored.array("angles").astype(arguments["base"].dtype, copy=False)
-        chain = chain.with_geometry(angles=torch.from_numpy(angles))
-        tip_at = stored.value("tip_at", float)
-        places = stored.list_of(list, "markers")
-        if any([type(number) for number in place] != 4 * [float] for place in places):
-            raise ValueError(
-                f"`markers` must hold lists of four numbers, got {places!r:.60}"
-            )
+        dtype = torch.from_numpy(stored.array("base")).dtype
+        chain = cls(**cls._arguments(stored), dtype=dtype)
+        angles = torch.tensor(stored.array("angles"), dtype=dtype, device="cpu")
+        chain = chain.with_geometry(angles=angles)
         markers = []
-        for at, *beside in [*places[:-1], [tip_at, *places[-1][1:]]]:
+        for at, *beside in stored.list_of(list, "markers"):
             segment = math.ceil(at) - 1
             markers.append((segment, at - segment, beside))
         return chain.with_markers(markers)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, ClassVar
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, ClassVar, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -20,14 +20,17 @@ if TYPE_CHECKING:
 
 __all__ = ["Chain"]
 
+_Values = TypeVar("_Values", bound=Tensor | tuple[Tensor, ...])
 _UNITS = {
     "angles": "rad",
     "rest_bends": "rad",
     "gains": "m per unit of q",
     "axial_stiffness": "-",
+    "bending_stiffness": "m²/rad²",
+    "actuator_zeros": "unit of q",
+    "joint_zeros": "unit of q",
 }
-_UNITS |= {"bending_stiffness": "m²/rad²"}  # others are in metres
-_UNITS |= dict.fromkeys(("actuator_zeros", "joint_zeros"), "unit of q")
+"""Units of entries of the geometry; others are in metres."""
 _FAR = 50.0  # robot sizes; some extensible robots are long and thin
 
 
@@ -64,12 +67,11 @@ class Chain(PoseModel):
 
     def html_rows(self) -> dict[str, object]:
         """Return names and values that a notebook shows of the chain."""
-        entries = self.geometry().items()
-        shown = {
-            f"{name} [{_UNITS.get(name, 'm')}]": numbers(a.detach())
-            for name, a in entries
-        }
-        return {**super().html_rows(), **shown}
+        rows = super().html_rows()
+        for name, value in self.geometry().items():
+            unit = _UNITS.get(name, "m")
+            rows[f"{name} [{unit}]"] = numbers(value.detach())
+        return rows
 
     def with_geometry(self, **geometry: Tensor) -> Self:
         """Return a chain with parts of the geometry replaced, differentiable in the new values.
@@ -117,28 +119,35 @@ class Chain(PoseModel):
         """
         self._check_tangents(tangents)
         check_vectors(q, self.n_actuators, "q", self._why_shape())
-        current = self.geometry()
+        return self._slope_of(lambda chain: chain(q), tangents)
 
-        def tip(t: Tensor) -> Tensor:
-            moved = {
-                name: current[name]
-                + torch.tensordot(t.to(current[name]), v.to(current[name]), 1)
-                for name, v in tangents.items()
-            }
-            return self.with_geometry(**moved)(q)
+    def _slope_of(
+        self, function: Callable[[Self], _Values], tangents: Mapping[str, Tensor]
+    ) -> _Values:
+        """Return derivatives (..., P) of tensors of a chain along P changes of its geometry."""
+        geometry = self.geometry()
 
-        return torch.func.jacfwd(tip)(q.new_zeros(len(next(iter(tangents.values())))))
+        def moved(steps: Tensor) -> _Values:
+            entries = {}
+            for name, tangent in tangents.items():
+                entry = geometry[name]
+                change = torch.tensordot(steps.to(entry), tangent.to(entry), 1)
+                entries[name] = entry + change
+            return function(self.with_geometry(**entries))
+
+        first = next(iter(tangents.values()))
+        return torch.func.jacfwd(moved)(first.new_zeros(len(first)))
 
     def _check_tangents(self, tangents: Mapping[str, Tensor]) -> None:
-        shapes = {name: value.shape for name, value in self.geometry().items()}
-        entries = tangents if isinstance(tangents, Mapping) else {}
-        if not entries or not {*entries} <= {*shapes}:
-            need = f"must map entries of the geometry, {sorted(shapes)}, to changes"
+        geometry = self.geometry()
+        if not tangents or not {*tangents} <= {*geometry}:
+            need = f"must map entries of the geometry, {[*geometry]}, to changes"
             raise ValueError(f"`tangents` {need}, got {tangents!r:.80}.")
-        first = next(iter(entries.values()))
-        for name, value in entries.items():
+        n_changes = len(next(iter(tangents.values())))
+        for name, value in tangents.items():
             check_tensor(value, f"tangents[{name!r}]")
-            check_shape(value, f"tangents[{name!r}]", (len(first), *shapes[name]))
+            shape = (n_changes, *geometry[name].shape)
+            check_shape(value, f"tangents[{name!r}]", shape)
 
     def poses(self, q: Tensor) -> Tensor:
         """Return the poses (..., K, 4, 4) of the base and of the frames along the robot."""

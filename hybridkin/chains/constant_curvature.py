@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -16,8 +17,9 @@ from hybridkin._core.blocks import in_blocks
 from hybridkin._core.plan import NoKernel, Plan
 from hybridkin._core.plausible import PlausibleRows
 from hybridkin._core.stored import Layout, Stored
-from hybridkin.chains._arcs import free_arcs, levers, reading_matrix, turned_by_first
-from hybridkin.chains._checks import bend_counts, filled, float_dtype
+from hybridkin.chains._arcs import turned_by_first
+from hybridkin.chains._checks import filled, float_dtype
+from hybridkin.chains._paths import bend_counts, free_arcs
 from hybridkin.chains.arc_chain import STRUCTURE, ArcChain, Change, frame_numbers
 
 __all__ = ["ConstantCurvatureChain"]
@@ -28,7 +30,7 @@ _NOTICED = 0.1  # share of the radius: the reading of a bend of 0.1 rad
 
 def _write_plan(plan: Plan, stored: Stored) -> int:
     """Write the node of a chain: its frame, and the linear map from q to its arcs."""
-    if stored.settings.get("stage") is not None:
+    if stored.value("stage", (str, None)) is not None:
         raise NoKernel("a chain on a rotation stage has no kernel")
     radii = stored.array("radii")
     reach = 10.0 * radii.mean()
@@ -45,14 +47,14 @@ def _write_plan(plan: Plan, stored: Stored) -> int:
 
     matrix = by_segment("arc_matrix")
     offset = by_segment("arc_offset")
-    n = width = matrix.shape[2]
+    n = matrix.shape[2]
+    width = n
     step = 0  # columns from the actuators of a segment to those of the next one
     if n % n_segments == 0:
+        # Only the columns of a segment's own actuators, if all others are zero.
         per_segment = n // n_segments
-        blocks = [
-            rows[:, k * per_segment :][:, :per_segment] for k, rows in enumerate(matrix)
-        ]
-        diagonal = np.stack(blocks)
+        columns = np.arange(n_arcs)[:, None] * per_segment + np.arange(per_segment)
+        diagonal = np.take_along_axis(matrix, columns[:, None], axis=2)
         if np.count_nonzero(diagonal) == np.count_nonzero(matrix):
             matrix = diagonal
             step = per_segment
@@ -123,8 +125,15 @@ class ConstantCurvatureChain(ArcChain):
     tensor([0.0000, 0.0000, 0.7500], dtype=torch.float64)
     """
 
-    _entries = tuple(
-        "radii angles lengths offsets rest_bends actuator_zeros gains base".split()
+    _entries = (
+        "radii",
+        "angles",
+        "lengths",
+        "offsets",
+        "rest_bends",
+        "actuator_zeros",
+        "gains",
+        "base",
     )
     layout = Layout(
         "constant_curvature",
@@ -157,23 +166,22 @@ class ConstantCurvatureChain(ArcChain):
         dtype = float_dtype(dtype)
         geometry = self._checked(
             routing,
-            radii,
-            lengths,
-            n_actuators,
-            angles,
-            offsets,
-            rest_bends,
-            gains,
-            base,
-            dtype,
+            radii=radii,
+            lengths=lengths,
+            n_actuators=n_actuators,
+            angles=angles,
+            offsets=offsets,
+            rest_bends=rest_bends,
+            gains=gains,
+            base=base,
+            dtype=dtype,
         )
         zeros = filled(actuator_zeros, "actuator_zeros", dtype, (self.n_actuators,))
-        self.bends = bend_counts(
-            geometry["angles"].split(self.actuators_per_segment), self.extensible
-        )
+        by_segment = geometry["angles"].split(self.actuators_per_segment)
+        self.bends = bend_counts(by_segment, self.extensible)
         self.stage = stage
-        turns = isinstance(stage, str) and stage == "rotation" and self.bends[0] == 0
-        if not (turns or stage is None):
+        turns = stage == "rotation" and self.bends[0] == 0
+        if stage is not None and not turns:
             raise ValueError(
                 '`stage` must be None or "rotation"; "rotation" needs a first segment with one '
                 f"actuator and without a length, got {stage!r}."
@@ -187,6 +195,11 @@ class ConstantCurvatureChain(ArcChain):
         if self.lengths is None:
             return ("radii", *gain, "base")
         return ("radii", "turns", "rest_bends", "lengths", *gain, "base")
+
+    @property
+    def rest(self) -> Tensor:
+        """The q (n,) at which tendons are not displaced and chambers have length 0."""
+        return self.actuator_zeros
 
     def consistency(self, q: Tensor) -> Tensor:
         """Return by how much the actuator lengths of each segment contradict each other.
@@ -214,8 +227,9 @@ class ConstantCurvatureChain(ArcChain):
         >>> chain.consistency(q).round(decimals=6)
         tensor([0.0000, 0.0030], dtype=torch.float64)
         """
-        rows = self.metres(self._rows(q))
-        return self._by_segment(rows - rows @ self._explained_by_arcs().to(q).T, q)
+        metres = self.metres(q)
+        explained = metres @ self._explained_by_arcs().to(q).mT
+        return self._by_segment(metres - explained)
 
     def contradictory(self, q: Tensor) -> Tensor:
         """Return whether the actuator lengths of each segment contradict each other.
@@ -245,7 +259,7 @@ class ConstantCurvatureChain(ArcChain):
         tensor([[False],
                 [ True]])
         """
-        readings = self._by_segment(self.metres(self._rows(q)), q)
+        readings = self._by_segment(self.metres(q))
         residual = self.consistency(q)
         explained = (readings.square() - residual.square()).clamp(min=0.0).sqrt()
         least = torch.maximum(_NOTICED * self.radii.to(q), _CONTRADICTED * explained)
@@ -270,21 +284,22 @@ class ConstantCurvatureChain(ArcChain):
         rows = self._rows(q)
         if all(self.extensible):
             return None
+        fixed_length = ~torch.tensor(self.extensible, device=q.device)
         with torch.no_grad():
-            fixed_length = ~torch.tensor(self.extensible, device=q.device)
             (wrong,) = in_blocks(
-                lambda some: (self.contradictory(some) & fixed_length,), rows
+                lambda q: (self.contradictory(q) & fixed_length,), rows
             )
             if not wrong.any():
                 return None
             residual = self.consistency(rows) * wrong
         row, segment = divmod(int(residual.argmax()), self.n_segments)
+        n_wrong = int(wrong.any(-1).sum())
         return (
-            f"{int(wrong.any(-1).sum())} of {len(rows)} rows of `{name}` pull the tendons of a "
-            "segment together or release them, which bends nothing in a ConstantCurvatureChain "
-            "but compresses a robot or leaves tendons slack: the worst is row "
-            f"{row}, segment {segment + 1}, {1e3 * float(residual[row, segment]):.3g} mm rms. "
-            "ElasticTendonChain models tendons that can only pull."
+            f"{n_wrong} of {len(rows)} rows of `{name}` pull the tendons of a segment together or "
+            "release them, which bends nothing in a ConstantCurvatureChain but compresses a robot "
+            f"or leaves tendons slack: the worst is row {row}, segment {segment + 1}, "
+            f"{1e3 * float(residual.max()):.3g} mm rms. ElasticTendonChain models tendons that can "
+            "only pull."
         )
 
     def plausible_rows(self) -> PlausibleRows:
@@ -312,14 +327,10 @@ class ConstantCurvatureChain(ArcChain):
         """Limits of q: none for tendons, lengths above 0 m in extensible segments."""
         if not self.absolute.any():
             return super().limits
-        if self.absolute.all() and self.in_metres and not self.actuator_zeros.any():
-            return super().limits | {"q_min": 0.0}
-        low = torch.where(
-            self.absolute & (self.gains > 0), self.actuator_zeros, -torch.inf
-        )
-        high = torch.where(
-            self.absolute & (self.gains < 0), self.actuator_zeros, torch.inf
-        )
+        above = self.absolute & (self.gains > 0)
+        below = self.absolute & (self.gains < 0)
+        low = torch.where(above, self.actuator_zeros, -torch.inf)
+        high = torch.where(below, self.actuator_zeros, torch.inf)
         return super().limits | {"q_min": low, "q_max": high}
 
     def longest(self, largest: Tensor) -> Tensor:
@@ -338,106 +349,113 @@ class ConstantCurvatureChain(ArcChain):
 
     def extra_repr(self) -> str:
         """Return the summary shown by repr()."""
-        kinds = ["extensible" if own else "inextensible" for own in self.extensible]
-        kinds[0] = kinds[0] if self.stage is None else f"{self.stage} stage"
+        kinds = [
+            "extensible" if stretches else "inextensible"
+            for stretches in self.extensible
+        ]
+        if self.stage is not None:
+            kinds[0] = f"{self.stage} stage"
         return f"{' and '.join(dict.fromkeys(kinds))}, {super().extra_repr()}"
 
     def _set_geometry(self, geometry: Mapping[str, Tensor | None]) -> None:
         super()._set_geometry(geometry)
-        radii = self.radii
-        free = self._free_arcs(self.angles)
-        # Scaled to bendings times radius: with mixed units half of the digits would be lost.
-        units = torch.cat([torch.ones_like(radii), 1.0 / radii, 1.0 / radii])
-        scaled = self._readings() * units @ free
-        held = identity(len(free), free) - free
-        inverse = torch.linalg.solve(scaled.mT @ scaled + held, scaled.mT)
+        free = self._free_arcs()
+        # Arcs in units with similar readings, bendings times radius: metres beside radians would
+        # lose half of the digits.
+        units = torch.cat([torch.ones_like(self.radii), *[1.0 / self.radii] * 2])
+        readings = self._readings() * units @ free
+        # Least squares by the normal equations, with ones for the arcs that are not free.
+        fixed = identity(len(free), free) - free
+        inverse = torch.linalg.solve(readings.mT @ readings + fixed, readings.mT)
         # One step of refinement: the normal equations lose some digits.
-        inverse = inverse + (free - inverse @ scaled) @ inverse
+        inverse = inverse + (free - inverse @ readings) @ inverse
         matrix = inverse * units[:, None] * self.gains
-        straight = self._placed(radii[:0] if self.lengths is None else self.lengths)
-        offset = (
-            torch.cat([straight, *self.rest_bends.T]) - matrix @ self.actuator_zeros
-        )
+        lengths = self.radii[:0] if self.lengths is None else self.lengths
+        rest = torch.cat([self._placed(lengths), *self.rest_bends.T])
         self.register_buffer("arc_matrix", matrix)
-        self.register_buffer("arc_offset", offset)
+        self.register_buffer("arc_offset", rest - matrix @ self.actuator_zeros)
 
-    def _by_segment(self, rows: Tensor, q: Tensor) -> Tensor:
-        """Return the RMS (..., S) of rows (N, n) over the actuators of each segment."""
-        parts = rows.split(self.actuators_per_segment, dim=-1)
-        norms = [
+    def _free_arcs(self) -> Tensor:
+        by_segment = self.angles.split(self.actuators_per_segment)
+        return free_arcs(by_segment, self.extensible, self.bends)
+
+    def _placed(self, lengths: Tensor) -> Tensor:
+        """Return lengths (..., S), 0 if extensible, from those of the other segments."""
+        place = identity(self.n_segments, lengths)
+        return lengths @ place[np.logical_not(self.extensible)]
+
+    def _by_segment(self, q: Tensor) -> Tensor:
+        """Return the RMS (..., S) of q (..., n) over the actuators of each segment."""
+        parts = q.split(self.actuators_per_segment, dim=-1)
+        rms = [
             torch.linalg.vector_norm(part, dim=-1) / part.shape[-1] ** 0.5
             for part in parts
         ]
-        return torch.stack(norms, dim=-1).reshape(*q.shape[:-1], self.n_segments)
+        return torch.stack(rms, dim=-1)
 
     def _arcs_and_slope(self, rows: Tensor) -> tuple[Tensor, Tensor]:
         arcs = self._linear(rows)
         matrix = self.arc_matrix.to(rows)
         if self.stage is None:
-            return (arcs, matrix)
+            return arcs, matrix
         return turned_by_first(arcs, matrix[..., None])
 
     def _linear(self, rows: Tensor) -> Tensor:
         """Return the arcs (3 S, N) of rows (N, n) before the stage turns them by length 0."""
-        return torch.addmm(
-            self.arc_offset.to(rows)[:, None], self.arc_matrix.to(rows), rows.T
+        offset = self.arc_offset.to(rows)[:, None]
+        return torch.addmm(offset, self.arc_matrix.to(rows), rows.T)
+
+    def _arcs_and_change(
+        self, rows: Tensor, tangents: Mapping[str, Tensor]
+    ) -> tuple[Tensor, Change]:
+        by_matrix, by_rest = self._changes_of_map(tangents)  # (P, 3 S, n), (P, 3 S)
+        arcs = self._linear(rows)
+        slope = torch.tensordot(rows, by_matrix, ([1], [2])) + by_rest  # (N, P, 3 S)
+        slope = slope.permute(2, 1, 0)
+        if self.stage is not None:
+            arcs, slope = turned_by_first(arcs, slope)
+        return arcs, lambda by_arcs: by_arcs @ slope.permute(2, 0, 1)
+
+    def _changes_of_map(self, tangents: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """Return the changes (P, ...) of `arc_matrix` and `arc_offset`.
+
+        For M, the pseudo-inverse of the readings B of the free arcs F, the change is that of Golub
+        & Pereyra, SIAM J. Numer. Anal. 10 (1973), eq. 4.12.
+        """
+        changes = self._all_changes(tangents)
+        like = changes["radii"]
+        gains = self.gains.to(like)
+        M = self.arc_matrix.to(like) / gains
+        F = self._free_arcs().to(like)
+        B = self._readings().to(like)
+        dB = (
+            nn.functional.pad(self._changes_of_bends(changes), (self.n_segments, 0)) @ F
         )
-
-    def _readings(self) -> Tensor:
-        at = levers(self.radii, self.angles, self.actuators_per_segment)
-        return reading_matrix(at, self.actuators_per_segment, self.starts)
-
-    def _free_arcs(self, angles: Tensor) -> Tensor:
-        return free_arcs(
-            angles.split(self.actuators_per_segment), self.extensible, self.bends
-        )
-
-    def _placed(self, lengths: Tensor) -> Tensor:
-        """Return lengths (..., S) of all segments, 0 if extensible, from those that are given."""
-        return (
-            lengths
-            @ identity(self.n_segments, lengths)[np.logical_not(self.extensible)]
-        )
-
-    def _arcs_and_change(self, rows: Tensor) -> tuple[Tensor, Change]:
-        def change(by_arcs: Tensor, tangents: Mapping[str, Tensor]) -> Tensor:
-            moved = self._arc_tangents(rows, tangents).permute(2, 1, 0)
-            if self.stage is not None:
-                moved = turned_by_first(self._linear(rows), moved)[1]
-            return by_arcs @ moved.permute(2, 0, 1)
-
-        return self._arcs_and_slope(rows)[0], change
-
-    def _arc_tangents(self, rows: Tensor, tangents: Mapping[str, Tensor]) -> Tensor:
-        """Return the derivatives (N, P, 3 S) of the arcs along P changes of the geometry."""
-        change, by_reading = self._changes(rows, tangents)
-        readings = self._readings().to(rows)
-        free = self._free_arcs(self.angles).to(rows)
-        by_reading = nn.functional.pad(by_reading, (self.n_segments, 0)) @ free
-        # Derivative of the pseudo-inverse M of the matrix B from free arcs to actuator lengths,
-        # M B = free (Golub & Pereyra, SIAM J. Numer. Anal. 10 (1973), eq. 4.12).
-        # for actuators in metres
-        M = (self.arc_matrix / self.gains).to(rows)
-        by_matrix = 0.0
+        dM = torch.zeros_like(dB).mT
         if 1 in self.bends:  # planes turn with their actuators
-            turns = torch.func.jacfwd(self._free_arcs)(self.angles).to(rows)
-            turns = (turns @ change["angles"].mT).permute(2, 0, 1)
-            by_reading = by_reading + readings @ turns
-            by_matrix = (
-                (identity(len(free), free) - free) @ turns @ readings.mT @ M.mT @ M
-            )
-        contradicted = identity(len(readings), rows) - readings @ M
-        by_matrix = (
-            by_matrix + M @ M.mT @ by_reading.mT @ contradicted - M @ by_reading @ M
-        )
-        straight = self._placed(change.get("lengths", change["radii"][:, :0]))
-        rest = torch.cat([straight, *change["rest_bends"].unbind(-1)], dim=-1)
-        shift = rest - change["actuator_zeros"] @ self.arc_matrix.to(rows).T
-        moving = (self.metres(rows) @ by_matrix.flatten(0, 1).T).unflatten(
-            1, by_matrix.shape[:2]
-        )
-        if "gains" in tangents:
-            moving = (
-                moving + ((rows - self.rest.to(rows))[:, None] * change["gains"]) @ M.T
-            )
-        return moving + shift
+            dF = self._slope_of(ConstantCurvatureChain._free_arcs, tangents)
+            dF = dF.to(like).permute(2, 0, 1)
+            dB = dB + B @ dF
+            dM = (identity(len(F), F) - F) @ dF @ B.mT @ M.mT @ M
+        unexplained = identity(len(B), B) - B @ M
+        dM = dM + M @ M.mT @ dB.mT @ unexplained - M @ dB @ M
+        d_matrix = dM * gains + M * changes["gains"][:, None]
+        d_lengths = self._placed(changes.get("lengths", like[:, :0]))
+        d_rest = torch.cat([d_lengths, *changes["rest_bends"].unbind(-1)], dim=1)
+        d_zeros = changes["actuator_zeros"] @ self.arc_matrix.to(like).mT
+        return d_matrix, d_rest - d_zeros - d_matrix @ self.actuator_zeros.to(like)
+
+    @classmethod
+    def _arguments(cls, stored: Stored) -> dict[str, Any]:
+        arguments = super()._arguments(stored)
+        given_lengths = iter(arguments.pop("lengths", ()))
+        lengths = []
+        for stretches in stored.list_of(bool, "extensible"):
+            lengths.append(None if stretches else next(given_lengths, math.nan))
+        angles = arguments["angles"]
+        for k, n_bends in enumerate(stored.list_of(int, "bends")):
+            # Planar actuators stay planar, although calibration has moved their angles slightly.
+            if n_bends == 1:
+                angles[k] = math.pi * (np.arange(len(angles[k])) % 2)
+        stage = stored.value("stage", (str, None))
+        return {**arguments, "lengths": lengths, "angles": angles, "stage": stage}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -14,14 +14,21 @@ from hybridkin._core.arrays import LARGEST, Numbers, Transform
 from hybridkin._core.plan import Plan
 from hybridkin._core.stored import Layout, Stored
 from hybridkin.chains import _slack
-from hybridkin.chains._arcs import levers, reading_matrix
 from hybridkin.chains._checks import filled, float_dtype
 from hybridkin.chains.arc_chain import STRUCTURE, ArcChain, Change, frame_numbers
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
 
 __all__ = ["ElasticTendonChain"]
 
-_SHAPING = "radii angles bending_stiffness axial_stiffness rest_bends tendon_zeros gains".split()
+_SHAPING = (
+    "radii",
+    "angles",
+    "bending_stiffness",
+    "axial_stiffness",
+    "rest_bends",
+    "tendon_zeros",
+    "gains",
+)
 _TABLE = 12  # largest number of tendons for which all responses are stored
 
 
@@ -59,6 +66,19 @@ def _write_plan(plan: Plan, stored: Stored) -> int:
     return plan.node(
         "elastic", len(x), 3, numbers, n_arcs, n_segments, equal_count, *counts
     )
+
+
+class _Table(NamedTuple):
+    """Stored responses of all sets of taut tendons, and the state they were computed for."""
+
+    shaping: list[Tensor]
+    state: list[object]
+    responses: _slack.Responses
+
+    def holds(self, shaping: list[Tensor], state: list[object]) -> bool:
+        """Return whether the geometry is still the same."""
+        same = [a is b for a, b in zip(self.shaping, shaping, strict=True)]
+        return all(same) and self.state == state
 
 
 class ElasticTendonChain(ArcChain):
@@ -146,11 +166,7 @@ class ElasticTendonChain(ArcChain):
         STRUCTURE,
         write_plan=_write_plan,
     )
-    # The table is checked against the geometry.
-    _structure = (
-        *ArcChain._structure,
-        "_table",
-    )
+    _structure = (*ArcChain._structure, "_table")
 
     def __init__(
         self,
@@ -171,38 +187,39 @@ class ElasticTendonChain(ArcChain):
     ) -> None:
         super().__init__()
         dtype = float_dtype(dtype)
-        if lengths is None or (isinstance(lengths, (list, tuple)) and None in lengths):
+        geometry = self._checked(
+            routing,
+            radii=radii,
+            lengths=lengths,
+            n_actuators=n_actuators,
+            angles=angles,
+            offsets=offsets,
+            rest_bends=rest_bends,
+            gains=gains,
+            base=base,
+            dtype=dtype,
+        )
+        if any(self.extensible):
             raise ValueError(
                 "`lengths` must hold the backbone length of every segment, got None."
             )
-        geometry = self._checked(
-            routing,
-            radii,
-            lengths,
-            n_actuators,
-            angles,
-            offsets,
-            rest_bends,
-            gains,
-            base,
-            dtype,
-        )
         if self.n_actuators > _slack.MOST:
             raise ValueError(
                 f"`n_actuators` must be at most {_slack.MOST} in all, got {self.n_actuators}."
             )
         if bending_stiffness is None:
-            bending = 0.01 * geometry["radii"] ** 2
-        else:
-            bending = bending_stiffness
-        axial = 10.0 if axial_stiffness is None else axial_stiffness
-        for name, value in (("bending_stiffness", bending), ("axial_stiffness", axial)):
+            bending_stiffness = 0.01 * geometry["radii"] ** 2
+        stiffness = {
+            "bending_stiffness": bending_stiffness,
+            "axial_stiffness": 10.0 if axial_stiffness is None else axial_stiffness,
+        }
+        for name, value in stiffness.items():
             geometry[name] = filled(value, name, dtype, (self.n_segments,))
             if not (geometry[name] > 1.0 / LARGEST).all():
                 need = f"must be positive, over {1.0 / LARGEST:g}"
                 raise ValueError(f"`{name}` {need}, got {geometry[name].tolist()}.")
         zeros = filled(tendon_zeros, "tendon_zeros", dtype, (self.n_actuators,))
-        self._table: tuple[list[Tensor], object, _slack.Responses] | None = None
+        self._table: _Table | None = None
         self._set_geometry({**geometry, "tendon_zeros": zeros})
 
     @classmethod
@@ -239,26 +256,23 @@ class ElasticTendonChain(ArcChain):
         counts = chain.actuators_per_segment
         geometry["tendon_zeros"] = geometry.pop("actuator_zeros") * chain.gains
         angles = [part.tolist() for part in geometry["angles"].split(counts)]
-        arguments = {
+        arguments: dict[str, Any] = {
+            **geometry,
+            "angles": angles,
             "n_actuators": counts,
             "routing": chain.routing,
             "dtype": chain.radii.dtype,
+            **options,
         }
-        return cls(**{**geometry, "angles": angles, **arguments, **options})._marked(
-            chain.markers
-        )
+        return cls(**arguments)._marked(chain.markers)
 
     @property
     def default_parameters(self) -> tuple[str, ...]:
         """Names of the parameters that a calibration fits by default."""
-        stiffness = ("bending_stiffness", "axial_stiffness")
         geometry = ("radii", "turns", "rest_bends", "lengths", "tool", "base")
-        return (
-            *geometry,
-            *stiffness,
-            "tendon_zeros",
-            *(() if self.in_metres else ("gain",)),
-        )
+        tendons = ("bending_stiffness", "axial_stiffness", "tendon_zeros")
+        gain = () if self.in_metres else ("gain",)
+        return (*geometry, *tendons, *gain)
 
     @property
     def pulls(self) -> Tensor:
@@ -300,115 +314,111 @@ class ElasticTendonChain(ArcChain):
         return {**super().__getstate__(), "_table": None}
 
     def _elasticity(self) -> _slack.Elasticity:
-        counts = self.actuators_per_segment
-        at = levers(self.radii, self.angles, counts)
-        ones = torch.ones_like(self.radii)
+        bend = 1.0 / self.radii
+        bending = self.bending_stiffness
+        no_change = torch.zeros_like(self.radii)
         return _slack.Elasticity(
-            reading_matrix(at, counts, self.starts),
-            torch.cat([ones, 1.0 / self.radii, 1.0 / self.radii]),
-            torch.cat(
-                [self.axial_stiffness, self.bending_stiffness, self.bending_stiffness]
-            ),
-            torch.cat([0.0 * ones, *self.rest_bends.unbind(-1)]),
-            self.tendon_zeros,
-            self.gains,
+            readings=self._readings(),
+            units=torch.cat([torch.ones_like(bend), bend, bend]),
+            stiffness=torch.cat([self.axial_stiffness, bending, bending]),
+            rest=torch.cat([no_change, *self.rest_bends.unbind(-1)]),
+            zeros=self.tendon_zeros,
+            gains=self.gains,
         )
 
     def _all_responses(self, rows: Tensor) -> _slack.Responses:
-        """Return the responses of all sets of taut tendons, cached until the geometry changes."""
-        geometry = self.geometry()
-        shaping = [geometry[name] for name in _SHAPING]
-        learning = torch.is_grad_enabled() and any(
-            value.requires_grad for value in shaping
-        )
-        passing = learning or any(value.is_inference() for value in shaping)
-        if passing:
-            key = None
-        else:
-            key = (rows.dtype, rows.device, *(v._version for v in shaping))
-        if key is not None and self._table is not None:
-            kept_elasticity, kept_key, responses = self._table
-            if key == kept_key and all(
-                a is b for a, b in zip(kept_elasticity, shaping, strict=True)
-            ):
-                return responses
+        """Return the responses of all sets of taut tendons, stored until the geometry changes."""
+        shaping = [self.get_buffer(name) for name in _SHAPING]
+        for part in shaping:
+            # Not stored: a graph serves one backward pass, inference tensors have no version.
+            if part.is_inference() or (part.requires_grad and torch.is_grad_enabled()):
+                return self._new_responses(rows)
+        versions = [part._version for part in shaping]
+        state = [rows.dtype, rows.device, *versions]
+        if self._table is None or not self._table.holds(shaping, state):
+            self._table = _Table(shaping, state, self._new_responses(rows))
+        return self._table.responses
+
+    def _new_responses(self, rows: Tensor) -> _slack.Responses:
+        """Return the responses of all sets of taut tendons, in the dtype of rows."""
         codes = torch.arange(2**self.n_actuators, device=self.radii.device)
-        # Outside inference mode: derivatives cannot use inference tensors.
-        if torch.is_inference_mode_enabled():
-            guard = torch.inference_mode(False)
-        else:
-            guard = nullcontext()
-        with guard:
-            elasticity = _slack.Elasticity(
-                *(part.double() for part in self._elasticity())
-            )
-            responses = _slack.responses_of(
-                _slack.as_mask(codes, self.n_actuators), elasticity
-            )
-            responses = _slack.Responses(*(part.to(rows) for part in responses))
-        if not passing:
-            self._table = (shaping, key, responses)
-        return responses
+        in_inference = torch.is_inference_mode_enabled()
+        # Later derivatives cannot use tensors of the inference mode.
+        with torch.inference_mode(False) if in_inference else nullcontext():
+            taut = _slack.as_mask(codes, self.n_actuators)
+            responses = _slack.responses_of(taut, self._elasticity().to(torch.float64))
+            return _slack.Responses(*(part.to(rows) for part in responses))
 
     def _find(self, rows: Tensor) -> tuple[Tensor, Tensor, _slack.Responses]:
         """Return the sets of taut tendons (N,) as bits, their places in responses, and those."""
         if self.n_actuators <= _TABLE:
             table = self._all_responses(rows)
-            codes = _slack.FindTaut.apply(
-                _slack.find_in_table, rows.detach(), table.stretch.detach()
-            )
+            stretch = table.stretch.detach()
+            codes = _slack.FindTaut.apply(_slack.find_in_table, rows.detach(), stretch)
             return codes, codes, table
-        elasticity = _slack.Elasticity(*(part.to(rows) for part in self._elasticity()))
-        parts = (part.detach() for part in (rows, *elasticity))
-        codes = _slack.FindTaut.apply(_slack.find_by_solving, *parts)
-        responses = _slack.responses_of(
-            _slack.as_mask(codes, self.n_actuators), elasticity
-        )
-        return codes, torch.arange(len(rows), device=rows.device), responses
+        elasticity = self._elasticity().to(rows)
+        fixed = (part.detach() for part in elasticity)
+        codes = _slack.FindTaut.apply(_slack.find_by_solving, rows.detach(), *fixed)
+        taut = _slack.as_mask(codes, self.n_actuators)
+        places = torch.arange(len(rows), device=rows.device)
+        return codes, places, _slack.responses_of(taut, elasticity)
 
     def _balance(self, rows: Tensor) -> _slack.Balance:
-        codes, at, responses = self._find(rows)
-        shape, stretch = (
-            _slack.applied(maps.index_select(0, at), _slack.extended(rows))
-            for maps in responses[:2]
-        )
+        codes, places, responses = self._find(rows)
+        shape, stretch, compliance = responses.at(places)
+        q = _slack.extended(rows)
         taut = _slack.as_mask(codes, self.n_actuators)
-        compliance = responses.compliance.index_select(0, at)
-        return _slack.Balance(shape, stretch.relu() * taut, taut, compliance)
+        pull = _slack.applied(stretch, q).relu() * taut
+        return _slack.Balance(_slack.applied(shape, q), pull, taut, compliance)
 
     def _arcs_and_slope(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        _, at, responses = self._find(rows)
-        straight = nn.functional.pad(
-            self.get_buffer("lengths").to(rows), (0, 2 * self.n_segments)
-        )
-        maps = responses.shape.index_select(0, at)
-        arcs = (_slack.applied(maps, _slack.extended(rows)) + straight).T.contiguous()
-        return arcs, maps[..., :-1].permute(1, 2, 0)
+        _, places, responses = self._find(rows)
+        maps = responses.shape.index_select(0, places)
+        shape = _slack.applied(maps, _slack.extended(rows))
+        return self._arcs_of(shape), maps[..., :-1].permute(1, 2, 0)
 
-    def _arcs_and_change(self, rows: Tensor) -> tuple[Tensor, Change]:
-        S = self.n_segments
+    def _arcs_of(self, shape: Tensor) -> Tensor:
+        """Return the arcs (3 S, N) of shapes (N, 3 S), which hold changes of length."""
+        straight = nn.functional.pad(
+            self.get_buffer("lengths"), (0, 2 * self.n_segments)
+        )
+        return (shape + straight.to(shape)).mT.contiguous()
+
+    def _arcs_and_change(
+        self, rows: Tensor, tangents: Mapping[str, Tensor]
+    ) -> tuple[Tensor, Change]:
+        """Return arcs and their changes, by the implicit function theorem.
+
+        The forces on the shape a vanish: K (a - a0) + B' pull = 0, with the pull B a + zeros -
+        gains q of the taut tendons. So a changes by -(K + B' B)^-1 times the change of the forces
+        at a fixed shape.
+        """
         shape, pull, taut, compliance = self._balance(rows)
 
-        def change(by_arcs: Tensor, tangents: Mapping[str, Tensor]) -> Tensor:
-            new, by_bendings = self._changes(rows, tangents)
-            readings, _, stiffness, rest, *_ = (
-                part.to(rows) for part in self._elasticity()
-            )
-            bending = new["bending_stiffness"]
-            by_stiffness = torch.cat([new["axial_stiffness"], bending, bending], dim=-1)
-            by_rest = nn.functional.pad(new["rest_bends"].mT.flatten(1), (S, 0))
-            # Implicit function theorem: compliance times the unbalanced forces, accumulated from
-            # the tip: its motion per force on the shape, and per pull of a tendon.
-            by_force = by_arcs @ compliance
-            by_pull = (by_force @ readings.mT) * taut[:, None]
-            turned = pull[:, None, :, None] * by_force[:, :, None, S:]
-            turned = turned + by_pull[..., None] * shape[:, None, None, S:]
-            softer = by_force * (rest - shape)[:, None]
-            effects = [by_force, softer, -by_pull, -turned.flatten(2), by_arcs[..., :S]]
-            causes = [stiffness * by_rest, by_stiffness, new["tendon_zeros"]]
-            causes += [by_bendings.flatten(1), new["lengths"], new["gains"]]
-            effects.append(by_pull * rows[:, None])
+        def change(by_arcs: Tensor) -> Tensor:
+            fixed = self._elasticity().to(rows)
+            by_force = -by_arcs @ compliance
+            by_pull = (by_force @ fixed.readings.mT) * taut[:, None]
+            by_stiffness = by_force * (shape - fixed.rest)[:, None]
+            by_rest = -by_force * fixed.stiffness
+            S = (
+                self.n_segments
+            )  # before it are the lengths, whose readings do not change
+            by_readings = pull[:, None, :, None] * by_force[:, :, None, S:]
+            by_readings = by_readings + by_pull[..., None] * shape[:, None, None, S:]
+
+            changes = self._all_changes(tangents)
+            bending = changes["bending_stiffness"]
+            effects_and_causes = [
+                (by_stiffness[..., :S], changes["axial_stiffness"]),
+                (by_stiffness[..., S:], torch.cat([bending, bending], dim=-1)),
+                (by_rest[..., S:], changes["rest_bends"].mT.flatten(1)),
+                (by_readings.flatten(2), self._changes_of_bends(changes).flatten(1)),
+                (by_pull, changes["tendon_zeros"]),
+                (-by_pull * rows[:, None], changes["gains"]),
+                (by_arcs[..., :S], changes["lengths"]),
+            ]
+            effects, causes = zip(*effects_and_causes, strict=True)
             return torch.cat(effects, dim=-1) @ torch.cat(causes, dim=-1).mT
 
-        straight = nn.functional.pad(self.get_buffer("lengths").to(rows), (0, 2 * S))
-        return (shape + straight).mT.contiguous(), change
+        return self._arcs_of(shape), change

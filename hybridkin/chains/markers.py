@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from hybridkin._core.arrays import number
 from hybridkin.chains._checks import filled
@@ -28,13 +28,16 @@ class MarkedChain(Chain):
     markers : tuple of K tuples of four floats
         For every point its place on the backbone, in segments from the base, and its offset in
         the frame at that place [m]. By default the robot's end.
-    tip_at : float
-        The place of the last marker, the tip.
     """
 
     n_segments: int
     markers: tuple[Marker, ...]
-    tip_at: float
+    stage: str | None = None  # "rotation" if the first segment is a rotation stage
+
+    @property
+    def tip_at(self) -> float:
+        """The place of the tip, the last marker, in segments from the base."""
+        return self.markers[-1][0]
 
     def with_tip(self, at: float) -> Self:
         """Return a chain whose tip is another point of the same robot.
@@ -65,7 +68,7 @@ class MarkedChain(Chain):
             )
         return self._marked([(at, 0.0, 0.0, 0.0)])
 
-    def with_markers(self, markers: Sequence[Any]) -> Self:
+    def with_markers(self, markers: Sequence[Sequence[Any]]) -> Self:
         """Return a chain whose outputs are several points of the same robot.
 
         Parameters
@@ -94,33 +97,28 @@ class MarkedChain(Chain):
         >>> marked(torch.zeros(6, dtype=torch.float64))
         tensor([0.0200, 0.0000, 0.0500, 0.0000, 0.0000, 0.2000], dtype=torch.float64)
         """
-        markers_checked = []
-        for marker in markers if isinstance(markers, (list, tuple)) else [markers]:
-            if not isinstance(marker, (list, tuple)) or len(marker) not in (2, 3):
-                need = "tuples (segment, fraction) or (segment, fraction, offset)"
-                raise ValueError(f"`markers` must be {need}, got {marker!r:.80}.")
-            segment, fraction, *offset = marker
-            beside = filled(
-                offset[0] if offset else 0.0, "markers", torch.float64, (3,)
-            )
-            if (
-                segment not in range(self.n_segments)
-                or not 0.0 < number(fraction, "markers") <= 1
-            ):
-                raise ValueError(
-                    "`markers` must be tuples (segment, fraction, offset) with a segment from 0 to "
-                    f"{self.n_segments - 1} and a fraction in (0, 1], got {segment}, {fraction}."
-                )
-            markers_checked.append((segment + fraction, *beside.tolist()))
-        if not markers_checked:
-            raise ValueError("`markers` must hold at least one marker, got none.")
-        if getattr(self, "stage", None) and any(
-            x or y for _, x, y, _ in markers_checked
-        ):
+        need = (
+            "`markers` must be tuples (segment, fraction) or (segment, fraction, offset), with a "
+            f"segment from 0 to {self.n_segments - 1} and a fraction in (0, 1]"
+        )
+        places: list[Marker] = []
+        for marker in markers:
+            try:
+                segment, fraction, offset = (*marker, 0.0)[:3]
+            except (TypeError, ValueError) as error:
+                raise ValueError(f"{need}, got {marker!r:.80}.") from error
+            x, y, z = filled(offset, "markers", torch.float64, (3,)).tolist()
+            inside = 0.0 < number(fraction, "markers") <= 1.0
+            if segment not in range(self.n_segments) or not inside:
+                raise ValueError(f"{need}, got {marker!r:.80}.")
+            places.append((float(segment + fraction), x, y, z))
+        if not places:
+            raise ValueError(f"{need}, got none.")
+        if self.stage is not None and any(x or y for _, x, y, _ in places):
             raise ValueError(
                 "`markers` must lie on the backbone of a robot on a rotation stage."
             )
-        return self._marked(markers_checked)
+        return self._marked(places)
 
     @property
     def tip_model(self) -> Self:
@@ -133,33 +131,74 @@ class MarkedChain(Chain):
         return [self] if single else [self._marked([marker]) for marker in self.markers]
 
     def up_to_tip(self, arcs: Tensor) -> Tensor:
-        """Return the rows (3 m, ...) up to the tip, of arcs (3 S, ...) or of their slope.
+        """Return arcs (3 S, ...), or their slope, up to the tip, (3 m, ...)."""
+        return self.up_to_markers(arcs)[:, -1]
 
-        The last of the m segments is cut at the tip.
+    def up_to_markers(self, arcs: Tensor) -> Tensor:
+        """Return arcs (3 S, ...), or their slope, up to each of K markers, (3 m, K, ...).
+
+        The m segments lead to the farthest marker. An arc is cut at a marker.
         """
-        if self.tip_at == self.n_segments:
-            return arcs
-        m = math.ceil(self.tip_at)
-        parts = arcs.unflatten(0, (3, self.n_segments))[:, :m]
-        last = parts[:, -1:] * (self.tip_at - m + 1)
-        return torch.cat([parts[:, :-1], last], dim=1).flatten(0, 1)
+        if self.markers_at_end:
+            return arcs[:, None]
+        reached = self._reached(arcs)
+        by_kind = arcs.unflatten(0, (3, self.n_segments)).unbind()
+        return torch.cat([_times(reached, part) for part in by_kind])
 
-    def _marked(self, markers: Sequence[Any]) -> Self:
+    def offsets_to_markers(self, offsets: Tensor) -> Tensor:
+        """Return the rigid offsets (S,) that lie before each marker, (m, K)."""
+        if self.markers_at_end:
+            return offsets[:, None]
+        return _times(self._reached(offsets) == 1.0, offsets)
+
+    def by_arcs(self, columns: Tensor) -> Tensor:
+        """Return derivatives (3, 3 S, K, N) by arcs, from those by arcs up to the markers.
+
+        The latter are (3, 3 m, K, N).
+        """
+        if self.markers_at_end:
+            return columns
+        reached = self._reached(columns)
+        parts = columns.unflatten(1, (3, -1)) * reached[..., None]
+        return self._padded(parts).flatten(1, 2)
+
+    def by_offsets(self, columns: Tensor) -> Tensor:
+        """Return derivatives (3, S, K, N) by offsets, from those before markers (3, m, K, N)."""
+        if self.markers_at_end:
+            return columns
+        before = self._reached(columns) == 1.0
+        return self._padded(columns * before[..., None])
+
+    def _padded(self, parts: Tensor) -> Tensor:
+        """Return derivatives (..., S, K, N): zero by segments after all markers."""
+        n_after = self.n_segments - parts.shape[-3]
+        return nn.functional.pad(parts, (0, 0, 0, 0, 0, n_after))
+
+    @property
+    def markers_at_end(self) -> bool:
+        """Whether the only marker is at the end of the robot."""
+        return len(self.markers) == 1 and self.markers[0][0] == self.n_segments
+
+    def _reached(self, like: Tensor) -> Tensor:
+        """Return the part (m, K) of the arc of every segment that lies before each marker."""
+        places = [at for at, *_ in self.markers]
+        segments = [*range(math.ceil(max(places)))]
+        # Not new_tensor: before torch 2.5 it fails in functional transforms.
+        options = {"dtype": like.dtype, "device": like.device}
+        before = torch.tensor(segments, **options)[:, None]
+        return (torch.tensor(places, **options) - before).clamp(0.0, 1.0)
+
+    def _marked(self, markers: Sequence[Marker]) -> Self:
         chain = self.with_geometry()  # shares the buffers
         chain._set_markers(markers)
         return chain
 
-    def _set_markers(self, markers: Sequence[Any]) -> None:
-        self.markers = tuple(
-            (float(at), float(x), float(y), float(z)) for at, x, y, z in markers
-        )
-        self.tip_at = self.markers[-1][0]
+    def _set_markers(self, markers: Sequence[Marker]) -> None:
+        self.markers = tuple(markers)
         self.n_outputs = 3 * len(self.markers)
 
-    def _tip_offsets(self, offsets: Tensor) -> Tensor:
-        """Return the rigid offsets (..., m) up to the tip."""
-        if self.tip_at == self.n_segments:
-            return offsets
-        m = math.ceil(self.tip_at)
-        last = offsets[..., m - 1 : m] * float(self.tip_at == m)
-        return torch.cat([offsets[..., : m - 1], last], dim=-1)
+
+def _times(reached: Tensor, values: Tensor) -> Tensor:
+    """Return parts (m, K) times the first m of values (S, ...), shape (m, K, ...)."""
+    values = values[: len(reached), None]
+    return reached.reshape(*reached.shape, *[1] * (values.ndim - 2)) * values

@@ -107,8 +107,9 @@ def _tips(model: ForwardModel) -> _Tips:
         "arc_matrix": np.eye(3 * m),
         "arc_offset": np.zeros(3 * m),
     }
-    place = {"tip_at": float(m), "markers": [[float(m), *model.markers[-1][1:]]]}
-    plan = Plan(Stored("constant_curvature", place, arrays, derived=derived))
+    markers = [[float(m), *model.markers[-1][1:]]]
+    settings = {"markers": markers, "stage": None}
+    plan = Plan(Stored("constant_curvature", settings, arrays, derived=derived))
     program = Program(plan)
 
     def tips(z: Tensor) -> tuple[Tensor, Tensor]:

@@ -14,7 +14,6 @@ from hybridkin import (
 )
 from hybridkin.chains import _slack
 from hybridkin.chains import elastic_tendons as tendons
-from hybridkin.chains._arcs import levers, reading_matrix
 
 RADII, LENGTHS = [0.0045, 0.005, 0.004], [0.06, 0.0625, 0.064]
 SQUARED = np.square(RADII)
@@ -46,8 +45,7 @@ def change_of_shape(chain, q):
 
 def least_energy(chain, q):
     """Return the shapes of least energy by bounded least squares, slackness as an unknown."""
-    at = levers(chain.radii, chain.angles, chain.actuators_per_segment)
-    B = reading_matrix(at, chain.actuators_per_segment, chain.starts).numpy()
+    B = chain._readings().numpy()
     bending = chain.bending_stiffness
     root = torch.cat([chain.axial_stiffness, bending, bending]).sqrt().numpy()
     rest = np.concatenate([np.zeros(chain.n_segments), *chain.rest_bends.T.numpy()])
@@ -99,8 +97,7 @@ def test_the_shape_has_the_least_energy(chain, rng):
 def test_forces_balance_where_it_rests(chain, rng):
     q = random_q(rng, 200, chain.n_actuators)
     shape, tension = change_of_shape(chain, q), chain.tensions(q)
-    at = levers(chain.radii, chain.angles, chain.actuators_per_segment)
-    B = reading_matrix(at, chain.actuators_per_segment, chain.starts)
+    B = chain._readings()
     stretch = shape @ B.T - q + chain.tendon_zeros
     assert_close(tension, stretch.relu(), rtol=0, atol=1e-15)
     assert torch.equal(chain.slack(q) & (tension > 0), torch.zeros_like(tension > 0))

@@ -280,7 +280,7 @@ def test_hybrids_learn_what_the_chain_leaves(name, coupling):
             r"`lengths` must have shape \(2,\)",
         ),
         (
-            lambda: ElasticTendonChain([0.01] * 2, [None, 0.1]),
+            lambda: ElasticTendonChain([0.01] * 2, [None, 0.1], routing="segment"),
             "`lengths` must hold the backbone length of every segment",
         ),
         (

@@ -160,7 +160,7 @@ def other_dtype(model):
 
 
 def attribute(model):
-    chain_of(model).tip_at = 1.5
+    chain_of(model)._set_markers([(1.5, 0.0, 0.0, 0.0)])
 
 
 def part(model):

@@ -283,9 +283,9 @@ def test_foreign_headers(tmp_path, header):
 @pytest.mark.parametrize(
     ("chain", "changes", "arrays"),
     [
-        (bent_chain(), {"tip_at": 3.0}, {}),
-        (bent_chain(), {"tip_at": None}, {}),
-        (bent_chain(), {"tip_at": "end"}, {}),
+        (bent_chain(), {"markers": [[3.0, 0.0, 0.0, 0.0]]}, {}),
+        (bent_chain(), {"markers": None}, {}),
+        (bent_chain(), {"markers": [["end", 0.0, 0.0, 0.0]]}, {}),
         (bent_chain(), {"routing": ["base"]}, {}),
         (bent_chain(), {"kind": "rigid"}, {}),
         (bent_chain(), {"kind": ["chain"]}, {}),
@@ -326,7 +326,7 @@ def test_damaged_chains(tmp_path, chain, changes, arrays):
 def test_numbers_that_json_does_not_know_are_refused(tmp_path, number):
     path = tmp_path / "chain"
     save_model(bent_chain(), path)
-    header = json.dumps(model_header(path)).replace('"tip_at": 2.0', f'"tip_at": {number}')
+    header = json.dumps(model_header(path)).replace("[[2.0, ", f"[[{number}, ")
     save_file(load_file(path), path, metadata={"hybridkin": header})
     with pytest.raises(ValueError, match=f"is not a model .*{number} is no JSON value"):
         load_model(path)

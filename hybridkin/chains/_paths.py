@@ -1,0 +1,139 @@
+"""The paths of actuators along a chain: what their lengths tell about the arcs."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from hybridkin._core.arrays import one_of
+
+_DETERMINED = 1e-6  # smallest relative reading that determines a direction of bending
+
+
+def path_starts(
+    routing: str, counts: Sequence[int], extensible: Sequence[bool]
+) -> tuple[int, ...]:
+    """Return the first segment that the actuators of each segment run through.
+
+    Actuators carried by a rigid stage start after it.
+    """
+    one_of(routing, "routing", ("segment", "base"))
+    segments = range(len(counts))
+    if routing == "segment":
+        return (*segments,)
+    after_stage = [0]
+    kinds = set()
+    for k in segments:
+        is_stage = extensible[k] and counts[k] == 1
+        after_stage.append(is_stage * (k + 1))
+        if not is_stage:
+            kinds.add(extensible[k])
+    if len(kinds) > 1:
+        raise ValueError(
+            "`routing` must be 'segment' if tendons would run through extensible segments of "
+            "several actuators, or the reverse, got 'base'; their lengths would not be defined."
+        )
+    return tuple(itertools.accumulate(after_stage[:-1], max))
+
+
+def reading_matrix(
+    radii: Tensor, angles: Tensor, counts: Sequence[int], starts: Sequence[int]
+) -> Tensor:
+    """Return the linear map (n, 3 S) from arcs to actuator lengths.
+
+    An actuator at the angle psi on the radius r reads ``l - r (b_x cos psi + b_y sin psi)``, summed
+    over the segments from `starts[k]` to its own, k. Columns are the lengths, then the x- and the
+    y-bendings of all segments.
+    """
+    spans = _spans(counts, starts).to(radii)
+    return torch.cat([spans, bend_matrix(radii, angles, counts, starts)], dim=-1)
+
+
+def bend_matrix(
+    radii: Tensor, angles: Tensor, counts: Sequence[int], starts: Sequence[int]
+) -> Tensor:
+    """Return the columns (..., n, 2 S) of the bendings of the `reading_matrix`."""
+    segment = [k for k, count in enumerate(counts) for _ in range(count)]
+    radius = radii[..., segment]
+    spans = _spans(counts, starts).to(radii)
+    x = -(radius * angles.cos())[..., None] * spans
+    y = -(radius * angles.sin())[..., None] * spans
+    return torch.cat([x, y], dim=-1)
+
+
+def _spans(counts: Sequence[int], starts: Sequence[int]) -> Tensor:
+    """Return which segments (n, S) every actuator runs through, as 0 and 1."""
+    spans = torch.zeros(sum(counts), len(counts))
+    row = 0
+    for k, count in enumerate(counts):
+        spans[row : row + count, starts[k] : k + 1] = 1.0
+        row += count
+    return spans
+
+
+def bend_readings(angles: Tensor, extensible: bool) -> Tensor:
+    """Return how a segment's bending changes the lengths of its n actuators, (2, n) [-].
+
+    Rows are x and y. Without the mean if the segment is extensible: that is a change of its length.
+    """
+    at = torch.stack([angles.cos(), angles.sin()])
+    return at - at.mean(dim=1, keepdim=True) if extensible else at
+
+
+def bend_counts(
+    angles: Sequence[Tensor], extensible: Sequence[bool]
+) -> tuple[int, ...]:
+    """Return the number of directions in which each segment bends: 2, or 1 in a plane.
+
+    It is 0 for an extensible segment with a single actuator.
+    """
+    bends = []
+    for of_segment, stretches in zip(angles, extensible, strict=True):
+        if stretches and len(of_segment) == 1:
+            bends.append(0)
+            continue
+        x, y = bend_readings(of_segment, stretches)
+        most, least = _principal(x, y)
+        planar = least <= 64.0 * torch.finfo(x.dtype).eps * most
+        if most < _DETERMINED or not (planar or least > _DETERMINED * most):
+            raise ValueError(
+                "`angles` must determine the bending of every segment, got "
+                f"{[row.tolist() for row in angles]}; give the actuators of a segment clearly "
+                "different angles [rad], or exactly planar ones: psi and psi + math.pi."
+            )
+        bends.append(1 if planar else 2)
+    return tuple(bends)
+
+
+def _principal(x: Tensor, y: Tensor) -> tuple[float, float]:
+    """Return the largest and the smallest reading of a bending of 1 rad in any direction."""
+    singular = torch.linalg.svdvals(torch.stack([x, y])).tolist()
+    return singular[0], singular[1] if len(singular) > 1 else 0.0
+
+
+def free_arcs(
+    angles: Sequence[Tensor], extensible: Sequence[bool], bends: Sequence[int]
+) -> Tensor:
+    """Return the projector (3 S, 3 S) on the arcs that the actuators of each segment determine.
+
+    These are its length if it is extensible, and `bends` components of its bending: both, none, or
+    the one in the plane of its actuators.
+    """
+    blocks = []  # (3, 3) for every segment: length, x- and y-bending
+    for of_segment, stretches, n_bends in zip(angles, extensible, bends, strict=True):
+        if n_bends == 1:
+            # The plane at the angle psi in which the actuators read most.
+            x, y = bend_readings(of_segment, stretches)
+            psi = 0.5 * torch.atan2(2.0 * (x * y).sum(), (x * x - y * y).sum())
+            direction = torch.stack([psi.cos(), psi.sin()])
+            bending = torch.outer(direction, direction)
+        else:
+            bending = 0.5 * n_bends * torch.eye(2).to(of_segment)
+        length = float(stretches) * torch.ones(1, 1).to(of_segment)
+        blocks.append(torch.block_diag(length, bending))
+    # From segment by segment to all lengths, all x- and all y-bendings.
+    by_kind = torch.diag_embed(torch.stack(blocks, dim=-1))  # (3, 3, S, S)
+    return by_kind.transpose(1, 2).flatten(2).flatten(0, 1)
