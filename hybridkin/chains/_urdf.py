@@ -3,36 +3,19 @@
 from __future__ import annotations
 
 import math
-import re
 import warnings
-from collections import Counter, defaultdict
-from collections.abc import Sequence
-from graphlib import CycleError, TopologicalSorter
-from typing import Any, TypeAlias
-from xml.parsers.expat import ExpatError, ParserCreate
+from collections.abc import Iterable, Sequence
+from os import PathLike
+from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from lxml import etree
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from hybridkin.chains._arm_files import (
-    UNLIMITED,
-    Joint,
-    in_robot,
-    matrix_of,
-    source_of,
-    unused,
-)
+from hybridkin.chains._arm_files import UNLIMITED, Joint, check_link, source_of
 
-_MISSING = (
-    "have no <limit>, which URDF requires; they are treated as unlimited. Add <limit>, or set "
-    'type="continuous" if they turn without limits.'
-)
-_LOCKED = (
-    "are locked at 0: both limits are 0, the default of URDF if `lower` and `upper` are missing. "
-    "Give both if the joints move."
-)
-_ONE_AXIS = ("revolute", "continuous", "prismatic")
+_KINDS = ("revolute", "continuous", "prismatic", "fixed")
 _FREE = {
     "floating": ("x", "y", "z", "yaw", "pitch", "roll"),
     "planar": ("x", "y", "yaw"),
@@ -40,274 +23,254 @@ _FREE = {
 _AXES = {"x": 0, "y": 1, "z": 2, "roll": 0, "pitch": 1, "yaw": 2}
 _MOST = 64  # joints that mimic each other in a row
 _SAME = 1e-12  # [m] or [-]: smaller changes of an origin are not written
-_TAG = re.compile(rb"""<(?:[^>"']|"[^"]*"|'[^']*')*>""")
 
 
-class _Tag(dict[str, str]):
-    """The attributes of a tag, and its position in the file [bytes]."""
+class Urdf:
+    """A URDF, and the joints from one link to another.
 
-    place = -1
+    The reader of pytorch_kinematics is no help: it has single precision and another default axis,
+    knows no mimic, planar and floating joints, and refuses limits without effort.
+
+    Attributes
+    ----------
+    robot : lxml Element
+        The <robot>.
+    path : list of (lxml Element, list of Joint)
+        The <joint> elements from root to end, and what they are in an arm.
+    """
+
+    def __init__(
+        self, text_or_path: str | PathLike[str], end_link: str, root_link: str | None
+    ) -> None:
+        self.robot = _robot(text_or_path)
+        links = [link.get("name", "") for link in self.robot.findall("link")]
+        check_link(end_link, links, "end_link")
+        if root_link is not None:
+            check_link(root_link, links, "root_link")
+        joints = self.robot.findall("joint")
+        self._by_name = _distinct(
+            "joint", (joint.get("name", "") for joint in joints), joints
+        )
+        by_child = _distinct(
+            "<child>", (_link(joint, "child") for joint in joints), joints
+        )
+        self.path: list[tuple[etree._Element, list[Joint]]] = []
+        link = end_link
+        while link != root_link and link in by_child:
+            if len(self.path) == len(joints):
+                raise ValueError(
+                    f"the links of a URDF must be a tree, got a cycle to {link!r}."
+                )
+            joint = by_child[link]
+            self.path.append((joint, self._joints(joint)))
+            link = _link(joint, "parent")
+        if root_link not in (None, link):
+            raise ValueError(
+                f"`root_link` must lead to {end_link!r}, but {root_link!r} does not."
+            )
+        self.path.reverse()
+        self.joints = [joint for _, joints in self.path for joint in joints]
+
+    def placed(self, names: Sequence[str], origins: NDArray) -> str:
+        """Return the XML with new origins (n, 4, 4) of the moving joints, as an arm has them."""
+        moving = [joint.name for joint in self.joints if joint.kind != "fixed"]
+        if [*dict.fromkeys(moving)] != [*names] or len(moving) != len(origins):
+            raise ValueError(
+                f"`text_or_path` must be the URDF of this arm, whose actuators are {[*names]}, "
+                f"got {moving}."
+            )
+        wanted = iter(origins)
+        before = np.eye(4)
+        for element, (joint, *free) in self.path:
+            if free:
+                raise ValueError(
+                    f"joint {free[0].name!r} is free; use a `root_link` after it."
+                )
+            if joint.kind == "fixed":
+                before = before @ joint.origin
+                continue
+            # Exclude the fixed joints before it and the offset of a mimic joint.
+            origin = _origin(element)
+            ahead = np.linalg.solve(before, next(wanted))
+            placed = ahead @ np.linalg.solve(joint.origin, origin)
+            before = np.eye(4)
+            if np.abs(placed - origin).max() > _SAME:
+                _write_origin(element, placed)
+        return etree.tostring(self.robot.getroottree(), encoding="unicode")
+
+    def _joints(self, element: etree._Element) -> list[Joint]:
+        """Return what a joint does: a free one moves along and about several axes."""
+        origin = _origin(element)
+        name = element.get("name", "")
+        kind = element.get("type", "")
+        if kind in _FREE and element.find("mimic") is None:
+            return [Joint(origin), *_free_joints(name, kind)]
+        actuator, factor, offset = self._mimicked(element)
+        driver = self._by_name.get(actuator)
+        driver_kind = kind if driver is None else driver.get("type", "")
+        if not {kind, driver_kind} <= {*_KINDS}:
+            raise ValueError(
+                f"`type` of joint {name!r} and of the joint that it mimics must be one of "
+                f"{_KINDS}, or without <mimic> one of {[*_FREE]}, got {kind!r}, {driver_kind!r}."
+            )
+        if kind == "fixed":
+            return [Joint(origin)]
+        axis = np.array(_numbers(element, "axis", "xyz", "1 0 0"))
+        step = offset * axis / (np.linalg.norm(axis) or 1.0)
+        if kind == "prismatic":
+            origin = origin @ _matrix(position=step)
+        else:
+            origin = origin @ _matrix(Rotation.from_rotvec(step))
+        if driver_kind == "fixed":
+            return [Joint(origin)]
+        limits = _limits(actuator, driver)
+        kind = "prismatic" if kind == "prismatic" else "revolute"
+        return [Joint(origin, kind, axis, actuator, actuator, limits, factor)]
+
+    def _mimicked(self, element: etree._Element | None) -> tuple[str, float, float]:
+        """Return the joint that a joint follows, at last itself, and its factor and offset.
+
+        The joint is at ``factor * q + offset``, where q is the position of the joint followed.
+        """
+        assert element is not None
+        name = element.get("name", "")
+        followed = [name]
+        factor = 1.0
+        offset = 0.0
+        while element is not None and element.find("mimic") is not None:
+            offset += factor * _numbers(element, "mimic", "offset", "0")[0]
+            factor *= _numbers(element, "mimic", "multiplier", "1")[0]
+            name = element.find("mimic").get("joint", "")
+            if name in followed or len(followed) > _MOST:
+                raise ValueError(
+                    f"joints must not mimic each other in a circle, nor more than {_MOST} in a "
+                    f"row, got {followed[:9]}."
+                )
+            followed.append(name)
+            element = self._by_name.get(name)
+        return name, factor, offset
 
 
-_Element: TypeAlias = defaultdict[str, _Tag]  # the first tag of every name in a <joint>
-
-
-def _read(text: str) -> tuple[list[str], list[_Element]]:
-    """Return the links and the joints of a <robot>; other tags, e.g. of vendors, are ignored."""
-    links: list[str] = []
-    joints: list[_Element] = []
-    path: list[str] = []
-    parser = ParserCreate()
-
-    def start(tag: str, attributes: dict[str, str]) -> None:
-        path.append(tag)
-        if path[0] != "robot":
-            raise ValueError(f"the outermost tag must be <robot>, got <{tag}>")
-        if len(path) == 2 and tag == "link":
-            links.append(attributes.get("name", ""))
-        if len(path) == 2 and tag == "joint":
-            joints.append(defaultdict(_Tag))
-        if path[1:2] == ["joint"] and len(path) < 4 and tag not in joints[-1]:
-            joints[-1][tag] = _Tag(attributes)
-            joints[-1][tag].place = parser.CurrentByteIndex
-
-    def refuse(*_: Any) -> None:
-        raise ValueError("it declares entities, which can grow without bound")
-
-    parser.StartElementHandler = start
-    parser.EntityDeclHandler = refuse
-    parser.EndElementHandler = lambda tag: path.pop()
-    try:
-        parser.Parse(_bytes(text), True)
-    except (ExpatError, ValueError) as error:
-        raise ValueError(f"`text_or_path` must be a valid URDF: {error}.") from error
-    return links, joints
-
-
-def urdf_text(text_or_path: Any) -> str:
-    """Return the text of a URDF; `_bytes` restores bytes that are not UTF-8."""
+def _robot(text_or_path: str | PathLike[str]) -> etree._Element:
+    """Return the root of a URDF. Entities are not expanded, and nothing else is loaded."""
     source = source_of(text_or_path)
-    data = source if isinstance(source, str) else source.read_bytes()
-    if isinstance(data, str):
-        return data
-    return data.decode("utf-8-sig", "surrogateescape")
-
-
-def _bytes(text: str) -> bytes:
-    return text.encode(errors="surrogateescape")
-
-
-def _numbers(element: _Element, tag: str, key: str, default: str) -> list[float]:
-    """Return the numbers of an attribute, as many as the default has."""
-    text = element[tag].get(key, default)
-    numbers = []
+    data = source.read_bytes() if isinstance(source, Path) else source.encode()
+    parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False)
     try:
-        numbers = [float(part) for part in text.split()]
-    except ValueError:
-        pass
-    if len(numbers) != (n := len(default.split())):
-        where = f"`{key}` of <{tag}> of joint {element['joint'].get('name', '')!r}"
+        robot = etree.fromstring(data, parser)
+    except etree.XMLSyntaxError as error:
+        raise ValueError(f"`text_or_path` must be a valid URDF: {error}.") from error
+    if robot.tag != "robot" or robot.getroottree().docinfo.doctype:
         raise ValueError(
-            f"{where} must be {n} numbers, got {text!r}; correct the URDF."
+            "`text_or_path` must be a URDF, with the outermost tag <robot> and without DOCTYPE, "
+            f"got <{robot.tag}>."
+        )
+    return robot
+
+
+def _distinct(
+    what: str, names: Iterable[str], joints: Sequence[etree._Element]
+) -> dict[str, etree._Element]:
+    """Return the joints by names, each of which may occur once."""
+    by_name: dict[str, etree._Element] = {}
+    for name, joint in zip(names, joints, strict=True):
+        if name in by_name:
+            raise ValueError(
+                f"every {what} of a URDF must occur once, got {name!r} repeatedly."
+            )
+        by_name[name] = joint
+    return by_name
+
+
+def _link(joint: etree._Element, end: str) -> str:
+    """Return the link at an end of a joint, "parent" or "child"."""
+    tag = joint.find(end)
+    return "" if tag is None else tag.get("link", "")
+
+
+def _numbers(joint: etree._Element, tag: str, key: str, default: str) -> list[float]:
+    """Return the numbers of an attribute, as many as the default has."""
+    element = joint.find(tag)
+    text = default if element is None else element.get(key, default)
+    n = len(default.split())
+    try:
+        numbers = [float(word) for word in text.split()]
+    except ValueError:
+        numbers = []
+    if len(numbers) != n:
+        raise ValueError(
+            f"`{key}` of <{tag}> of joint {joint.get('name')!r} must be {n} numbers, got "
+            f"{text!r}; correct the URDF."
         )
     return numbers
 
 
-def _elements(
-    text: str, end_link: str, root_link: str | None
-) -> list[tuple[_Element, list[Joint]]]:
-    """Return the <joint> elements from one link to another, each with its joints."""
-    links, joints = _read(text)
-    _check_tree(links, joints)
-    by_child = {joint["child"].get("link", ""): joint for joint in joints}
-    by_name = {joint["joint"].get("name", ""): joint for joint in joints}
-    link = in_robot(end_link, links, "`end_link`")
-    root = None if root_link is None else in_robot(root_link, links, "`root_link`")
-    path: list[tuple[_Element, list[Joint]]] = []
-    while link != root and link in by_child:
-        element = by_child[link]
-        path.append((element, _joints(element, by_name)))
-        link = element["parent"].get("link", "")
-    if root is not None and link != root:
-        raise ValueError(
-            f"`root_link` must lead to {end_link!r}, but {root!r} does not."
+def _limits(name: str, joint: etree._Element | None) -> tuple[float, float, float]:
+    """Return the lower limit, the upper limit and the largest speed of a joint."""
+    speed = math.inf
+    if joint is not None:  # 0 means no limit
+        speed = _numbers(joint, "limit", "velocity", "0")[0] or math.inf
+        if joint.get("type") == "continuous":
+            return -math.inf, math.inf, speed
+    if joint is None or joint.find("limit") is None:
+        _warn(
+            f"joint {name!r} has no <limit>, which URDF requires; it is unlimited. Add <limit>, or "
+            'set type="continuous" if it turns without limits.'
         )
-    return path[::-1]
-
-
-def urdf_path(
-    text_or_path: object, end_link: str, root_link: str | None
-) -> list[Joint]:
-    """Return the joints of a URDF from one link to another."""
-    elements = _elements(urdf_text(text_or_path), end_link, root_link)
-    path = [joint for _, joints in elements for joint in joints]
-    moving = {joint.name: joint for joint in path if joint.kind != "fixed"}
-    for limits, what in ((None, _MISSING), ((0.0, 0.0), _LOCKED)):
-        names = [name for name, joint in moving.items() if joint.limits == limits]
-        if names:
-            warnings.warn(f"joints {names} {what}", stacklevel=3)
-    return path
-
-
-def _check_tree(links: list[str], joints: list[_Element]) -> None:
-    """Raise unless links and joints form one tree with unique names."""
-    named = [joint["joint"].get("name", "") for joint in joints]
-    parents, children = (
-        [joint[tag].get("link", "") for joint in joints] for tag in ("parent", "child")
-    )
-    for what, given in {"link": links, "joint": named, "<child>": children}.items():
-        doubled = sorted(name for name, times in Counter(given).items() if times > 1)
-        if doubled:
-            raise ValueError(
-                f"every {what} of a URDF must occur once, got {doubled} repeatedly."
-            )
-    reached = dict.fromkeys(links)
-    for name, parent, child in zip(named, parents, children, strict=True):
-        in_robot(parent, reached, f"<parent> of joint {name!r}")
-        in_robot(child, reached, f"<child> of joint {name!r}")
-    try:
-        tree = zip(children, parents, strict=True)
-        TopologicalSorter({child: [parent] for child, parent in tree}).prepare()
-    except CycleError as error:
-        loop = " -> ".join(map(repr, error.args[1]))[:400]
-        raise ValueError(
-            f"the links of a URDF must be a tree, got a cycle: {loop}."
-        ) from error
-    roots = sorted({*links} - {*children})
-    if len(roots) > 1:
-        raise ValueError(
-            f"a URDF must have one root, but no joint leads to any of {roots}; connect them with "
-            "joints, or remove all but one."
+        return UNLIMITED
+    low = _numbers(joint, "limit", "lower", "0")[0]
+    high = _numbers(joint, "limit", "upper", "0")[0]
+    if low == high == 0.0:
+        _warn(
+            f"joint {name!r} is locked at 0: both limits are 0, the default of URDF. Give `lower` "
+            "and `upper` if it moves."
         )
+    if low > high:
+        _warn(f"limits of joint {name!r} are swapped; they are used in order.")
+        return high, low, speed
+    return low, high, speed
 
 
-def _origin(element: _Element) -> NDArray:
-    turn = Rotation.from_euler("xyz", _numbers(element, "origin", "rpy", "0 0 0"))
-    return matrix_of(turn, _numbers(element, "origin", "xyz", "0 0 0"))
+def _warn(message: str) -> None:
+    warnings.warn(message, stacklevel=6)  # the caller of `from_urdf`
 
 
-def _joints(element: _Element, by_name: dict[str, _Element]) -> list[Joint]:
-    """Return what a joint does: a free one moves along and about several axes."""
-    origin = _origin(element)
-    name = element["joint"].get("name", "")
-    kind = element["joint"].get("type", "")
-    if kind in _FREE and not element["mimic"]:
-        path = [Joint(origin)]
-        names = {*by_name, *(other["mimic"].get("joint") for other in by_name.values())}
-        for part in _FREE[kind]:
-            move = "prismatic" if len(part) == 1 else "revolute"
-            actuator = unused(f"{name}_{part}", names)
-            path.append(
-                Joint(matrix_of(), move, np.eye(3)[_AXES[part]], actuator, UNLIMITED)
-            )
-        return path
-    driver = element
-    factor = 1.0
-    offset = 0.0
-    followed = [name]
-    while mimic := driver["mimic"]:
-        # The joint is at factor * (multiplier * q + its offset) + offset.
-        offset += factor * _numbers(driver, "mimic", "offset", "0")[0]
-        factor *= _numbers(driver, "mimic", "multiplier", "1")[0]
-        name = mimic.get("joint", "")
-        if name in followed:
-            raise ValueError(
-                f"joints must not mimic each other in a circle, got {followed}."
-            )
-        followed.append(name)
-        if len(followed) > _MOST:
-            raise ValueError(
-                f"joint {followed[0]!r} must mimic via at most {_MOST} other joints."
-            )
-        # Not in the file.
-        driver = by_name.get(name) or defaultdict(_Tag, joint=_Tag(type=kind))
-    driven_by = driver["joint"].get("type", "")
-    if not {kind, driven_by} <= {*_ONE_AXIS, "fixed"}:
-        kinds = (*_ONE_AXIS, "fixed", *_FREE)
-        raise ValueError(
-            f"`type` of joint {followed[0]!r} must be one of {kinds}, or one of the first four "
-            f"if it mimics another joint, got {kind!r}"
-            + f" that mimics {driven_by!r}."
-            * bool(element["mimic"])
-        )
-    kind = kind.replace("continuous", "revolute")
-    axis = _numbers(element, "axis", "xyz", "1 0 0")
-    step = offset * np.array(axis) / (np.linalg.norm(axis) or 1.0)
-    turn = Rotation.from_rotvec((kind == "revolute") * step)
-    origin = origin @ matrix_of(turn, (kind == "prismatic") * step)
-    if "fixed" in (kind, driven_by):
-        return [Joint(origin)]
-    limits = UNLIMITED if driven_by == "continuous" else None
-    if driver["limit"] and limits is None:
-        low, high = (
-            _numbers(driver, "limit", side, "0")[0] for side in ("lower", "upper")
-        )
-        limits = (low, high)
-        if math.inf > low > high > -math.inf:
-            limits = (high, low)
-            warnings.warn(
-                f"limits of joint {name!r} are swapped; they are used in order: {high:g}, {low:g}.",
-                stacklevel=5,
-            )
-    speed = _numbers(driver, "limit", "velocity", "0")[0]
-    return [Joint(origin, kind, axis, name, limits, speed or math.inf, factor)]
+def _free_joints(name: str, kind: str) -> list[Joint]:
+    joints: list[Joint] = []
+    for part in _FREE[kind]:
+        move = "prismatic" if part in "xyz" else "revolute"
+        axis = np.eye(3)[_AXES[part]]
+        joints.append(Joint(np.eye(4), move, axis, (name, part), f"{name}_{part}"))
+    return joints
 
 
-def placed_urdf(
-    text: str,
-    end_link: str,
-    root_link: str | None,
-    names: Sequence[str],
-    origins: NDArray,
-) -> str:
-    """Return a URDF whose moving joints have new origins (n, 4, 4); the rest is not changed."""
-    path = _elements(text, end_link, root_link)
-    data = _bytes(text)
-    moving = [
-        joint.name for _, joints in path for joint in joints if joint.kind != "fixed"
-    ]
-    if [*dict.fromkeys(moving)] != [*names] or len(moving) != len(origins):
-        need = f"`text_or_path` must be the URDF of this arm, whose actuators are {[*names]}"
-        raise ValueError(f"{need}, got {moving} up to {end_link!r}.")
-    wanted = iter(origins)
-    before = matrix_of()
-    changes = []
-    for element, (joint, *free) in path:
-        origin = _origin(element)
-        if free:
-            raise ValueError(
-                f"joint {free[0].name!r} is free; use a `root_link` after it."
-            )
-        if joint.kind == "fixed":
-            before = before @ joint.origin
-            continue
-        # Exclude the fixed joints before it and the offset of a mimic joint.
-        ahead = np.linalg.solve(before, next(wanted))
-        placed = ahead @ np.linalg.solve(joint.origin, origin)
-        before = matrix_of()
-        if np.abs(placed - origin).max() > _SAME:
-            changes.append((element["origin"].place, element["joint"].place, placed))
-    for own, around, placed in sorted(
-        changes, key=lambda change: change[1], reverse=True
-    ):
-        tag = _TAG.match(data, max(own, around))
-        assert tag is not None
-        end = b">" if own >= 0 and not tag[0].endswith(b"/>") else b"/>"
-        start = tag.start() if own >= 0 else tag.end()
-        data = data[:start] + _origin_tag(placed) + end + data[tag.end() :]
-    return data.decode(errors="surrogateescape")
+def _origin(joint: etree._Element) -> NDArray:
+    turn = Rotation.from_euler("xyz", _numbers(joint, "origin", "rpy", "0 0 0"))
+    return _matrix(turn, _numbers(joint, "origin", "xyz", "0 0 0"))
 
 
-def _origin_tag(placed: NDArray) -> bytes:
-    """Return the beginning of an <origin>; its angles are exact at a pitch of 90 degrees too."""
-    a, b, c = placed[:3, :3]
-    position = placed[:3, 3]
-    yaw = math.atan2(b[0], a[0])
-    sine = math.sin(yaw)
-    cosine = math.cos(yaw)
-    pitch = math.atan2(-c[0], cosine * a[0] + sine * b[0])
-    roll = math.atan2(sine * a[2] - cosine * b[2], cosine * b[1] - sine * a[1])
-    rows = position, (roll, pitch, yaw)
-    # no -0.0.
-    xyz, rpy = (" ".join(repr(float(number) + 0.0) for number in row) for row in rows)
-    return f'<origin xyz="{xyz}" rpy="{rpy}"'.encode()
+def _matrix(turn: Rotation | None = None, position: ArrayLike = 0.0) -> NDArray:
+    matrix = np.eye(4)
+    matrix[:3, 3] = position
+    if turn is not None:
+        matrix[:3, :3] = turn.as_matrix()
+    return matrix
+
+
+def _write_origin(joint: etree._Element, placed: NDArray) -> None:
+    """Write the <origin> of a joint; its angles are exact at a pitch of 90 degrees too."""
+    R = placed[:3, :3]
+    yaw = math.atan2(R[1, 0], R[0, 0])
+    # What is left without the yaw is a roll, then a pitch.
+    level = Rotation.from_euler("z", -yaw).as_matrix() @ R
+    pitch = math.atan2(-level[2, 0], level[0, 0])
+    roll = math.atan2(-level[1, 2], level[1, 1])
+    element = joint.find("origin")
+    if element is None:
+        element = etree.SubElement(joint, "origin")
+    element.set("xyz", _text(placed[:3, 3]))
+    element.set("rpy", _text([roll, pitch, yaw]))
+
+
+def _text(numbers: Iterable[float]) -> str:
+    return " ".join(repr(float(number) + 0.0) for number in numbers)  # no -0.0

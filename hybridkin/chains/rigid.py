@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from os import PathLike
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from torch import Tensor, nn
 
 from hybridkin._core.arrays import Numbers, Transform
+from hybridkin._core.blocks import check_vectors, in_blocks
 from hybridkin._core.plan import NoKernel, Plan
 from hybridkin._core.stored import Layout, Restore, Stored
-from hybridkin._core.units import warn_millimetres
-from hybridkin.chains._arm_files import chain_path, mjcf_path, moving_joints
+from hybridkin._core.units import degrees_message, millimetres_message, warn_millimetres
+from hybridkin.chains._arm_files import (
+    Joint,
+    Options,
+    chain_path,
+    mjcf_path,
+    without_fixed,
+)
 from hybridkin.chains._checks import (
     filled,
     float_dtype,
@@ -22,14 +30,23 @@ from hybridkin.chains._checks import (
     pose,
     rigid_pose,
 )
-from hybridkin.chains._joint_motions import FAR, JointChain
-from hybridkin.chains._urdf import placed_urdf, urdf_path, urdf_text
+from hybridkin.chains._joint_motions import (
+    as_poses,
+    carried_tip,
+    joint_coefficients,
+    joint_motions,
+    moving_frames,
+)
+from hybridkin.chains._urdf import Urdf
+from hybridkin.chains.chain import Chain
 
 if TYPE_CHECKING:
     from pytorch_kinematics.chain import Chain as KinematicsChain
+    from typing_extensions import Unpack
 
 __all__ = ["RigidChain"]
 
+_FAR = 10.0  # [m]; a joint that slides further is more likely in millimetres
 _KINDS = ("revolute", "prismatic")
 
 
@@ -42,8 +59,7 @@ def _write_plan(plan: Plan, stored: Stored) -> int:
     plan.limit("actuators", n_joints)
     before = stored.array("base")
     numbers = []
-    motions = stored.derived["motions"]
-    origins = motions[:, 0] + motions[:, 2]
+    origins = stored.derived["origins_at_zero"]
     for origin, axis in zip(origins, stored.array("axes"), strict=True):
         side = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
         side = side / np.linalg.norm(side)
@@ -52,16 +68,18 @@ def _write_plan(plan: Plan, stored: Stored) -> int:
         frame = before @ origin @ turn
         numbers += [frame[:3, :3], frame[:3, 3]]
         before = turn.T
-    before = before @ stored.array("tip")
-    tip = before @ np.append(stored.array("tool"), 1.0)
-    couplings = stored.arrays.get("couplings", np.zeros((0, n_joints)))
-    numbers += [tip[:3], before[:3, :3], couplings]
+    end = before @ stored.derived["end"]
+    numbers += [end[:3, 3], end[:3, :3]]
+    couplings = stored.array("couplings")
+    coupled = not np.array_equal(couplings, np.eye(n_joints))
+    if coupled:
+        numbers.append(couplings)
     return plan.node(
-        "rigid", couplings.shape[1], 3, numbers, n_joints, len(couplings) > 0, *slides
+        "rigid", couplings.shape[1], 3, numbers, n_joints, coupled, *slides
     )
 
 
-class RigidChain(JointChain):
+class RigidChain(Chain):
     """Tip position of a rigid serial arm, from its joint positions.
 
     The motion of a revolute joint is affine in sin q and cos q (Rodrigues' formula), that of a
@@ -115,14 +133,18 @@ class RigidChain(JointChain):
     tensor([0.2000, 0.3000, 0.0000])
     """
 
+    kinds: tuple[str, ...]
+    names: tuple[str, ...]
+
     _entries = ("base", "joint_zeros", "tool")
+    _structure = ("n_actuators", "kinds", "names")
     _arrays = ("origins", "axes", "tip", "tool", "q_min", "q_max", "dq_max", "base")
     _arrays += ("joint_zeros", "couplings")
     layout = Layout(
         "rigid",
         dict.fromkeys(_arrays, ""),
         {"kinds": list, "names": list},
-        derived=("motions",),
+        derived=("origins_at_zero", "end"),
         write_plan=_write_plan,
     )
 
@@ -154,27 +176,14 @@ class RigidChain(JointChain):
         origins = numeric(origins, "origins", need="n44", length=n_joints)
         for k in range(n_joints):
             origins[k] = rigid_pose(origins[k], f"origins[{k}]")
-        if couplings is not None:
-            couplings = numeric(couplings, "couplings", need="nm", length=n_joints)
-        self.n_actuators = n = n_joints if couplings is None else couplings.shape[1]
-        for name, value in (("kinds", kinds), ("names", names)):
-            if value is not None and not np.iterable(value):
-                raise TypeError(
-                    f"`{name}` must be a sequence of strings, got {value!r:.80}."
-                )
-        if kinds is None:
-            self.kinds = ("revolute",) * n_joints
-        else:
-            self.kinds = tuple(map(str, kinds))
-        default = [f"joint_{k + 1}" for k in range(n)]
-        self.names = tuple(map(str, default if names is None else names))
-        if len(self.kinds) != n_joints or not set(self.kinds) <= set(_KINDS):
-            need = f"must hold {n_joints} of {_KINDS}, one per joint"
-            raise ValueError(f"`kinds` {need}, got {self.kinds}.")
-        if len(self.names) != n:
-            raise ValueError(
-                f"`names` must hold {n} names, one per actuator, got {self.names}."
-            )
+        if couplings is None:
+            couplings = np.eye(n_joints)
+        couplings = numeric(couplings, "couplings", need="nm", length=n_joints)
+        self.n_actuators = n = couplings.shape[1]
+        self.kinds = _strings(kinds, "kinds", ["revolute"] * n_joints)
+        self.names = _strings(names, "names", [f"joint_{k + 1}" for k in range(n)])
+        if not set(self.kinds) <= set(_KINDS):
+            raise ValueError(f"`kinds` must be among {_KINDS}, got {self.kinds}.")
         slides = [kind == "prismatic" for kind in self.kinds]
         geometry = {
             "origins": origins,
@@ -189,7 +198,7 @@ class RigidChain(JointChain):
         }
         self._set_geometry(geometry)
         self.to(dtype)
-        warn_millimetres("origins", self.origins[:, :3, 3].abs(), FAR)
+        warn_millimetres("origins", self.origins[:, :3, 3].abs(), _FAR)
 
     @classmethod
     def from_urdf(
@@ -198,7 +207,7 @@ class RigidChain(JointChain):
         end_link: str,
         *,
         root_link: str | None = None,
-        **options: Any,
+        **options: Unpack[Options],
     ) -> RigidChain:
         """Return the arm from one link of a URDF to another.
 
@@ -211,7 +220,7 @@ class RigidChain(JointChain):
         root_link : str, optional
             The base link. Default: the root of the tree of `end_link`.
         **options
-            `tool`, `base` and `dtype`, as for `RigidChain`.
+            `tool`, `base`, `joint_zeros` and `dtype`, as for `RigidChain`.
 
         Returns
         -------
@@ -219,27 +228,24 @@ class RigidChain(JointChain):
             Its actuators are the moving joints of the path, in order. A mimic joint is replaced by
             the joint it mimics, on the path or not, with that joint's limits. A floating joint
             becomes six (x, y, z, yaw, pitch, roll), a planar one three (x, y, yaw, in the frame of
-            the joint); their names end in "_" where another joint has the name. Equal limits lock
-            a joint. Continuous joints have infinite limits, and so have, with a warning, joints
-            without <limit>. A velocity of 0 means no speed limit. Without moving joints the tip is
-            constant. Tags that are not part of URDF are ignored.
+            the joint). Equal limits lock a joint. Continuous joints have infinite limits, and so
+            have, with a warning, joints without <limit>. A velocity of 0 means no speed limit.
+            Without moving joints the tip is constant. Tags that are not part of URDF are ignored.
 
         Raises
         ------
         FileNotFoundError
             If there is no such file.
         ValueError
-            For text that is not a URDF or declares entities, links that are not one tree, invalid
-            numbers, and joints that mimic each other in a circle.
+            For text that is not a URDF or has a DOCTYPE, links that are missing or not connected,
+            invalid numbers, and joints that mimic each other in a circle.
 
         Warns
         -----
         UserWarning
             For joints without <limit>, with swapped limits, and with limits that are both zero.
         """
-        return cls(
-            **moving_joints(urdf_path(text_or_path, end_link, root_link)), **options
-        )
+        return cls._of_joints(Urdf(text_or_path, end_link, root_link).joints, options)
 
     def to_urdf(
         self,
@@ -260,7 +266,7 @@ class RigidChain(JointChain):
         Returns
         -------
         str
-            The same text with new <origin> tags for moving joints whose origin has changed. Reading
+            The same XML with new <origin> tags for moving joints whose origin has changed. Reading
             it gives this arm with zero `joint_zeros`. A URDF does not contain `base` and `tool`.
 
         Raises
@@ -268,8 +274,7 @@ class RigidChain(JointChain):
         FileNotFoundError
             If there is no such file.
         ValueError
-            If the URDF is not that of this arm, or if links or zeros have moved within a floating
-            or planar joint.
+            If the URDF is not that of this arm, or has a floating or planar joint on the path.
 
         Examples
         --------
@@ -285,10 +290,8 @@ class RigidChain(JointChain):
         <joint name="j" type="continuous"> <parent link="a"/> <child link="b"/> <!-- 1 -->
         <origin xyz="0.0 0.0 0.25" rpy="0.0 0.0 0.0"/> </joint> </robot>
         """
-        origins = (self.motions[:, 0] + self.motions[:, 2]).double().numpy(force=True)
-        return placed_urdf(
-            urdf_text(text_or_path), end_link, root_link, self.names, origins
-        )
+        origins = self.origins_at_zero.double().numpy(force=True)
+        return Urdf(text_or_path, end_link, root_link).placed(self.names, origins)
 
     @classmethod
     def from_mjcf(
@@ -297,43 +300,43 @@ class RigidChain(JointChain):
         end_link: str,
         *,
         root_link: str | None = None,
-        **options: Any,
+        **options: Unpack[Options],
     ) -> RigidChain:
         """Return the arm from one body of a MuJoCo model to another body or site.
 
         Parameters
         ----------
         text_or_path : str or path
-            XML text, or the path of a file with it.
+            XML text, or the path of a file with it. Files that it includes are read too.
         end_link : str
-            The body, or else the site, whose frame carries the tool.
+            The body or site whose frame carries the tool.
         root_link : str, optional
             The base body. Default: the world.
         **options
-            `tool`, `base` and `dtype`, as for `RigidChain`.
+            `tool`, `base`, `joint_zeros` and `dtype`, as for `RigidChain`.
 
         Returns
         -------
         RigidChain
-            Its actuators are the hinges and slides of the path, in order; q is MuJoCo's qpos.
-            Limits are those of `range`; without it or with ``limited="false"`` they are infinite.
+            Its actuators are the hinges and slides of the path, in order, with the limits that
+            MuJoCo uses. q = 0 is MuJoCo's ``qpos`` = 0.
 
         Raises
         ------
         ImportError
-            If mujoco is not installed.
+            If MuJoCo is not installed.
         FileNotFoundError
             If there is no such file.
         ValueError
-            For text that is not an MJCF, bodies that are missing or not connected, a path without
-            a moving joint, a `range` that is not an interval, and free or ball joints.
+            For text that is not an MJCF, bodies that are missing or not connected, and free or ball
+            joints.
         """
-        return cls(
-            **moving_joints(mjcf_path(text_or_path, end_link, root_link)), **options
-        )
+        return cls._of_joints(mjcf_path(text_or_path, end_link, root_link), options)
 
     @classmethod
-    def from_chain(cls, chain: KinematicsChain, **options: Any) -> RigidChain:
+    def from_chain(
+        cls, chain: KinematicsChain, **options: Unpack[Options]
+    ) -> RigidChain:
         """Return the arm of a pytorch_kinematics chain without branches.
 
         Parameters
@@ -341,7 +344,7 @@ class RigidChain(JointChain):
         chain : pytorch_kinematics SerialChain
             A chain from the base to the end link. It is not changed.
         **options
-            `tool`, `base` and `dtype`, as for `RigidChain`.
+            `tool`, `base`, `joint_zeros` and `dtype`, as for `RigidChain`.
 
         Returns
         -------
@@ -352,19 +355,35 @@ class RigidChain(JointChain):
         Raises
         ------
         ValueError
-            For chains that branch or have no moving joint.
+            For chains that branch.
         """
-        return cls(**moving_joints(chain_path(chain)), **options)
+        return cls._of_joints(chain_path(chain), options)
 
-    @property
-    def limits(self) -> dict[str, Any]:
-        """The limits of the joints, as tensors of shape (n,)."""
-        return {name: self.get_buffer(name) for name in ("q_min", "q_max", "dq_max")}
-
-    @property
-    def default_parameters(self) -> tuple[str, ...]:
-        """Names of the parameters that a calibration fits by default."""
-        return ("base",)
+    @classmethod
+    def _of_joints(cls, path: Sequence[Joint], options: Options) -> RigidChain:
+        """Return the arm of the joints from its base to its end link, fixed ones included."""
+        joints, tip = without_fixed(path)
+        n = len(joints)
+        # The last joint of an actuator stands for all: they have the same name and limits.
+        actuators = {joint.actuator: joint for joint in joints}
+        columns = [*actuators]
+        couplings = np.zeros((n, len(columns)))
+        for k, joint in enumerate(joints):
+            couplings[k, columns.index(joint.actuator)] = joint.factor
+        limits = np.array([joint.limits for joint in actuators.values()])
+        q_min, q_max, dq_max = limits.reshape(-1, 3).T
+        return cls(
+            np.reshape([joint.origin for joint in joints], (n, 4, 4)),
+            np.reshape([joint.axis for joint in joints], (n, 3)),
+            kinds=[joint.kind for joint in joints],
+            couplings=couplings,
+            names=[joint.name for joint in actuators.values()],
+            q_min=q_min,
+            q_max=q_max,
+            dq_max=dq_max,
+            tip=tip,
+            **options,
+        )
 
     @classmethod
     def from_stored(cls, stored: Stored, restore: Restore) -> RigidChain:
@@ -376,3 +395,219 @@ class RigidChain(JointChain):
             if name in stored.arrays
         }
         return cls(**arrays, **settings, dtype=torch.from_numpy(arrays["base"]).dtype)
+
+    def geometry(self) -> dict[str, Tensor]:
+        """Return the geometry by name.
+
+        Besides arguments of the constructor this has "links", shape (n_joints, 3) [m]: the origin
+        of every joint in the moving frame of the previous joint. The last link is the `tool`.
+        """
+        return {**super().geometry(), "links": self.origins[:, :3, 3]}
+
+    def _set_geometry(self, geometry: Mapping[str, Tensor | None]) -> None:
+        buffers = dict(geometry)
+        links = buffers.pop("links", None)
+        for name, value in buffers.items():
+            self.register_buffer(name, value)
+        if links is not None:
+            column = nn.functional.pad(links, (0, 1), value=1.0)[..., None]
+            self.origins = torch.cat([self.origins[..., :3], column], dim=-1)
+        motions = joint_motions(self.origins, self.axes, self.slides)
+        u1, u2 = joint_coefficients(-self.couplings @ self.joint_zeros, self.slides)
+        still, by_u1, by_u2 = motions.unbind(1)
+        at_zero = still + u1[:, None, None] * by_u1 + u2[:, None, None] * by_u2
+        tool = self.tip @ nn.functional.pad(self.tool, (0, 1), value=1.0)
+        end = torch.cat([self.tip[:, :3], tool[:, None]], dim=1)
+        self.register_buffer("motions", motions)
+        self.register_buffer("origins_at_zero", at_zero)
+        self.register_buffer("end", end)
+
+    @property
+    def default_parameters(self) -> tuple[str, ...]:
+        """Names of the parameters that a calibration fits by default."""
+        return ("base",)
+
+    @property
+    def limits(self) -> dict[str, Tensor]:
+        """The limits of the joints, as tensors of shape (n,)."""
+        return {name: self.get_buffer(name) for name in ("q_min", "q_max", "dq_max")}
+
+    @property
+    def reach(self) -> Tensor:
+        """Size of the arm, shape () [m]: the sum of links, finite strokes and tool."""
+        farthest = torch.maximum(self.q_min.abs(), self.q_max.abs())
+        farthest = torch.where(torch.isfinite(farthest), farthest, 0.0)
+        links = self.origins[:, :3, 3].norm(dim=1).sum()
+        ends = self.tip[:3, 3].norm() + self.tool.norm()
+        reach = links + self._strokes(farthest) + ends
+        return torch.where(reach > 0, reach, 1.0)
+
+    def longest(self, largest: Tensor) -> Tensor:
+        """Return the reach plus the strokes of prismatic joints within ``|q| <= largest``."""
+        return self.reach + self._strokes(largest + self.joint_zeros.abs())
+
+    def _strokes(self, largest: Tensor) -> Tensor:
+        """Return the sum of the strokes of prismatic joints for ``|q| <= largest``."""
+        return (self.couplings[self.slides].abs() @ largest).sum()
+
+    @property
+    def turns(self) -> Tensor:
+        """Which actuators are angles with a period of one turn, shape (n,), bool."""
+        still = torch.where(self.slides[:, None], 0.0, self.couplings.round())
+        return (self.couplings == still).all(0)
+
+    @property
+    def units(self) -> list[str]:
+        """The unit of every actuator: "rad" if it turns a joint, else "m"."""
+        turns = (self.couplings[~self.slides] != 0.0).any(0)
+        return ["rad" if turn else "m" for turn in turns.tolist()]
+
+    def coordinates(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return joint positions from the origins at rows q (N, n), and dz/dq (n_joints, n)."""
+        couplings = self.couplings.to(q)
+        return (q - self.joint_zeros.to(q)) @ couplings.mT, couplings
+
+    def from_coordinates(self, z: Tensor) -> Tensor:
+        """Return the tip (N, 3) at joint positions z (N, n_joints)."""
+        u1, u2 = joint_coefficients(z, self.slides.to(z.device))
+        end = self.end.to(z)[:, 3]
+        return carried_tip(u1, u2, self.motions.to(z), end, self.base.to(z)).T
+
+    def from_coordinates_and_jacobian(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the tip (N, 3) and its Jacobian by the joint positions (N, 3, n_joints)."""
+        tip, linear, _ = self._columns(self._frames(z))
+        return tip.T, linear.permute(2, 1, 0)
+
+    def forward(self, q: Tensor) -> Tensor:
+        """Return the tip position.
+
+        Parameters
+        ----------
+        q : Tensor of shape (..., n_actuators)
+            Joint positions [rad]; [m] for prismatic joints.
+
+        Returns
+        -------
+        Tensor of shape (..., 3)
+            Tip position in the measuring frame [m].
+        """
+        return self._by_rows(lambda z: (self.from_coordinates(z),), q)[0]
+
+    def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the tip (..., 3) [m] and its Jacobian dx/dq (..., 3, n) in one pass.
+
+        In closed form, in [m/rad] for revolute joints and [-] for prismatic ones.
+        """
+        x, J = self._by_rows(self.from_coordinates_and_jacobian, q)
+        return x, J @ self.couplings.to(q)
+
+    def pose_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the tip's pose (..., 4, 4) in the measuring frame, and `pose_jacobian(q)`."""
+        pose, J = self._by_rows(self._pose_and_columns, q)
+        return pose, J @ self.couplings.to(q)
+
+    def _pose_and_columns(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        frames = self._frames(z)
+        _, linear, axes = self._columns(frames)
+        angular = torch.where(self.slides.to(z.device)[:, None, None], 0.0, axes)
+        columns = torch.cat([linear, angular], dim=1)
+        pose = as_poses(frames[-1:])[:, 0] @ self.end.to(z)
+        return pose, columns.permute(2, 1, 0)
+
+    def poses(self, q: Tensor) -> Tensor:
+        """Return the pose of the base and of the link moved by each joint.
+
+        Parameters
+        ----------
+        q : Tensor of shape (..., n_actuators)
+            Joint positions [rad]; [m] for prismatic joints.
+
+        Returns
+        -------
+        Tensor of shape (..., n_joints + 1, 4, 4)
+            Homogeneous transforms into the measuring frame; the last one is that of the tip: the
+            end link's frame, shifted to the tool.
+        """
+        frames = self._by_rows(lambda z: (as_poses(self._frames(z)),), q)[0]
+        tip = frames[..., -1:, :, :] @ self.end.to(q)
+        return torch.cat([frames[..., :-1, :, :], tip], dim=-3)
+
+    def pose(self, q: Tensor) -> Tensor:
+        """Return the tip's pose in the measuring frame, shape (..., 4, 4)."""
+        return self.poses(q)[..., -1, :, :]
+
+    def backbone(self, q: Tensor, n_points: int = 1) -> Tensor:
+        """Return points along the straight lines from the base through all joints to the tip.
+
+        Parameters
+        ----------
+        q : Tensor of shape (..., n_actuators)
+            Joint positions [rad]; [m] for prismatic joints.
+        n_points : int, default=1
+            Points per line; the last one is the end of the line.
+
+        Returns
+        -------
+        Tensor of shape (..., (n_joints + 1) * n_points + 1, 3)
+            Positions in the measuring frame [m].
+        """
+        if n_points < 1:
+            raise ValueError(f"`n_points` must be at least 1, got {n_points}.")
+        frames = self._by_rows(lambda z: (as_poses(self._frames(z)),), q)[0]
+        corners = torch.cat([frames[..., :3, 3], self(q)[..., None, :]], dim=-2)
+        start = corners[..., :-1, None, :]
+        end = corners[..., 1:, None, :]
+        fractions = torch.linspace(0.0, 1.0, n_points + 1, dtype=q.dtype)[1:, None]
+        points = torch.lerp(start, end, fractions.to(q.device)).flatten(-3, -2)
+        return torch.cat([corners[..., :1, :], points], dim=-2)
+
+    def unit_messages(self, q: Tensor, name: str, factor: float = 1.0) -> list[str]:
+        """Return warnings if joints turn by more than two turns, or slide too far."""
+        turns = torch.tensor([unit == "rad" for unit in self.units], device=q.device)
+        turned = degrees_message(name, q[:, turns].abs(), factor)
+        slid = millimetres_message(name, q[:, ~turns].abs(), factor * _FAR)
+        return [message for message in (turned, slid) if message is not None]
+
+    def extra_repr(self) -> str:
+        """Return the summary shown by repr()."""
+        return f"{len(self.kinds)} joints: {', '.join(self.names)}"
+
+    def _why_shape(self) -> str:
+        return f"this arm has {self.n_actuators} moving joints"
+
+    def _by_rows(
+        self, function: Callable[[Tensor], tuple[Tensor, ...]], q: Tensor
+    ) -> tuple[Tensor, ...]:
+        """Return a function of joint positions (N, n_joints) at q (..., n)."""
+        check_vectors(q, self.n_actuators, "q", self._why_shape())
+        return in_blocks(lambda rows: function(self.coordinates(rows)[0]), q)
+
+    def _frames(self, z: Tensor) -> Tensor:
+        """Return the `moving_frames` at joint positions (N, n_joints), (n_joints + 1, 4, 3, N)."""
+        u1, u2 = joint_coefficients(z, self.slides.to(z.device))
+        return moving_frames(u1, u2, self.motions.to(z), self.base.to(z))
+
+    def _columns(self, frames: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the tip (3, N), its derivatives and the joint axes (n_joints, 3, N).
+
+        `frames` are those of `moving_frames`.
+        """
+        tip = torch.tensordot(self.end.to(frames)[:, 3], frames[-1], 1)
+        axes = (self.axes.to(frames)[..., None, None] * frames[1:, :3]).sum(1)
+        turning = torch.linalg.cross(axes, tip - frames[1:, 3], dim=1)
+        slides = self.slides.to(frames.device)[:, None, None]
+        # NaN in a row of NaN.
+        return tip, torch.where(slides, axes + (tip - tip), turning), axes
+
+
+def _strings(
+    strings: Sequence[str] | None, name: str, default: Sequence[str]
+) -> tuple[str, ...]:
+    """Return a caller's strings, as many as the default has."""
+    if strings is None:
+        return tuple(default)
+    if not np.iterable(strings):
+        raise TypeError(f"`{name}` must be a sequence of strings, got {strings!r:.80}.")
+    if len(strings) != len(default):
+        raise ValueError(f"`{name}` must hold {len(default)} strings, got {strings}.")
+    return tuple(map(str, strings))

@@ -4,10 +4,11 @@ import re
 import numpy as np
 import pytest
 import torch
+from lxml import etree
 from scipy.spatial.transform import Rotation
 from torch.testing import assert_close
 
-from hybridkin import HybridForwardModel, InverseKinematics, RigidChain, calibrate
+from hybridkin import InverseKinematics, RigidChain, calibrate
 from hybridkin._core.model import reverse_jacobian
 
 Z = [0.0, 0.0, 1.0]
@@ -125,13 +126,6 @@ def test_a_gantry_is_the_identity(rng):
     assert_close(gantry.pose_jacobian(q)[:, 3:], torch.zeros_like(J), rtol=0, atol=0)
 
 
-def test_a_full_turn_changes_nothing(rng):
-    q = random_q(rng)
-    turn = torch.full_like(q, 2 * math.pi)
-    turn[:, 2] = 0.0  # the prismatic joint
-    assert_close(arm()(q + turn), arm()(q), rtol=0, atol=1e-14)
-
-
 def test_urdf_against_pytorch_kinematics(rng):
     kinematics = pytest.importorskip("pytorch_kinematics")
     serial = kinematics.build_serial_chain_from_urdf(URDF.encode(), "flange")
@@ -149,31 +143,20 @@ def test_urdf_against_pytorch_kinematics(rng):
     assert_close(arm().poses(q)[:, 1:-1], expected, rtol=0, atol=2e-6)
 
 
-def test_urdf_is_read_to_double_precision():
-    assert arm().origins[1, 0, 3].item() == 0.01
-    rotation = arm().origins[2, :3, :3]
+def test_urdf_is_read_to_double_precision_with_limits_and_names():
+    chain = arm()
+    assert chain.origins[1, 0, 3].item() == 0.01
     turn, tilt = math.cos(0.4), 1.5707963
     expected = [turn * math.cos(tilt), -turn * math.sin(tilt)]
-    assert_close(rotation[1, 1:], torch.tensor(expected, dtype=torch.float64), rtol=0, atol=3e-16)
-
-
-def test_urdf_limits_and_names():
-    chain = arm()
-    inf = math.inf
-    low = torch.tensor([-2.8, -inf, 0.0] + [-inf] * 5, dtype=torch.float64)
-    high = torch.tensor([2.7, inf, 0.4] + [inf] * 5, dtype=torch.float64)
-    assert_close(chain.q_min, low, rtol=0, atol=0)
-    assert_close(chain.q_max, high, rtol=0, atol=0)
+    rotation = torch.tensor(expected, dtype=torch.float64)
+    assert_close(chain.origins[2, 1, 1:3], rotation, rtol=0, atol=3e-16)
+    assert chain.q_min.tolist() == [-2.8, -math.inf, 0.0] + [-math.inf] * 5
+    assert chain.q_max.tolist() == [2.7, math.inf, 0.4] + [math.inf] * 5
     assert chain.kinds == ("revolute", "revolute", "prismatic", *["revolute"] * 5)
     assert chain.names == tuple(f"j{k}" for k in range(1, 9))
-
-
-def test_urdf_axis_defaults_to_x():
-    text = """<robot name="r"><link name="a"/><link name="b"/><joint name="j" type="continuous">
-    <parent link="a"/><child link="b"/></joint></robot>"""
-    chain = RigidChain.from_urdf(text, "b", tool=[0.0, 1.0, 0.0])
-    x = chain(torch.tensor([math.pi / 2], dtype=torch.float64))
-    assert_close(x, torch.tensor(Z, dtype=torch.float64), rtol=0, atol=1e-15)
+    text = LINKS.format(JOINT.format("continuous", ""))  # without <axis> it is x
+    x = RigidChain.from_urdf(text, "b", tool=[0, 1, 0])(torch.tensor([math.pi / 2]).double())
+    assert_close(x, torch.tensor(Z, dtype=torch.float64), rtol=0, atol=1e-7)
 
 
 def test_part_of_a_urdf_from_a_file(tmp_path, rng):
@@ -219,23 +202,17 @@ def test_part_of_an_mjcf_from_a_file(tmp_path, rng):
     joined = lower.poses(q[:, :1])[:, -1] @ upper.poses(q[:, 1:])[:, -1]
     whole = RigidChain.from_mjcf(path, "hand")
     assert_close(joined, whole.poses(q)[:, -1], rtol=0, atol=1e-14)
-    assert_close(whole.q_min, torch.tensor([-2.0] + [-math.inf] * 3, dtype=torch.float64))
+    assert whole.q_min.tolist() == [-2.0] + [-math.inf] * 3
+    assert whole.q_max.tolist() == [2.5] + [math.inf] * 3
     assert RigidChain.from_mjcf(path, "pin", root_link="ball").names == ("pin",)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("rows", [2, 65], ids=["few rows", "many rows"])
-def test_gradcheck(rows, rng):
-    chain, q = arm(tool=[0.1, 0.02, 0.2]), random_q(rng, rows)
+def test_gradcheck(rng):
+    chain, q = arm(tool=[0.1, 0.02, 0.2], root_link="plate"), random_q(rng, 2, 4)
     q[0] = 0.0
-
-    def both_ends(ends):
-        return chain.forward_and_jacobian(torch.cat([ends[:1], q[1:-1], ends[1:]]))
-
-    ends = q[[0, -1]].requires_grad_()
-    assert torch.autograd.gradcheck(both_ends, ends)
-    assert torch.autograd.gradcheck(chain, ends)
-    assert torch.autograd.gradgradcheck(chain, ends)
+    q.requires_grad_()
+    assert torch.autograd.gradcheck(chain.forward_and_jacobian, q)
+    assert torch.autograd.gradgradcheck(chain, q)
 
 
 def test_angular_jacobian_turns_the_tip_frame(rng):
@@ -245,15 +222,9 @@ def test_angular_jacobian_turns_the_tip_frame(rng):
     spin = slope.permute(0, 3, 1, 2) @ frame[:, None].mT
     expected = torch.stack([spin[..., 2, 1], spin[..., 0, 2], spin[..., 1, 0]], 1)
     assert_close(angular, expected, rtol=0, atol=4e-15)
-
-
-@pytest.mark.parametrize("n", [1, 5, 300])
-def test_pose_and_jacobian_is_the_last_pose(rng, n):
-    chain = RigidChain.from_urdf(URDF, "camera")
-    q = 0.3 * torch.rand(n, chain.n_actuators, generator=rng, dtype=torch.float64)
     pose, J = chain.pose_and_jacobian(q)
-    assert_close(pose, chain.poses(q)[:, -1], rtol=0, atol=1e-13)
-    assert_close(J, chain.pose_jacobian(q), rtol=0, atol=0)
+    assert_close(pose, chain.pose(q), rtol=0, atol=2e-15)
+    assert_close(J[:, :3], chain.jacobian(q), rtol=0, atol=0)
     assert_close(chain.pose_and_jacobian(q[0])[0], pose[0])
 
 
@@ -264,11 +235,10 @@ def test_poses_and_backbone_agree(rng):
     assert_close(poses[:, -1, :3, 3], chain(q), rtol=0, atol=4e-15)
     assert_close(points[:, :-6:3], poses[:, :-1, :3, 3], rtol=0, atol=4e-15)
     assert_close(points[:, -1], chain(q), rtol=0, atol=4e-15)
-    bends = points.diff(dim=1).diff(dim=1)
-    corners = torch.arange(2, bends.shape[1], 3)
-    straight = torch.ones(bends.shape[1], dtype=torch.bool).index_fill(0, corners, value=False)
-    assert bends[:, straight].abs().max() < 1e-14
-    assert chain.backbone(q).shape == (4, 10, 3)
+    corners = chain.backbone(q)
+    assert corners.shape == (4, 10, 3)
+    third = torch.lerp(corners[:, :-1], corners[:, 1:], 1 / 3)
+    assert_close(points[:, 1::3], third, rtol=0, atol=4e-15)
 
 
 def test_float32_keeps_its_dtype_and_accuracy(rng):
@@ -297,16 +267,10 @@ def test_reach_bounds_the_tip(rng):
     q[:, 2].clamp_(0.0, 0.4)  # the prismatic joint, within its limits
     assert (chain(q).norm(dim=1) <= chain.reach).all()
     assert_close(planar().reach, torch.tensor(0.5, dtype=torch.float64), rtol=1e-14, atol=0)
-    point = RigidChain(np.eye(4)[None], [Z])
-    assert_close(point.reach, torch.tensor(1.0, dtype=torch.float64), rtol=0, atol=0)
-
-
-def test_strokes_without_limits_do_not_count_in_the_reach():
+    assert RigidChain(np.eye(4)[None], [Z]).reach == 1.0  # a point
     origins, kinds = [translation(0.3, 0.0, 0.4)] * 2, ["prismatic"] * 2
     half = RigidChain(origins, [Z, Z], kinds=kinds, q_min=[0.0, 0.0], q_max=[math.inf, 0.2])
     assert_close(half.reach, torch.tensor(1.2, dtype=torch.float64), rtol=1e-14, atol=0)
-    free = RigidChain(origins, [Z, Z], kinds=kinds)
-    assert_close(free.reach, torch.tensor(1.0, dtype=torch.float64), rtol=1e-14, atol=0)
 
 
 def test_with_geometry_is_differentiable_and_leaves_the_arm(rng):
@@ -322,97 +286,69 @@ def test_with_geometry_is_differentiable_and_leaves_the_arm(rng):
     assert_close(chain(q), arm()(q), rtol=0, atol=0)
     with pytest.raises(ValueError, match="`radii` is not part"):
         chain.with_geometry(radii=tool)
-    with pytest.raises(ValueError, match=r"`tool` must have shape \(3,\)"):
-        chain.with_geometry(tool=tool[:2])
-
-
-def test_pytorch_kinematics_rotations_become_orthonormal():
-    kinematics = pytest.importorskip("pytorch_kinematics")
-    serial = kinematics.build_serial_chain_from_urdf(URDF.encode(), "flange")
-    rotation = RigidChain.from_chain(serial).origins[:, :3, :3]
-    eye = torch.eye(3, dtype=torch.float64).expand_as(rotation)
-    assert_close(rotation.mT @ rotation, eye, rtol=0, atol=2e-15)
-
-
-def sagging(q):
-    """A cable-driven arm whose true tips hang below the rigid model's."""
-    x = arm()(q)
-    sag = 0.01 * torch.cos(q[:, 1]) + 0.005 * torch.sin(q[:, 3])
-    return torch.stack([x[:, 0], x[:, 1] + 0.004 * q[:, 0], x[:, 2] - sag], -1)
-
-
-def test_a_hybrid_learns_the_sag_of_an_arm_and_is_inverted(rng):
-    q, unseen = random_q(rng, 600), 0.8 * random_q(rng, 100)
-    model = HybridForwardModel(arm(), random_state=0).fit(q.numpy(), sagging(q).numpy())
-
-    def rmse(x):
-        return float(np.sqrt(((x - sagging(unseen).numpy()) ** 2).sum(1).mean()))
-
-    learned = rmse(model.predict(unseen.numpy()))
-    assert learned < 0.2 * rmse(model.predict_mechanical(unseen.numpy()))
-    J = reverse_jacobian(model.module_, unseen)[1]
-    assert_close(model.jacobian(unseen.numpy()), J.numpy(), rtol=0, atol=1e-12)
-    targets = torch.as_tensor(model.predict(unseen.numpy()))
-    ik = InverseKinematics(model, q_min=-1.0, q_max=1.0)
-    found = ik.solve(targets, max_iter=100, restarts=5)
-    assert_close(model.module_(found.q), targets, rtol=0, atol=1e-4)
 
 
 LINKS = '<robot name="r"><link name="a"/><link name="b"/>{}</robot>'
 JOINT = '<joint name="j" type="{}"><parent link="a"/><child link="b"/>{}</joint>'
-MIMIC = LINKS.format(JOINT.format("revolute", '<mimic joint="j"/>'))
-CIRCLE = LINKS.format(
-    JOINT.format("fixed", "")
-    + '<joint name="k" type="fixed"><parent link="b"/><child link="a"/></joint>'
-)
+SECOND = JOINT.replace('"j"', '"k"').format("fixed", "")
 EYES = np.stack([np.eye(4)] * 2)
 
 
 @pytest.mark.parametrize(
-    ("make", "message"),
+    ("name", "make"),
     [
-        (lambda: RigidChain(EYES, [Z]), r"`origins` must have shape \(1, 4, 4\), got \(2, 4, 4\)"),
-        (lambda: RigidChain(2 * EYES, [Z, Z]), r"`origins\[0\]` must hold a rotation"),
-        (lambda: RigidChain(EYES, [[0, 0]]), r"`axes` must have shape \(n, 3\)"),
-        (lambda: RigidChain(EYES, [Z, [0, 0, 0]]), "`axes` must not have zero length"),
-        (lambda: RigidChain(EYES, [Z, ["a", 0, 0]]), "`axes` must be numeric"),
-        (lambda: RigidChain(EYES, [Z, [math.nan, 0, 0]]), "`axes` must be finite"),
-        (lambda: planar(kinds=["revolute"]), "`kinds` must hold 2 of"),
-        (lambda: planar(kinds=["revolute", "ball"]), "`kinds` must hold 2 of"),
-        (lambda: planar(names=["a"]), "`names` must hold 2 names"),
-        (lambda: planar(q_min=[1, 1], q_max=[2, 0]), "`q_min` must not exceed `q_max`"),
-        (lambda: planar(q_min=[0, math.nan]), "`q_min` must be finite"),
-        (lambda: planar(dq_max=[1, 0]), "`dq_max` must be positive, got"),
-        (lambda: planar(couplings=[[1.0]]), r"`couplings` must have shape \(2, m\)"),
-        (lambda: planar(joint_zeros=[1.0]), r"`joint_zeros` must have shape \(2,\)"),
-        (lambda: planar(tool=[0.1]), r"`tool` must have shape \(3,\)"),
-        (lambda: planar(tool=[0, 0, math.inf]), "`tool` must be finite"),
-        (lambda: planar(base=np.eye(3)), r"`base` must be one pose of shape \(4, 4\)"),
-        (lambda: planar(tip=2 * np.eye(4)), "`tip` must hold a rotation"),
-        (
-            lambda: planar()(torch.zeros(4, 3)),
-            r"`q` must have shape \(..., 2\), .* 2 moving joints",
-        ),
-        (lambda: planar().backbone(torch.zeros(2), 0), "`n_points` must be at least 1"),
-        (lambda: planar().check_actuators(torch.tensor([[0, math.nan]])), "`q` must be finite"),
-        (lambda: RigidChain.from_urdf("<robot", "a"), "must be a valid URDF"),
-        (
-            lambda: RigidChain.from_urdf(URDF, "flang"),
-            "`end_link` 'flang' .* did you mean 'flange'",
-        ),
-        (lambda: arm(root_link="?"), "`root_link` '[?]' is not in the robot; it has"),
-        (lambda: arm(root_link="camera"), "`root_link` must lead to 'flange', but 'camera'"),
-        (
-            lambda: RigidChain.from_urdf(LINKS.format(JOINT.format("ball", "")), "b"),
-            "`type` of joint 'j' must be one of .* got 'ball'",
-        ),
-        (lambda: RigidChain.from_urdf(CIRCLE, "b"), "must be a tree, got a cycle"),
-        (lambda: RigidChain.from_urdf(MIMIC, "b"), "joints must not mimic each other in a circle"),
+        ("origins", lambda: RigidChain(EYES, [Z])),
+        (r"origins\[0\]", lambda: RigidChain(2 * EYES, [Z, Z])),
+        ("axes", lambda: RigidChain(EYES, [Z, [0, 0, 0]])),
+        ("kinds", lambda: planar(kinds=["revolute"])),
+        ("kinds", lambda: planar(kinds=["revolute", "ball"])),
+        ("kinds", lambda: planar(kinds=3)),
+        ("names", lambda: planar(names=["a"])),
+        ("q_min", lambda: planar(q_min=[1, 1], q_max=[2, 0])),
+        ("q_min", lambda: planar(q_min=[0, math.nan])),
+        ("dq_max", lambda: planar(dq_max=[1, 0])),
+        ("couplings", lambda: planar(couplings=[[1.0]])),
+        ("tip", lambda: planar(tip=2 * np.eye(4))),
+        ("q", lambda: planar()(torch.zeros(4, 3))),
+        ("n_points", lambda: planar().backbone(torch.zeros(2), 0)),
     ],
 )
-def test_bad_input_says_what_is_needed(make, message):
-    with pytest.raises(ValueError, match=message):
+def test_bad_arguments_are_refused_by_name(name, make):
+    with pytest.raises((TypeError, ValueError), match=f"`{name}`"):
         make()
+
+
+@pytest.mark.parametrize(
+    ("read", "message"),
+    [
+        (lambda: RigidChain.from_urdf("<robot", "a"), "valid URDF"),
+        (lambda: RigidChain.from_urdf("<sdf/>", "a"), "got <sdf>"),
+        (
+            lambda: RigidChain.from_urdf(f'<!DOCTYPE robot [<!ENTITY a "b">]>{URDF[39:]}', "l1"),
+            "DOCTYPE",
+        ),
+        (lambda: RigidChain.from_urdf(URDF, "flang"), "`end_link` .* did you mean 'flange'"),
+        (lambda: arm(root_link="?"), "`root_link` '[?]' is not in the robot; it has"),
+        (lambda: arm(root_link="camera"), "`root_link` must lead to 'flange'"),
+        (lambda: urdf(JOINT.format("ball", "")), "`type` of joint 'j' .* got 'ball'"),
+        (lambda: urdf(JOINT.format("revolute", '<mimic joint="j"/>')), "in a circle"),
+        (
+            lambda: urdf(JOINT.format("fixed", '<origin xyz="1 2"/>')),
+            "`xyz` of <origin> .* 3 numbers",
+        ),
+        (lambda: urdf(JOINT.format("fixed", "") + SECOND), "every <child> .* 'b' repeatedly"),
+        (lambda: urdf(JOINT.format("fixed", "") + SECOND.replace('"k"', '"j"')), "every joint"),
+        (lambda: urdf(JOINT.replace('"a"', '"b"').format("fixed", "")), "got a cycle"),
+        (lambda: urdf(one_joint("nan", 1)), "`q_min` must be finite"),
+    ],
+)
+def test_broken_urdfs_are_refused(read, message):
+    with pytest.raises(ValueError, match=message):
+        read()
+
+
+def urdf(joints):
+    return RigidChain.from_urdf(joints if "<robot" in joints else LINKS.format(joints), "b")
 
 
 def one_joint(low, high):
@@ -420,101 +356,29 @@ def one_joint(low, high):
     return LINKS.format(JOINT.format("revolute", limit))
 
 
-@pytest.mark.parametrize("limits", [("nan", 1), (0, "nan"), ("inf", "inf"), (0, "-inf")])
-def test_wrong_urdf_limits_name_the_joint(limits):
-    with pytest.raises(ValueError, match="joint 'j' must have a lower and an upper limit"):
-        RigidChain.from_urdf(one_joint(*limits), "b")
-
-
-def test_equal_urdf_limits_lock_the_joint():
-    arm = RigidChain.from_urdf(one_joint(0.3, 0.3), "b")
-    assert (float(arm.q_min), float(arm.q_max)) == (0.3, 0.3)
-    with pytest.warns(UserWarning, match=r"\['j'\] are locked at 0"):
-        arm = RigidChain.from_urdf(one_joint(0, 0), "b")
-    assert (float(arm.q_min), float(arm.q_max)) == (0.0, 0.0)
-
-
-def test_missing_urdf_limits_are_unlimited_with_a_warning():
-    with pytest.warns(UserWarning, match=r"\['j'\] have no <limit>") as caught:
-        arm = RigidChain.from_urdf(LINKS.format(JOINT.format("revolute", "")), "b")
+def test_equal_missing_and_swapped_limits_of_a_urdf():
+    assert urdf(one_joint(0.3, 0.3)).limits["q_min"] == urdf(one_joint(0.3, 0.3)).q_max == 0.3
+    with pytest.warns(UserWarning, match="'j' is locked") as caught:
+        locked = urdf(one_joint(0, 0))
     assert caught[0].filename == __file__
-    assert (float(arm.q_min), float(arm.q_max)) == (-math.inf, math.inf)
-
-
-def test_inverse_kinematics_keeps_a_locked_joint(rng):
-    low, high = torch.tensor([-2.0, 0.4, -2.0]), torch.tensor([2.0, 0.4, 2.0])
-    origins = np.stack([translation(0.2, 0.0, 0.0)] * 3)
-    locked = RigidChain(origins, [Z, [0, 1, 0], Z], tool=[0.2, 0, 0.1], q_min=low, q_max=high)
-    q = low + (high - low) * torch.rand(50, 3, generator=rng, dtype=torch.float64)
-    ik = InverseKinematics(locked, q_min=locked.q_min, q_max=locked.q_max)
-    found = ik.solve(locked(q), restarts=8)
-    assert found.converged.all()
-    assert_close(found.q[:, 1], torch.full((50,), 0.4, dtype=torch.float64), rtol=0, atol=1e-7)
-
-
-EXTRA = '<link name="c"/>' + JOINT.replace('"j"', '"k"').format("fixed", "")
-
-
-@pytest.mark.parametrize(
-    ("joints", "message"),
-    [
-        (JOINT.replace('"a"', '"z"'), "<parent> of joint 'j' 'z' is not in the robot"),
-        (JOINT + EXTRA.replace('"b"', '"z"'), "<child> of joint 'k' 'z' is not in the robot"),
-        (JOINT + EXTRA.replace('"a"', '"b"').replace('"b"', '"c"'), "got a cycle: .c. -> .c."),
-        (JOINT + '<link name="c"/>', r"one root, but no joint leads to any of \['a', 'c'\]"),
-        (JOINT + EXTRA.replace('"a"', '"c"'), r"every <child> .* once, got \['b'\]"),
-        (JOINT + '<link name="a"/>', r"every link .* once, got \['a'\]"),
-        (JOINT + EXTRA.replace('"b"', '"c"').replace('"k"', '"j"'), r"every joint .* \['j'\]"),
-    ],
-)
-def test_a_urdf_must_be_a_tree(joints, message):
-    with pytest.raises(ValueError, match=message):
-        RigidChain.from_urdf(LINKS.format(joints.format("fixed", "")), "b")
-
-
-HINGE = '<mujoco><compiler {}/><worldbody><body name="b"><joint name="j" {}/>'
-HINGE += '<geom size="0.1"/></body></worldbody></mujoco>'
-
-
-@pytest.mark.parametrize(
-    ("compiler", "joint", "limits"),
-    [
-        ("", 'range="-30 60"', (-math.pi / 6, math.pi / 3)),
-        ('angle="radian"', 'range="-1 2"', (-1.0, 2.0)),
-        ("", 'type="slide" range="-0.1 0.2"', (-0.1, 0.2)),
-        ("", 'range="-30 60" limited="false"', (-math.inf, math.inf)),
-        ("", "", (-math.inf, math.inf)),
-    ],
-)
-def test_mjcf_limits(compiler, joint, limits):
-    pytest.importorskip("mujoco")
-    arm = RigidChain.from_mjcf(HINGE.format(compiler, joint), "b")
-    assert (float(arm.q_min), float(arm.q_max)) == pytest.approx(limits, abs=1e-15)
-
-
-@pytest.mark.parametrize(
-    ("joint", "message"),
-    [
-        ('range="30 -30"', "joint 'j' must have a lower and an upper limit"),
-        ('range="nan 1"', "must have numbers, .* got range='nan 1'"),
-        ('range="5 5"', "`range` of joint 'j' must be an interval"),
-        ('limited="true"', "must be a valid MJCF"),
-    ],
-)
-def test_wrong_mjcf_limits_name_the_joint(joint, message, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)  # MuJoCo writes a log of its own there
-    pytest.importorskip("mujoco")
-    with pytest.raises(ValueError, match=message):
-        RigidChain.from_mjcf(HINGE.format("", joint), "b")
+    assert locked.q_min == locked.q_max == 0.0
+    with pytest.warns(UserWarning, match="'j' has no <limit>"):
+        free = urdf(JOINT.format("revolute", ""))
+    assert (float(free.q_min), float(free.q_max)) == (-math.inf, math.inf)
+    with pytest.warns(UserWarning, match="'j' are swapped"):
+        swapped = urdf(one_joint(1, -1))
+    assert (float(swapped.q_min), float(swapped.q_max), float(swapped.dq_max)) == (-1, 1, 1)
+    still = urdf(one_joint(-1, 1).replace('velocity="1"', 'velocity="0"'))
+    assert still.dq_max == math.inf
 
 
 @pytest.mark.parametrize(
     ("text", "end", "root", "message"),
     [
-        ("<mujoco>", "hand", None, "must be a valid MJCF"),
-        (MJCF, "hant", None, "`end_link` 'hant' .* did you mean 'hand'"),
-        (MJCF, "hand", "hend", "`root_link` 'hend' .* did you mean 'hand'"),
-        (MJCF, "hand", "ball", "`root_link` must lead to 'hand', but 'ball'"),
+        ("<mujoco>", "hand", None, "valid MJCF"),
+        (MJCF, "hant", None, "`end_link` .* did you mean 'hand'"),
+        (MJCF, "hand", "hend", "`root_link` .* did you mean 'hand'"),
+        (MJCF, "hand", "ball", "`root_link` must lead to 'hand'"),
         (MJCF, "pin", None, "of body 'ball' is free or a ball"),
     ],
 )
@@ -614,84 +478,6 @@ def test_joints_that_mimic_others_are_one_actuator(rng):
         assert ik.solve(arm(q[:1]), q0=q[:1] + 0.05).converged.all()
 
 
-def serial_urdf(*joints):
-    """A URDF of joints in a row, each as name, type and more tags."""
-    links = "".join(f'<link name="l{i}"/>' for i in range(len(joints) + 1))
-    tags = "".join(
-        f'<joint name="{name}" type="{kind}"><parent link="l{i}"/><child link="l{i + 1}"/>'
-        '<origin xyz="0.5 0 0"/><axis xyz="0 0 1"/>'
-        f'<limit lower="-1" upper="1" effort="1" velocity="1"/>{more}</joint>'
-        for i, (name, kind, more) in enumerate(joints)
-    )
-    return f'<robot name="r">{links}{tags}</robot>', f"l{len(joints)}"
-
-
-@pytest.mark.parametrize(
-    ("joints", "names"),
-    [
-        (
-            [("base", "planar", ""), ("base_x", "prismatic", "")],
-            ("base_x_", "base_y", "base_yaw", "base_x"),
-        ),
-        (
-            [("base_yaw", "revolute", ""), ("base", "planar", "")],
-            ("base_yaw", "base_x", "base_y", "base_yaw_"),
-        ),
-        (
-            [("base", "planar", ""), ("base_x", "planar", ""), ("base_x_y", "revolute", "")],
-            (
-                *("base_x_", "base_y", "base_yaw"),
-                *("base_x_x", "base_x_y_", "base_x_yaw", "base_x_y"),
-            ),
-        ),
-        ([("joint_2", "revolute", ""), ("", "revolute", "")], ("joint_2", "joint_2_")),
-    ],
-)
-def test_joints_whose_names_would_be_equal_are_actuators_of_their_own(joints, names):
-    arm = RigidChain.from_urdf(*serial_urdf(*joints))
-    assert arm.names == names
-    assert arm.n_actuators == len(arm.kinds)
-    q = torch.zeros(len(names), dtype=torch.float64)
-    assert arm.pose_jacobian(q).abs().sum(0).min() > 0.5
-
-
-def test_a_mimic_joint_follows_a_joint_and_no_part_of_a_planar_one():
-    mimic = '<mimic joint="base_x"/>'
-    joints = [("base", "planar", ""), ("base_x", "revolute", ""), ("j", "revolute", mimic)]
-    arm = RigidChain.from_urdf(*serial_urdf(*joints))
-    assert arm.names == ("base_x_", "base_y", "base_yaw", "base_x")
-    assert arm.couplings.nonzero().tolist() == [[0, 0], [1, 1], [2, 2], [3, 3], [4, 3]]
-    missing = [("base", "planar", ""), ("j", "prismatic", mimic)]  # the file has no joint base_x
-    with pytest.warns(UserWarning, match="base_x.* have no <limit>"):
-        assert RigidChain.from_urdf(*serial_urdf(*missing)).n_actuators == 4
-
-
-def test_an_unnamed_joint_of_an_mjcf_is_an_actuator_of_its_own():
-    pytest.importorskip("mujoco")
-    text = """<mujoco><worldbody><body name="a"><joint type="hinge" axis="0 0 1" name="joint_2"/>
-    <geom size=".1"/><body name="b" pos="1 0 0"><joint type="hinge" axis="0 0 1"/>
-    <geom size=".1"/><body name="c" pos="1 0 0"><geom size=".1"/></body></body></body></worldbody>
-    </mujoco>"""
-    arm = RigidChain.from_mjcf(text, "c")
-    assert arm.names == ("joint_2", "joint_2_")
-    q = torch.tensor([0.3, -0.8], dtype=torch.float64)
-    a, b = q[0], q.sum()
-    expected = torch.stack([a.cos() + b.cos(), a.sin() + b.sin(), 0 * a])
-    torch.testing.assert_close(arm(q), expected)
-
-
-def test_joints_of_equal_names_in_a_chain_are_actuators_of_their_own():
-    pk = pytest.importorskip("pytorch_kinematics")
-    chain = pk.build_serial_chain_from_urdf(
-        *serial_urdf(("first", "revolute", ""), ("second", "revolute", ""))
-    )
-    for name in chain.get_frame_names():
-        chain.find_frame(name).joint.name = "same"
-    arm = RigidChain.from_chain(chain)
-    assert arm.n_actuators == 2
-    assert len({*arm.names}) == 2
-
-
 def test_a_mimicked_joint_may_be_fixed_or_missing():
     fixed = COUPLED.replace('name="m" type="prismatic"', 'name="m" type="fixed"')
     arm = RigidChain.from_urdf(fixed, "f")
@@ -699,7 +485,7 @@ def test_a_mimicked_joint_may_be_fixed_or_missing():
     q = torch.tensor([[0.0, 0.7]], dtype=torch.float64)
     assert arm.names == ("n",)
     assert_close(arm.pose(q[:, 1:]), still.pose(q), rtol=0, atol=2e-15)
-    with pytest.warns(UserWarning, match=r"\['q'\] have no <limit>"):
+    with pytest.warns(UserWarning, match="'q' has no <limit>"):
         missing = RigidChain.from_urdf(COUPLED.replace('mimic joint="m"', 'mimic joint="q"'), "f")
     assert missing.names == ("q", "n")
     assert_close(missing.pose(q), still.pose(q), rtol=0, atol=0)
@@ -736,29 +522,26 @@ def test_floating_and_planar_joints_are_moves_and_turns():
     second[:3, :3] = Rotation.from_euler("Z", float(q[8])).as_matrix()
     second[:2, 3] = q[6:8]
     assert_close(arm.pose(q), torch.from_numpy(first @ second), rtol=0, atol=1e-15)
+    with pytest.raises(ValueError, match="'o_x' is free"):
+        arm.to_urdf(LINKS.format('<link name="c"/>' + both), "c")
 
 
-def test_swapped_limits_are_taken_in_order_and_no_speed_stands_for_none():
-    with pytest.warns(UserWarning, match="limits of joint 'j' are swapped"):
-        arm = RigidChain.from_urdf(one_joint(1, -1), "b")
-    assert (float(arm.q_min), float(arm.q_max), float(arm.dq_max)) == (-1.0, 1.0, 1.0)
-    still = one_joint(-1, 1).replace('velocity="1"', 'velocity="0"')
-    assert RigidChain.from_urdf(still, "b").dq_max == math.inf
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ('<!DOCTYPE robot [<!ENTITY a "aaaa">]>' + COUPLED, "it declares entities"),
-        ("<sdf/>", "the outermost tag must be <robot>, got <sdf>"),
-        (COUPLED.replace("0.2 0 0", "0.2 0"), r"`xyz` of <origin> of joint 'n' must be 3 numbers"),
-        (COUPLED.replace('multiplier="2"', 'multiplier="x"'), "`multiplier` of <mimic> of joint"),
-        (COUPLED.replace('joint="m"', 'joint="l"'), "mimic each other in a circle"),
-    ],
-)
-def test_hostile_and_broken_urdfs_are_refused(text, message):
-    with pytest.raises(ValueError, match=message):
-        RigidChain.from_urdf(text, "f")
+def test_joints_of_equal_names_are_actuators_of_their_own():
+    """A part of a planar joint beside a joint of its name, and a joint that mimics the latter."""
+    text = """<robot name="r"><link name="a"/><link name="b"/><link name="c"/><link name="d"/>"""
+    text += joint("base", "a", "b", "planar") + joint("base_x", "b", "c", "revolute", LIMIT)
+    text += joint("j", "c", "d", "revolute", LIMIT, '<mimic joint="base_x"/>') + "</robot>"
+    arm = RigidChain.from_urdf(text, "d")
+    assert arm.names == ("base_x", "base_y", "base_yaw", "base_x")
+    assert arm.couplings.nonzero().tolist() == [[0, 0], [1, 1], [2, 2], [3, 3], [4, 3]]
+    pytest.importorskip("mujoco")
+    unnamed = MJCF.replace('name="lift"', "").replace('name="wrist"', "")
+    assert RigidChain.from_mjcf(unnamed, "hand").n_actuators == 4
+    kinematics = pytest.importorskip("pytorch_kinematics")
+    chain = kinematics.build_serial_chain_from_urdf(URDF.encode(), "l3")
+    for name in chain.get_frame_names():
+        chain.find_frame(name).joint.name = "same"
+    assert RigidChain.from_chain(chain).n_actuators == 3
 
 
 def moved(arm, rng):
@@ -788,7 +571,7 @@ def test_joint_zeros_are_where_q_starts(rng):
 @pytest.mark.parametrize(("text", "end"), [(URDF, "flange"), (COUPLED, "f")])
 def test_a_calibrated_urdf_is_read_as_the_calibrated_arm(text, end, tmp_path, rng):
     path = tmp_path / "arm.urdf"
-    path.write_bytes(b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode())
+    path.write_bytes(b"\xef\xbb\xbf" + text.encode())
     tool = [0.1, 0.2, 0.3]
     chain = moved(RigidChain.from_urdf(path, end, tool=tool), rng)
     written = chain.to_urdf(path, end)
@@ -796,29 +579,24 @@ def test_a_calibrated_urdf_is_read_as_the_calibrated_arm(text, end, tmp_path, rn
     assert_close(again.poses(q)[:, 1:], chain.poses(q)[:, 1:], rtol=0, atol=1e-12)
     assert_close(again.jacobian(q), chain.jacobian(q), rtol=0, atol=1e-12)
     assert again.to_urdf(written, end) == written
-    kept = re.compile("<origin[^>]*>")
-    assert kept.sub("", written) == kept.sub("", text.replace("\n", "\r\n"))
-    fixed = re.search('<joint name="(plate|mount)".*?</joint>', text.replace("\n", "\r\n"), re.S)
+    # Nothing else has changed: comments, tags of vendors, the order, fixed joints.
+    origin = re.compile("<origin[^>]*>(</origin>)?")
+    before = etree.tostring(etree.fromstring(text.encode()).getroottree(), encoding="unicode")
+    assert origin.sub("", written) == origin.sub("", before)
+    fixed = re.search('<joint name="(plate|mount)".*?</joint>', before, re.S)
     assert fixed[0] in written
-    plain = RigidChain.from_urdf(text, end)
-    assert plain.to_urdf(text, end) == text
-    with pytest.raises(ValueError, match="must be the URDF of this arm"):
-        plain.to_urdf(text, "e" if end == "f" else "l7")
+    assert RigidChain.from_urdf(text, end).to_urdf(text, end) == before
 
 
 def test_only_the_urdf_of_the_arm_is_changed():
     """Neither one with other names of as many joints, nor one with a joint more that mimics."""
-    first, second, tags = "<origin/>", '<origin xyz="0.1 0 0"/>', '<mimic joint="j"/>'
     links = '<robot name="r"><link name="a"/><link name="b"/><link name="c"/>{}</robot>'
-    one = joint("j", "a", "b", "continuous", first)
-    text = links.format(one + joint("k", "b", "c", "fixed", second))
-    chain = RigidChain.from_urdf(text, "c")
-    assert chain.to_urdf(text, "c") == text
-    renamed = links.format(one.replace('"j"', '"other"') + joint("k", "b", "c", "fixed", second))
-    longer = links.format(one + joint("k", "b", "c", "continuous", second, tags))
-    for other, got in ((renamed, r"\['other'\]"), (longer, r"\['j', 'j'\]")):
-        with pytest.raises(ValueError, match=rf"whose actuators are \['j'\], got {got} up to 'c'"):
-            chain.to_urdf(other, "c")
+    first, second = joint("j", "a", "b", "continuous"), joint("k", "b", "c", "fixed")
+    chain = RigidChain.from_urdf(links.format(first + second), "c")
+    third = joint("k", "b", "c", "continuous", '<mimic joint="j"/>')
+    for other in (first.replace('"j"', '"other"') + second, first + third):
+        with pytest.raises(ValueError, match="must be the URDF of this arm"):
+            chain.to_urdf(links.format(other), "c")
 
 
 def test_a_pitch_of_ninety_degrees_is_written_exactly():
@@ -856,43 +634,24 @@ def test_calibration_finds_links_and_joint_zeros(rng):
     assert_close(again(q), result.chain(q), rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    "part",
-    [
-        '<worldbody><replicate count="1000000000"><geom size="1"/></replicate></worldbody>',
-        '<worldbody><replicate count="500"><replicate count="500"/></replicate></worldbody>',
-        '<asset><texture name="t" builtin="flat" width="100000" height="100000"/></asset>',
-        '<size nuser_body="2000000000"/>',
-        '<worldbody><body pos="nan 0 0"/></worldbody>',
-    ],
-)
-def test_mjcf_that_would_fill_the_memory_or_write_a_file(part):
-    with pytest.raises(ValueError, match="`text_or_path` must have numbers, and sizes within"):
-        RigidChain.from_mjcf(f"<mujoco>{part}</mujoco>", "hand")
-
-
 def test_urdf_of_any_size_takes_bounded_time(tmp_path):
     path = tmp_path / "arm.urdf"
-    names = [f"<link name='l{k}'/>" for k in range(2_001)]
 
-    def joints(n, tags):
-        return [
-            f"<joint name='j{k}' type='revolute'><parent link='l{k}'/><child link='l{k + 1}'/>"
-            f"<limit lower='-1' upper='1'/>{tags(k)}</joint>"
+    def read(n, mimic=""):
+        joints = [
+            joint(f"j{k}", f"l{k}", f"l{k + 1}", "revolute", LIMIT, mimic.format((k + 1) % n))
             for k in range(n)
         ]
-
-    def written(n, tags=lambda k: ""):
-        path.write_text(f"<robot>{''.join([*names[: n + 1], *joints(n, tags)])}</robot>")
-        return path
+        links = [f'<link name="l{k}"/>' for k in range(n + 1)]
+        path.write_text(f"<robot>{''.join(links + joints)}</robot>")
+        return RigidChain.from_urdf(path, f"l{n}")
 
     with pytest.raises(ValueError, match="at most 1000 moving joints, got 2000"):
-        RigidChain.from_urdf(written(2_000), "l2000")
-    row = written(100, lambda k: f"<mimic joint='j{k + 1}'/>" if k < 99 else "")
-    with pytest.raises(ValueError, match="must mimic via at most 64 other joints"):
-        RigidChain.from_urdf(row, "l100")
+        read(2_000)
+    with pytest.raises(ValueError, match="nor more than 64 in a row"):
+        read(100, '<mimic joint="j{}"/>')
     path.write_text("<robot>" + " " * 4_000_000)
-    with pytest.raises(ValueError, match="`text_or_path` must be at most 4000000 bytes long"):
+    with pytest.raises(ValueError, match="at most 4000000 bytes long"):
         RigidChain.from_urdf(path, "l1")
 
 

@@ -18,7 +18,6 @@ from hybridkin import RigidChain, load_model, robots
 from hybridkin.datasets import load_armlab, load_asl_trunk, load_log
 from hybridkin.ik import trajectories
 from hybridkin.workflow import open_model, read_path
-from paper.mjcf import trunk_mjcf
 
 URDF = b"""<robot name="arm"><link name="base"/><link name="upper"/><link name="hand"/>
 <joint name="turn" type="revolute"><parent link="base"/><child link="upper"/>
@@ -26,11 +25,6 @@ URDF = b"""<robot name="arm"><link name="base"/><link name="upper"/><link name="
 </joint><joint name="bend" type="prismatic"><parent link="upper"/><child link="hand"/>
 <origin xyz="0.2 0 0"/><mimic joint="turn" multiplier="2" offset="0.1"/><limit lower="0" upper="1"/>
 </joint></robot>
-"""
-MJCF = b"""<mujoco><worldbody><body name="upper" pos="0 0 0.1"><joint name="turn" axis="0 0 1"
-range="-1 1" limited="true"/><geom size="0.1"/><body name="hand" pos="0.2 0 0" euler="0 10 0">
-<joint name="slide" type="slide" axis="1 0 0"/><geom type="box" size="0.1 0.1 0.1"/>
-<site name="tip" pos="0 0 0.1"/></body></body></worldbody></mujoco>
 """
 TOML = b"""name = "arm"
 calibrate = ["radii", "base"]
@@ -142,7 +136,6 @@ _TABLE = _log()
 _CSV = _TABLE.to_csv(index=False).encode()
 _POINTS = _TABLE[["t", "x", "y", "z"]].assign(t=0.1 * np.arange(20)).to_csv(index=False).encode()
 _POINTS_3 = _TABLE[["x", "y", "z"]].to_csv(index=False).encode()
-_TRUNK = trunk_mjcf((0.0, -9.81), 1.0, 0.0, (1.0, 1.0, 1.0)).encode()
 
 READERS = {
     "model": Reader(
@@ -180,12 +173,6 @@ READERS = {
         [hostile.damaged, hostile.renumbered, hostile.described],
         lambda path, k: _read_chain(RigidChain.from_urdf(path, "hand")),
         "arm.urdf",
-    ),
-    "mjcf": Reader(
-        [MJCF, MJCF, _TRUNK],
-        [hostile.damaged, hostile.renumbered, hostile.described],
-        lambda path, k: _read_chain(RigidChain.from_mjcf(path, "tip" if k % 2 else "hand")),
-        "arm.xml",
     ),
 }
 
