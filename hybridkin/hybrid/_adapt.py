@@ -16,7 +16,7 @@ from hybridkin._core.arrays import identity
 from hybridkin._core.model import ForwardModel
 from hybridkin._core.rotations import (
     cross_matrix,
-    nearest_rotation,
+    rigid_motion,
     rotation,
     rotation_vector,
 )
@@ -211,16 +211,18 @@ class _Problem:
         """
         x = torch.from_numpy(evaluate(self.fitted, self.q.numpy())[0])
         y = self.y[:, : x.shape[1]].reshape(-1, 3)
-        theta = self.q.new_zeros(6 + len(self.scale))
         measured = ~y.isnan().any(1)
         x = x.reshape(-1, 3)[measured]
         y = y[measured]
-        moments = (y - y.mean(0)).mT @ (x - x.mean(0)) + noise**2 * identity(3, x)
-        R, _ = nearest_rotation(moments)
-        theta[:3] = rotation_vector(R)
-        way = y.mean(0) - self.pivot - R @ (x.mean(0) - self.pivot)
-        theta[3:6] = way / self.reach
-        return theta.numpy()
+        # Points beside both means: they turn about no axis.
+        beside = noise / 2**0.5 * torch.cat([identity(3, x), -identity(3, x)])
+        motion = rigid_motion(
+            torch.cat([x, x.mean(0) + beside]), torch.cat([y, y.mean(0) + beside])
+        )
+        R = motion[:3, :3]
+        way = R @ self.pivot + motion[:3, 3] - self.pivot
+        shift = torch.zeros_like(self.scale)
+        return torch.cat([rotation_vector(R), way / self.reach, shift]).numpy()
 
     def linearised(self, theta: NDArray) -> tuple[NDArray, NDArray]:
         """Return the residual (k, m) at a change, and the derivative (k, m, 6 + n) of the model.
@@ -256,15 +258,14 @@ def _whitened(values: NDArray, groups: NDArray | None) -> NDArray:
     """
     if groups is None:
         return values
-    _, of, counts = np.unique(groups, return_inverse=True, return_counts=True)
-    sums = np.zeros((len(counts), *values.shape[1:]))
-    np.add.at(sums, of, values)
-    shape = (-1,) + (1,) * (values.ndim - 1)
-    means = (sums / counts.reshape(shape))[of]
+    whitened = np.empty_like(values)
     individual = 1.0 - _COMMON
-    return (values - means) / individual**0.5 + means / (
-        (individual + _COMMON * counts) ** 0.5
-    )[of].reshape(shape)
+    for group in np.unique(groups):
+        rows = groups == group
+        mean = values[rows].mean(axis=0)
+        common = mean / (individual + _COMMON * rows.sum()) ** 0.5
+        whitened[rows] = (values[rows] - mean) / individual**0.5 + common
+    return whitened
 
 
 def _likeliest_scales(

@@ -334,11 +334,11 @@ class HybridModule(Hybrid):
 
     def error_part(self, q: Tensor) -> Tensor:
         """Return the sum of corrections and drift, which is added to f(q), (..., m) [m]."""
-        return in_blocks(lambda rows: (self._learned(rows, self._inside(rows)),), q)[0]
+        return in_blocks(self._learned, q)[0]
 
     def error_weight(self, q: Tensor) -> Tensor:
         """Return the error weight t(q), shape (...)."""
-        return in_blocks(lambda rows: (self._trust(rows),), q)[0][..., 0]
+        return in_blocks(self._learned, q)[1][..., 0]
 
     def domain_distance(self, q: Tensor) -> Tensor:
         """Return the largest distance from the training rows of guards and groups, (...)."""
@@ -358,15 +358,22 @@ class HybridModule(Hybrid):
 
     def _forward(self, q: Tensor) -> tuple[Tensor]:
         inside = self._inside(q)
-        learned = self._learned(q, inside)
+        learned, _ = self._learned(q, inside)
         if inside is not None:
             return (inside.x + learned,)
         if self.mechanical is not None:
             return (self.mechanical(q) + learned,)
         return (learned,)
 
-    def _learned(self, q: Tensor, inside: Inside | None) -> Tensor:
-        """Return the sum of corrections and drift at rows q, (N, m); zero (N, 1) without [m]."""
+    def _learned(
+        self, q: Tensor, inside: Inside | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Return the sum of corrections and drift at rows q, (N, m) [m], and t(q), (N, 1).
+
+        The sum is zero (N, 1) without any.
+        """
+        if inside is None:
+            inside = self._inside(q)
         trust = q.new_ones(len(q), 1)
         total = q.new_zeros(len(q), 1)
         for weight, correction in self._parts():
@@ -379,15 +386,7 @@ class HybridModule(Hybrid):
             total = total + weight * value
         if self.drift is not None:
             total = total + trust * self.drift(q)
-        return total
-
-    def _trust(self, q: Tensor) -> Tensor:
-        """Return the error weight t(q) at rows q, shape (N, 1)."""
-        trust = q.new_ones(len(q), 1)
-        for weight, correction in self._parts():
-            if correction.guard is not None:
-                trust = trust - weight * (1.0 - correction.guard(q))
-        return trust
+        return total, trust
 
     def _distance(self, q: Tensor) -> Tensor:
         """Return the largest distance of any guard, and of the groups, at rows q, (N, 1)."""

@@ -36,11 +36,11 @@ def play_of(
         return None, []
     ranges = np.ptp(rows.X, axis=0)
     if isinstance(play, str):
-        operator_found = choose_play(calibrated(spec, rows), rows)
-        if operator_found is None or operator_found.width < 0.95 * ranges.max():
-            return operator_found, []
-        return operator_found, [
-            f"play='auto' found a backlash of {operator_found.width:.3g}, as wide as the range of "
+        chosen = choose_play(calibrated(spec, rows), rows)
+        if chosen is None or chosen.width < 0.95 * ranges.max():
+            return chosen, []
+        return chosen, [
+            f"play='auto' found a backlash of {chosen.width:.3g}, as wide as the range of "
             "`X`: the log gives no upper limit. Record larger motions, or give the width as `play`."
         ]
     operator = PlayOperator(play)
@@ -74,19 +74,24 @@ def choose_play(spec: Spec, rows: Rows) -> PlayOperator | None:
     groups = rows.groups
     motions = np.zeros(len(X)) if groups is None else groups
     strokes = np.subtract(*np.percentile(X, (95, 5), axis=0))
-    least = _LEAST * float(np.median(strokes[strokes > 0.0])) if strokes.any() else 0.0
-    # The error can have several minima over the width, so widths of all sizes are tried.
-    doubled = least * 2.0 ** np.arange(20)
     widest = float(np.ptp(X, axis=0).max())
-    widths = [0.0, *doubled[(doubled > 0.0) & (doubled < widest)].tolist(), widest]
+    widths = [0.0, widest]
+    if strokes.any():
+        # The error can have several minima over the width, so widths of all sizes are tried.
+        least = _LEAST * np.median(strokes[strokes > 0.0])
+        doubled = least * 2.0 ** np.arange(20)
+        widths[1:1] = doubled[doubled < widest].tolist()
     # A motion is one sample, as its rows have similar errors. A single motion is cut into ten.
-    parts = motions if len(np.unique(motions)) > 1 else np.arange(len(X)) * 10 // len(X)
+    parts = motions
+    if len(np.unique(motions)) == 1:
+        parts = np.arange(len(X)) * 10 // len(X)
     counted = (rows.counts > 0) & ~np.isnan(rows.tips).any(axis=1)
     counts = rows.counts[counted]
     motion = parts[counted]
-    names = np.unique(motion)
+    names, of_motion = np.unique(motion, return_inverse=True)
     if len(names) < 2:
         return None
+    totals = np.bincount(of_motion, counts)
 
     def errors_by_motion(width: float) -> NDArray:
         effective = PlayOperator(width).apply_by_group(X, motions)[counted]
@@ -95,8 +100,7 @@ def choose_play(spec: Spec, rows: Rows) -> PlayOperator | None:
         network = ELMRegressorCV(200, weight_scales=(0.4,), **_PLAIN)
         held_out = network.fit(effective, error, counts, motion).left_out_errors_
         distance = np.linalg.norm(held_out.reshape(len(error), -1), axis=1)
-        of_motion = [motion == a for a in names]
-        return np.array([np.average(distance[k], weights=counts[k]) for k in of_motion])
+        return np.bincount(of_motion, counts * distance) / totals
 
     search = search_width(errors_by_motion, np.mean, widths, widest, refine=True)
     return PlayOperator(search.width) if search.kept else None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from math import ceil, floor, inf
+from math import ceil, inf
 from typing import NamedTuple
 
 import numpy as np
@@ -20,16 +20,15 @@ _ROUNDING = 1e-9  # rounding error of shares
 
 
 class Radius(NamedTuple):
-    """Estimated error radius about a predicted tip [m]; infinite if the log supports none."""
+    """Estimated error radius about a predicted tip [m]; infinite outside the domain."""
 
     inside: float  # in the domain of the error model; infinite: too few groups for the coverage
-    outside: float  # infinite: the log has no errors outside the domain
     coverage: float  # share of held-out tips within the radius
     n_rows: int
 
     def at(self, in_domain: NDArray) -> NDArray:
         """Return the radius (N,) of rows that are inside or outside the domain (N,)."""
-        return np.where(in_domain, self.inside, self.outside)
+        return np.where(in_domain, self.inside, inf)
 
     @property
     def least_groups(self) -> int:
@@ -74,15 +73,13 @@ def conformal_radius(
         errors[test] = np.nanmax(distances(x, y[test]), axis=1)
     names, of = np.unique(groups[inside], return_inverse=True)
     radius = _quantile(errors[inside], of, rows.counts[inside], coverage)
-    estimate = Radius(radius, inf, coverage, len(y))
-    n = len(names)
+    estimate = Radius(radius, coverage, len(y))
     if estimate.inside < inf:
         return estimate, None
     return estimate, (
-        f"`coverage` {coverage:g} needs at least {estimate.least_groups} "
-        f"{'rows' if rows.groups is None else 'groups'} inside the domain of the error model when "
-        f"they are held out, got {n}: the radius is infinite. Record more motions, or ask for a "
-        f"`coverage` of at most {floor(1000 * n / (n + 1) + _ROUNDING) / 1000:g}."
+        f"`coverage` {coverage:g} needs at least {estimate.least_groups} groups (rows, if there "
+        "are no groups) inside the domain of the error model when they are held out, got "
+        f"{len(names)}: the radius is infinite. Record more motions, or lower `coverage`."
     )
 
 

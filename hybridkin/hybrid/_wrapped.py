@@ -58,12 +58,34 @@ class Wrapped(PoseModel):
         tip = self.model.tip_model
         return self if tip is self.model else self.around(tip)
 
+    @property
+    def plane(self) -> tuple[Tensor, Tensor] | None:
+        """The plane of the log."""
+        return self.model.plane
+
     def around(self, model: ForwardModel) -> ForwardModel:
         """Return another model, changed like this one."""
         raise NotImplementedError
 
-    def _posed(self) -> PoseModel:
-        return cast(PoseModel, self.model)
+    def forward(self, q: Tensor) -> Tensor:
+        """Return the outputs of the other model for what it gets, shape (..., m) [m]."""
+        return self.model(self._inner(q))
+
+    def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return x (..., m) and dx/dq (..., m, n)."""
+        return self.model.forward_and_jacobian(self._inner(q))
+
+    def pose_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return `pose(q)` and `pose_jacobian(q)` in one pass."""
+        return cast(PoseModel, self.model).pose_and_jacobian(self._inner(q))
+
+    def domain_distance(self, q: Tensor) -> Tensor:
+        """Return the distance from the training rows of what the other model gets, (...)."""
+        return self.model.domain_distance(self._inner(q))
+
+    def _inner(self, q: Tensor) -> Tensor:
+        """Return what the other model gets for q."""
+        return q
 
 
 def _place_within(plan: Plan, stored: Stored, *before: str) -> int:
@@ -110,27 +132,11 @@ class Shifted(Wrapped):
         """Return another model after the same shift."""
         return shifted(model, self.shift)
 
-    def forward(self, q: Tensor) -> Tensor:
-        """Return f(q + shift), shape (..., m) [m]."""
-        return self.model(self._then(q))
-
-    def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        """Return f(q + shift) (..., m) and its derivative (..., m, n)."""
-        return self.model.forward_and_jacobian(self._then(q))
-
-    def pose_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        """Return `pose(q)` and `pose_jacobian(q)` in one pass."""
-        return self._posed().pose_and_jacobian(self._then(q))
-
-    def domain_distance(self, q: Tensor) -> Tensor:
-        """Return the distance of q + shift from the training rows, shape (...)."""
-        return self.model.domain_distance(self._then(q))
-
     def misses(self, x: Tensor, largest: Tensor) -> Tensor:
         """Return by how much targets are out of reach of f, shape (...) [m]."""
         return self.model.misses(x, largest + self.shift.abs())
 
-    def _then(self, q: Tensor) -> Tensor:
+    def _inner(self, q: Tensor) -> Tensor:
         check_vectors(
             q, len(self.shift), "q", f"this robot has {len(self.shift)} actuators"
         )
@@ -163,32 +169,23 @@ class Moved(Wrapped):
         super().__init__(model)
         self.register_buffer("motion", motion)
 
-    @property
-    def plane(self) -> tuple[Tensor, Tensor] | None:
-        """The plane of the log."""
-        return self.model.plane
-
     def around(self, model: ForwardModel) -> ForwardModel:
         """Return another model after the same motion."""
         return moved(model, self.motion)
 
     def forward(self, q: Tensor) -> Tensor:
         """Return T f(q), shape (..., m) [m]."""
-        return moved_points(self.model(q), self.motion)
+        return moved_points(super().forward(q), self.motion)
 
     def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return T f(q) (..., m) and its derivative (..., m, n)."""
-        x, J = self.model.forward_and_jacobian(q)
+        x, J = super().forward_and_jacobian(q)
         return moved_points(x, self.motion), _turned(J.mT, self.motion).mT
 
     def pose_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return `pose(q)` and `pose_jacobian(q)` in one pass."""
-        T, J = self._posed().pose_and_jacobian(q)
+        T, J = super().pose_and_jacobian(q)
         return self.motion.to(T) @ T, _turned(J.mT, self.motion).mT
-
-    def domain_distance(self, q: Tensor) -> Tensor:
-        """Return the distance of q from the training rows, shape (...)."""
-        return self.model.domain_distance(q)
 
     def misses(self, x: Tensor, largest: Tensor) -> Tensor:
         """Return by how much targets before T are out of reach of f, shape (...) [m]."""

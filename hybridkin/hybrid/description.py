@@ -145,16 +145,13 @@ def hybrid_of(stored: Stored, training: object) -> HybridForwardModel:
             stored.array("play_width", () if single_width else (n,))
         )
     if "radius" in stored.arrays:
-        inside, outside, coverage, n_rows = stored.array(
-            "radius", (4,), finite=False
-        ).tolist()
-        if not (
-            inside >= 0.0 and outside == inf and 0.0 < coverage < 1.0 and n_rows < inf
-        ):
+        radius = stored.array("radius", (3,), finite=False).tolist()
+        inside, coverage, n_rows = radius
+        if not (inside >= 0.0 and 0.0 < coverage < 1.0 and n_rows < inf):
             raise ValueError(
                 "`radius` must hold a radius, a coverage and a number of rows"
             )
-        model.radius_ = Radius(inside, inf, coverage, int(n_rows))
+        model.radius_ = Radius(inside, coverage, int(n_rows))
     model._fitted_rows = stored.array("fitted_rows", "N")
     results = training.get("cv_results") if isinstance(training, dict) else None
     if results:

@@ -151,8 +151,8 @@ class HybridForwardModel(HybridPredictor):
     play_ : PlayOperator or None
         The backlash; None if there is none, or if "auto" found no significant gain.
     radius_ : Radius or None
-        With `coverage`: the radius ``inside`` the domain [m], infinite with too few groups, and
-        ``outside`` it, always infinite. `adapt` and `partial_fit` do not change it.
+        With `coverage`: the radius ``inside`` the domain [m], infinite with too few groups.
+        `adapt` and `partial_fit` do not change it.
     training_range_ : TrainingRange
         ``low`` and ``high`` (n,), the least and the largest q of the fit [unit of q]; with `play`
         of the motion of the actuators. `adapt` moves it with the actuator zeros.

@@ -128,14 +128,6 @@ def test_fewer_rows_are_the_first_of_more():
     assert_allclose(larger, error[:7])
 
 
-def test_chosen_rows_leave_less_error_than_random_ones():
-    q = lengths(300)
-    _, error = choose_rows(trunk(), q, 40)
-    random = [choose_rows(trunk(), q[k : k + 1], 1, measured=q[k : k + 39], target=q)[1][0]
-              for k in (0, 100, 200)]  # fmt: skip
-    assert error[-1] < 0.8 * min(random)
-
-
 def test_rows_for_a_path_leave_less_error_there():
     q = lengths(200)
     path = np.linspace(q[0], q[1], 20)

@@ -187,17 +187,6 @@ def test_motions_of_single_actuators_do_not_vouch_for_what_lies_between(guard):
     assert_array_equal(alone.error_weight(new), with_groups.error_weight(new))
 
 
-def test_later_measurements_keep_the_tested_distance():
-    q, x, groups = corner_log()
-    model = HybridForwardModel(ConstantCurvatureChain([0.05]), LinearRegression())
-    model.fit(q, x, groups=groups)
-    new = 0.16 + 0.1 * np.random.default_rng(1).random((500, 3))
-    inside = model.in_domain(new)
-    model.partial_fit(q[:20], x[:20] + 0.01)
-    assert 0 < inside.sum() < 500
-    assert_array_equal(model.in_domain(new), inside)
-
-
 def test_no_guard_or_nothing_learned_has_no_domain():
     q, x, groups = corner_log()
     for given in ({"guard": None}, {"error_model": "drop"}):
@@ -205,13 +194,3 @@ def test_no_guard_or_nothing_learned_has_no_domain():
         module = model.fit(q, x, groups=groups).module_
         assert module.tested is None
         assert module.in_domain(torch.from_numpy(10.0 * q)).all()
-
-
-def test_poses_keep_to_the_tested_distance():
-    q, x, groups = corner_log()
-    model = HybridForwardModel(ConstantCurvatureChain([0.05]), output="pose")
-    model.fit(q, np.hstack([x, 0.1 * q]), groups=groups)
-    new = 0.16 + 0.1 * np.random.default_rng(1).random((500, 3))
-    share = model.in_domain(new).mean()
-    model.module_.learned.tested = None
-    assert 0.0 < share < 0.7 * model.in_domain(new).mean()

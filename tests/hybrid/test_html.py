@@ -50,7 +50,8 @@ def test_calibration_error_model_error_and_range():
     model = HybridForwardModel(CHAIN, "linear", coupling="serial", calibrate=["radii"])
     html = shown(model.fit(q, x, groups=np.arange(60) // 6))
     found, rmse = model.calibration_, 1e3 * model.error_model_.rmse / 3**0.5
-    assert f"<td>radii; root mean square error {1e3 * found.rmse:.3g} mm, held-out groups" in html
+    assert "calibrated</th><td>radii</td>" in html
+    assert f"rmse={found.rmse:.3e} m" in html
     assert "<td>&quot;linear&quot;, serial</td>" in html
     assert f"held-out error</th><td>standard deviation of a coordinate {rmse:.3g} mm<" in html
     assert "guard by leverage), as far as held-out groups tested it" in html

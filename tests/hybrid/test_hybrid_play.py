@@ -9,7 +9,6 @@ from hybridkin import (
     HybridForwardModel,
     InverseKinematics,
     PlayOperator,
-    datasets,
     fit_play,
     robots,
 )
@@ -50,17 +49,6 @@ def rms(model, q, x, groups):
     return np.sqrt(np.mean(np.sum((model.predict(q, groups=groups) - x) ** 2, axis=1)))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("mechanical", [CHAIN, None])
-def test_the_width_is_found_and_used(log, mechanical):
-    train, test = split(log)
-    model = HybridForwardModel(mechanical, play="auto", random_state=0)
-    model.fit(*train[:2], groups=train[2])
-    assert abs(model.play_.width - WIDTH) < (0.05 if mechanical else 0.5) * WIDTH
-    without = HybridForwardModel(mechanical, random_state=0).fit(*train[:2], groups=train[2])
-    assert rms(model, *test) < (0.1 if mechanical else 0.6) * rms(without, *test)
-
-
 def test_the_width_is_found_where_a_marker_is_missing(log):
     q, _, groups = log
     chain = CHAIN.with_markers([(1, 1.0), (2, 1.0)])
@@ -89,14 +77,6 @@ def test_a_given_play_is_that_of_the_operator(log):
     assert_array_equal(model.in_domain(q, groups=groups), still.in_domain(y))
     one = model.predict(q[groups == 9])  # without groups: one motion
     assert_array_equal(one, still.predict(y[groups == 9]))
-
-
-@pytest.mark.slow
-def test_no_play_is_found_where_there_is_none(log):
-    q, _, groups = log
-    x = tips(q) + 2e-4 * np.random.default_rng(1).standard_normal((len(q), 3))
-    model = HybridForwardModel(CHAIN, "linear", play="auto").fit(q, x, groups=groups)
-    assert model.play_ is None
 
 
 def log_with(share, motions=8, rows=20):
@@ -166,35 +146,6 @@ def test_measurements_go_on_where_the_last_ones_ended(log):
     for row, tip in zip(q[:40], payload[:40], strict=True):
         models[1].partial_fit(row[None], tip[None])
     assert_allclose(models[0].predict(q[:40]), models[1].predict(q[:40]), atol=1e-12)
-
-
-@pytest.mark.slow
-def test_with_a_radius(log):
-    train, test = split(log)
-    model = HybridForwardModel(CHAIN, "quadratic", play="auto", coverage=0.85)
-    model.fit(*train[:2], groups=train[2])
-    q, x, groups = test
-    predicted, radius = model.predict(q, return_radius=True, groups=groups)
-    within = np.linalg.norm(predicted - x, axis=1) <= radius
-    assert 0.75 < within.mean() <= 1.0
-    assert rms(model, *test) < 1.5e-3
-
-
-@pytest.mark.slow
-def test_a_recording_with_friction():
-    try:
-        data = datasets.load_asl_trunk()
-    except FileNotFoundError as missing:
-        pytest.skip(str(missing))
-    late = np.isin(data.groups, np.unique(data.groups)[::4])
-    errors = []
-    for play in (None, "auto"):
-        model = HybridForwardModel(None, play=play, random_state=0)
-        model.fit(data.q[~late], data.x[~late], groups=data.groups[~late])
-        predicted = model.predict(data.q[late], groups=data.groups[late])
-        errors.append(np.linalg.norm(predicted - data.x[late], axis=1).mean())
-    assert model.play_.width > 0.0
-    assert errors[1] < 0.95 * errors[0]
 
 
 def test_clear_errors(log):

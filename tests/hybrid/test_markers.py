@@ -233,14 +233,6 @@ def test_adapt_to_rows_that_miss_markers(groups):
 
 
 @pytest.mark.slow
-def test_auto_takes_few_rows_of_several_markers():
-    q, x = log(2)
-    with pytest.warns(UserWarning, match="too few to rely on"):
-        model = HybridForwardModel(CHAIN, "auto", calibrate=(), random_state=0).fit(q, x)
-    assert np.isfinite(model.predict(q)).all()
-
-
-@pytest.mark.slow
 def test_auto_blends_models_of_several_markers():
     chain = ConstantCurvatureChain([0.1]).with_markers([(0, 0.5), (0, 1.0)])
     rng = np.random.default_rng(0)

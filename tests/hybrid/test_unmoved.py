@@ -7,7 +7,6 @@ import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
 from sklearn.base import clone
-from sklearn.ensemble import RandomForestRegressor
 from sklearn.linear_model import LinearRegression
 from torch.testing import assert_close
 
@@ -120,23 +119,6 @@ def test_one_domain_in_torch_compiled_and_in_files(kind, groups, tmp_path):
             assert_allclose(found, distance, rtol=1e-8, atol=1e-12)
             assert_array_equal(twin.predict(new), x)
             assert_array_equal(twin.in_domain(new), model.in_domain(new))
-
-
-@pytest.mark.parametrize("kind", ["posture", "line", "rest"])
-def test_rows_in_single_precision_move_the_same_directions(kind):
-    q = log(kind).astype(np.float32)
-    model = fitted(q, "quadratic")
-    assert model.in_domain(q).all()
-    assert not model.in_domain(q + (0.3 * across(q)[0]).astype(np.float32)).any()
-
-
-def test_trees_are_constant_where_no_row_moves():
-    q = log("line")
-    model = fitted(q, RandomForestRegressor(5, random_state=0), guard=None)
-    off = q + 0.5 * across(q)[0]
-    # The same up to rounding of q, which may fall on a threshold of a tree.
-    same = np.linalg.norm(model.predict_error(off) - model.predict_error(q), axis=1) < 1e-9
-    assert same.mean() > 0.9
 
 
 def test_the_warning_names_what_does_not_move():
