@@ -13,7 +13,7 @@ from hybridkin.ik._gram import apply_columns, apply_rows, solve_rows
 
 
 class BoxProblem(NamedTuple):
-    """Minimise |dq - z|^2 + |J dq - v|^2 / lambda^2 over lower <= dq <= upper, for every row.
+    """Eq. (19): minimise |dq - z|^2 + |J dq - v|^2 / lambda^2 with lower <= dq <= upper, by rows.
 
     Attributes
     ----------
@@ -78,42 +78,49 @@ def box_limited_step(
     if mu is None:
         mu = torch.zeros_like(problem.v)
     best = mu.clone()
-    live = problem
+    live = problem  # the rows that are not solved yet
     rows = torch.arange(len(mu), device=mu.device)
-    noise = 4.0 * torch.finfo(mu.dtype).eps
     settled = torch.zeros(len(mu), dtype=torch.bool, device=mu.device)
+    noise = 4.0 * torch.finfo(mu.dtype).eps
     for _ in range(IK_NEWTON):
+        # The residual F(mu) of eq. (20), and the size of what is summed up in it.
         y, dq = live.at(mu)
         pull = damping_sq[:, None] * mu
         residual = apply_rows(live.J, dq) + pull - live.v
-        scale = apply_rows(live.J.abs(), dq.abs()) + pull.abs() + live.v.abs()
+        size = apply_rows(live.J.abs(), dq.abs()) + pull.abs() + live.v.abs()
         best[rows] = mu
-        going = ~settled & (residual.abs() > noise * scale).any(-1)
+        # Go on with the rows that are not solved up to rounding.
+        going = ~settled & (residual.abs() > noise * size).any(-1)
         if not going.all():
-            keep = going.nonzero()[:, 0]
-            live = live.take(keep)
-            rows, mu, damping_sq, y, residual = (
-                a[keep] for a in (rows, mu, damping_sq, y, residual)
-            )
+            left = going.nonzero()[:, 0]
+            live = live.take(left)
+            rows = rows[left]
+            mu = mu[left]
+            damping_sq = damping_sq[left]
+            y = y[left]
+            residual = residual[left]
         if rows.numel() == 0:
             break
         # Newton's step of F on the linear piece of y: actuators at a limit stay there.
-        J, _, _, lower, upper = live
+        lower = live.lower
+        upper = live.upper
         free = (y > lower) & (y < upper)
-        newton = -solve_rows(J * free[:, None], residual, damping_sq)
-        slope = apply_columns(J, newton)
-        full = y + slope
+        newton = -solve_rows(live.J * free[:, None], residual, damping_sq)
+        slope = apply_columns(live.J, newton)
         # A full step that stays on its linear piece has solved the problem.
-        same = ((full > lower) == (y > lower)) & ((full < upper) == (y < upper))
+        end = y + slope
+        same = ((end > lower) == (y > lower)) & ((end < upper) == (y < upper))
         settled = (same | (lower == upper)).all(-1)
-        start = (newton * residual).sum(-1)
+        # Else the step ends where the objective is least along it: there its derivative,
+        # F(mu + t newton) . newton, is zero.
+        at_start = (newton * residual).sum(-1)
         curvature = damping_sq * newton.square().sum(-1)
-        end = start + curvature + (slope * _moved(y, full, lower, upper)).sum(-1)
-        length = torch.ones_like(end)
-        far = ((end > 0.0) & ~settled).nonzero()[:, 0]
-        if far.numel() > 0:
-            parts = (y, slope, start, curvature, lower, upper)
-            length[far] = _exact_line_search(*(a[far] for a in parts))
+        moved = (slope * _moved(y, end, lower, upper)).sum(-1)
+        too_far = ((at_start + curvature + moved > 0.0) & ~settled).nonzero()[:, 0]
+        length = torch.ones_like(damping_sq)
+        if too_far.numel() > 0:
+            line = (y, slope, at_start, curvature, lower, upper)
+            length[too_far] = _exact_line_search(*(a[too_far] for a in line))
         mu = mu + length[:, None] * newton
     best[rows] = mu
     return problem.at(best)[1], best
@@ -139,21 +146,23 @@ def strict_box_step(problem: BoxProblem, damping_sq: Tensor) -> Tensor:
     Tensor of shape (N, n)
         Steps within the box.
     """
-    J, v, z, *_ = problem
+    J = problem.J
     size_sq = torch.linalg.matrix_norm(J @ J.mT)  # about sigma_max^2
     # If J is zero the floor only has to be positive.
     relative = max(1e-6, math.sqrt(torch.finfo(J.dtype).eps))
-    floor = torch.where(size_sq > 0.0, relative * size_sq, torch.ones_like(size_sq))
-    centre = torch.zeros_like(v)
-    rows = ((damping_sq > 0.0) & (z != 0.0).any(-1)).nonzero()[:, 0]
+    floor = torch.where(size_sq > 0.0, relative * size_sq, 1.0)
+    centre = torch.zeros_like(problem.v)
+    rows = ((damping_sq > 0.0) & (problem.z != 0.0).any(-1)).nonzero()[:, 0]
     if rows.numel() > 0:
-        damped = problem._replace(z=torch.zeros_like(z)).take(rows)
+        # The damped task without posture; its tip motion replaces v.
+        damped = problem._replace(z=torch.zeros_like(problem.z)).take(rows)
         dq, mu = _proximal_box_step(damped, damping_sq[rows], floor[rows], centre[rows])
-        v = v.index_put((rows,), apply_rows(damped.J, dq))
+        v = problem.v.index_put((rows,), apply_rows(damped.J, dq))
+        problem = problem._replace(v=v)
         # Start from these multipliers: they keep the active limits, also if v is out of reach.
         centre[rows] = mu
         damping_sq = damping_sq.index_fill(0, rows, 0.0)
-    return _proximal_box_step(problem._replace(v=v), damping_sq, floor, centre)[0]
+    return _proximal_box_step(problem, damping_sq, floor, centre)[0]
 
 
 def _proximal_box_step(
@@ -173,35 +182,40 @@ def _proximal_box_step(
     return dq, mu
 
 
-def _moved(y: Tensor, to: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
-    return torch.clamp(to, lower, upper) - torch.clamp(y, lower, upper)
+def _moved(y: Tensor, end: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
+    """Return the motion from y to its end, both clipped to the box."""
+    return torch.clamp(end, lower, upper) - torch.clamp(y, lower, upper)
 
 
 def _exact_line_search(
     y: Tensor,
     slope: Tensor,
-    start: Tensor,
+    at_start: Tensor,
     curvature: Tensor,
     lower: Tensor,
     upper: Tensor,
 ) -> Tensor:
-    """Return t in (0, 1) where start + t curvature + slope . (clip(y + t slope) - clip(y)) = 0.
+    """Return t in (0, 1) where at_start + t curvature + slope . (clip(y + t slope) - clip(y)) = 0.
 
     The left side increases with t, is linear between the points where a coordinate reaches a bound,
     negative at 0 and positive at 1.
     """
-    t = torch.cat([(lower - y) / slope, (upper - y) / slope], dim=-1)
-    t = torch.nan_to_num(t, nan=1.0).clamp(0.0, 1.0)
-    ends = torch.stack([torch.zeros_like(start), torch.ones_like(start)], dim=-1)
-    t = torch.cat([t, ends], dim=-1).sort(-1).values
-    y, slope, lower, upper = (a[:, None] for a in (y, slope, lower, upper))
-    moved = _moved(y, y + t[..., None] * slope, lower, upper)
-    value = start[:, None] + t * curvature[:, None] + (slope * moved).sum(-1)
+    # These points, and both ends, in order.
+    at_bounds = torch.cat([(lower - y) / slope, (upper - y) / slope], dim=-1)
+    at_bounds = torch.nan_to_num(at_bounds, nan=1.0).clamp(0.0, 1.0)
+    first = torch.zeros_like(at_start[:, None])
+    t = torch.cat([first, at_bounds, first + 1.0], dim=-1).sort(-1).values
+    # The left side there.
+    y = y[:, None]
+    slope = slope[:, None]
+    end = y + t[..., None] * slope
+    moved = _moved(y, end, lower[:, None], upper[:, None])
+    value = at_start[:, None] + t * curvature[:, None] + (slope * moved).sum(-1)
     # The root lies on the linear part before the first positive value.
     right = (value > 0.0).to(torch.uint8).argmax(-1, keepdim=True).clamp_min(1)
-    t0 = t.gather(-1, right - 1)[:, 0]
-    t1 = t.gather(-1, right)[:, 0]
-    f0 = value.gather(-1, right - 1)[:, 0]
-    f1 = value.gather(-1, right)[:, 0]
-    part = f0 / (f0 - f1)
-    return t0 + (t1 - t0) * torch.nan_to_num(part, nan=1.0).clamp(0.0, 1.0)
+    left = right - 1
+    t_left = t.gather(-1, left)
+    value_left = value.gather(-1, left)
+    fall = value_left - value.gather(-1, right)
+    fraction = torch.nan_to_num(value_left / fall, nan=1.0).clamp(0.0, 1.0)
+    return (t_left + (t.gather(-1, right) - t_left) * fraction)[:, 0]

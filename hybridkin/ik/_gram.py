@@ -17,7 +17,7 @@ class RowGram(NamedTuple):
 
     With three rows the parts are the six entries of G, so that a batch needs a few elementwise
     operations instead of a LAPACK call per matrix. Otherwise they are its eigenvalues and
-    eigenvectors, or G itself if that is sufficient.
+    eigenvectors.
     """
 
     parts: tuple[Tensor, ...]
@@ -49,6 +49,8 @@ def row_gram(J: Tensor) -> RowGram:
         squares, vectors = torch.linalg.eigh(torch.nan_to_num(J @ J.mT))
         roots = squares.clamp_min(0.0).sqrt()
         return RowGram((squares, vectors), roots[..., 0], roots[..., -1])
+    # Eigenvalues of a symmetric 3 x 3 matrix by the trigonometric solution of the cubic equation:
+    # G = mean + radius B, and the angle belongs to the determinant of B.
     entries = g11, g21, g31, g22, g32, g33 = _entries_3x3(J)
     mean = (g11 + g22 + g33) / 3.0
     a = g11 - mean
@@ -68,23 +70,29 @@ def row_gram(J: Tensor) -> RowGram:
     return RowGram(entries, low.clamp_min(0.0).sqrt(), high.clamp_min(0.0).sqrt())
 
 
-def quick_gram(J: Tensor, sigma_max_only: bool = False) -> RowGram:
-    """Return `row_gram`; unless there are three rows, estimate it by a Cholesky factorisation.
+def adaptive_damping(gram: RowGram) -> Tensor:
+    """Return lambda^2, eq. (18): zero for a regular J, growing smoothly as J becomes singular.
 
-    The estimate of sigma_max can be too large, that of sigma_min too small, by up to the fourth
-    root of m. Unsolvable parts of a singular G are damped by rounding, not dropped. With
-    `sigma_max_only`, sigma_min is NaN.
+    With s = 0.02 sigma_max, lambda = s (1 - (sigma_min / s)^2) if sigma_min < s. This does not
+    depend on units, and lambda^2 is once differentiable.
+
+    Parameters
+    ----------
+    gram : RowGram
+        From `row_gram`.
+
+    Returns
+    -------
+    Tensor of shape (...,)
+        lambda^2, in the unit of J J^T.
+
+    References
+    ----------
+    Nakamura & Hanafusa, J. Dyn. Syst. Meas. Control 108 (1986).
     """
-    if sigma_max_only:
-        size = torch.linalg.vector_norm(J, dim=(-2, -1))
-        parts = _entries_3x3(J) if J.shape[-2] == 3 else (torch.nan_to_num(J @ J.mT),)
-        return RowGram(parts, torch.full_like(size, math.nan), size)
-    if J.shape[-2] == 3:
-        return row_gram(J)
-    G = torch.nan_to_num(J @ J.mT)
-    inverse = torch.cholesky_inverse(_factor(G, torch.zeros_like(G[..., 0, 0])))
-    size, low = (torch.linalg.matrix_norm(a).sqrt() for a in (G, inverse))
-    return RowGram((G,), torch.where(size > 0.0, 1.0 / low, 0.0), size)
+    threshold = IK_HEALTHY * gram.sigma_max
+    ratio = gram.sigma_min / torch.where(threshold > 0.0, threshold, 1.0)
+    return (threshold * (1.0 - ratio.square()).clamp_min(0.0)).square()
 
 
 def damped_solve(gram: RowGram, v: Tensor, damping_sq: Tensor | float = 0.0) -> Tensor:
@@ -109,22 +117,29 @@ def damped_solve(gram: RowGram, v: Tensor, damping_sq: Tensor | float = 0.0) -> 
     """
     if len(gram.parts) == 6:
         return _solve_3x3(gram.parts, v, damping_sq)
-    if len(gram.parts) == 1:
-        damping_sq = (
-            torch.as_tensor(damping_sq, device=v.device).to(v).expand_as(v[..., 0])
-        )
-        factor = _factor(gram.parts[0], damping_sq)
-        return torch.cholesky_solve(v[..., None], factor)[..., 0]
     squares, vectors = gram.parts
-    floor = (
-        8.0 * torch.finfo(v.dtype).eps * squares.clamp_min(0.0).sum(-1, keepdim=True)
-    )
-    if isinstance(damping_sq, Tensor):
-        damping_sq = damping_sq[..., None]
-    along = (v[..., None, :] @ vectors)[..., 0, :] * _reciprocal(
-        squares + damping_sq, floor
-    )
-    return (vectors @ along[..., None])[..., 0]
+    trace = squares.clamp_min(0.0).sum(-1, keepdim=True)
+    floor = 8.0 * torch.finfo(v.dtype).eps * trace
+    damping_sq = torch.as_tensor(damping_sq, dtype=v.dtype, device=v.device)[..., None]
+    along = apply_columns(vectors, v)
+    return apply_rows(vectors, along * _reciprocal(squares + damping_sq, floor))
+
+
+def solve_rows(J: Tensor, v: Tensor, damping_sq: Tensor) -> Tensor:
+    """Return mu with (J J^T + lambda^2 1) mu = v, quickly, without singular values.
+
+    Unless there are three rows, lambda^2 is at least what rounding requires, so that lost
+    directions of v are damped instead of dropped.
+    """
+    if J.shape[-2] == 3:
+        return _solve_3x3(_entries_3x3(J), v, damping_sq)
+    G = torch.nan_to_num(J @ J.mT)
+    rounding = torch.finfo(G.dtype)
+    trace = torch.diagonal(G, dim1=-2, dim2=-1).sum(-1)
+    used = torch.maximum(damping_sq, 16.0 * rounding.eps * trace + rounding.tiny)
+    damped = G + used[..., None, None] * identity(G.shape[-1], G)
+    factor = torch.linalg.cholesky_ex(damped)[0]
+    return torch.cholesky_solve(v[..., None], factor)[..., 0]
 
 
 def null_projection(J: Tensor, gram: RowGram, step: Tensor) -> Tensor:
@@ -162,51 +177,8 @@ def apply_columns(J: Tensor, mu: Tensor) -> Tensor:
     return (mu[..., None, :] @ J)[..., 0, :]
 
 
-def adaptive_damping(gram: RowGram) -> Tensor:
-    """Return lambda^2: zero for a regular J, growing smoothly as J becomes singular.
-
-    With s = 0.02 sigma_max, lambda = s (1 - (sigma_min / s)^2) if sigma_min < s. This does not
-    depend on units, and lambda^2 is once differentiable.
-
-    Parameters
-    ----------
-    gram : RowGram
-        From `row_gram`.
-
-    Returns
-    -------
-    Tensor of shape (...,)
-        lambda^2, in the unit of J J^T.
-
-    References
-    ----------
-    Nakamura & Hanafusa, J. Dyn. Syst. Meas. Control 108 (1986).
-    """
-    threshold = IK_HEALTHY * gram.sigma_max
-    ratio = gram.sigma_min / torch.where(
-        threshold > 0.0, threshold, torch.ones_like(threshold)
-    )
-    return (threshold * (1.0 - ratio.square()).clamp_min(0.0)).square()
-
-
-def solve_rows(J: Tensor, v: Tensor, damping_sq: Tensor) -> Tensor:
-    """Return mu with (J J^T + lambda^2 1) mu = v, for lambda^2 > 0 and without any floor."""
-    if J.shape[-2] == 3:
-        return _solve_3x3(_entries_3x3(J), v, damping_sq)
-    damping = damping_sq[..., None, None] * identity(J.shape[-2], J)
-    factor = torch.linalg.cholesky_ex(J @ J.mT + damping)[0]
-    return torch.cholesky_solve(v[..., None], factor)[..., 0]
-
-
-def _factor(G: Tensor, damping_sq: Tensor) -> Tensor:
-    """Return the Cholesky factor of G + lambda^2, kept positive definite against rounding."""
-    trace = torch.diagonal(G, dim1=-2, dim2=-1).sum(-1)
-    tiny = 16.0 * torch.finfo(G.dtype).eps * trace + torch.finfo(G.dtype).tiny
-    damped = G + (damping_sq + tiny)[..., None, None] * identity(G.shape[-1], G)
-    return torch.linalg.cholesky_ex(damped)[0]
-
-
 def _entries_3x3(J: Tensor) -> tuple[Tensor, ...]:
+    """Return the lower half of J J^T, column by column."""
     G = J @ J.mT
     pairs = ((0, 0), (1, 0), (2, 0), (1, 1), (2, 1), (2, 2))
     return tuple(G[..., i, j] for i, j in pairs)
@@ -221,6 +193,7 @@ def _solve_3x3(
     g11 = g11 + damping_sq
     g22 = g22 + damping_sq
     g33 = g33 + damping_sq
+    # The factors: L has the entries l21, l31, l32, and D the inverses i1, i2, i3.
     floor = 8.0 * torch.finfo(v.dtype).eps * (g11 + g22 + g33)
     i1 = _reciprocal(g11, floor)
     l21 = g21 * i1
@@ -229,6 +202,7 @@ def _solve_3x3(
     t = g32 - l31 * g21
     l32 = t * i2
     i3 = _reciprocal(g33 - l31 * g31 - l32 * t, floor)
+    # Forwards through L, then backwards through D and L^T.
     v2 = v2 - l21 * v1
     v3 = v3 - l31 * v1 - l32 * v2
     x3 = v3 * i3
@@ -239,7 +213,4 @@ def _solve_3x3(
 
 def _reciprocal(pivot: Tensor, floor: Tensor) -> Tensor:
     """Return 1 / pivot, or 0 if the pivot is only rounding error."""
-    keep = pivot > floor
-    return torch.where(
-        keep, 1.0 / torch.where(keep, pivot, torch.ones_like(pivot)), 0.0
-    )
+    return torch.where(pivot > floor, 1.0 / torch.where(pivot > floor, pivot, 1.0), 0.0)

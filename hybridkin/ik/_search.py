@@ -22,20 +22,16 @@ from hybridkin._core.kernel_numbers import (
 from hybridkin.ik._gram import apply_columns, apply_rows, row_gram
 from hybridkin.ik._settings import StepSettings
 from hybridkin.ik._starts import even_starts, nearest_starts
-from hybridkin.ik._step import StepRows, limited_step, null_step
+from hybridkin.ik._step import limited_step, null_step
 from hybridkin.ik.tasks import Tolerance
 
 _FIRST_DAMPING = 1.0  # lambda^2 / sigma_max^2 of the first iteration
-# in place of the error: reached outside the domain, and inside
+# In place of the error: reached outside the domain, and inside.
 _OUTSIDE = -1.0
 _DONE = -2.0
 _RETURNS = 30  # attempts to return rows that ended outside the tip limits
 # Where further starts are split; only rows still open use the next part.
-_PARTS = [
-    4,
-    8,
-    16,
-]
+_PARTS = [4, 8, 16]
 _ROWS = 256  # rows searched again at once
 _FINE = 0.01  # factor on tol when configurations are compared
 _SAME = 0.01  # of the ranges: closer configurations count as the same
@@ -95,7 +91,7 @@ class _Slide(Point):
 
     wish: Tensor  # desired step
     free: Tensor  # its part in the null space
-    share: Tensor  # fraction of it to take
+    fraction: Tensor  # of it, to take
 
 
 @dataclass(frozen=True)
@@ -111,100 +107,111 @@ class Search:
         settings = self.settings
         q = settings.start_at(q)
         target = settings.allowed(target)
-        if (
-            cold
-            and len(q) > 0
-            and row_gram(settings.evaluate(q[:1])[1]).is_singular.all()
-        ):
-            # At a straight backbone, motions that cancel to first order would be missed.
-            at_start = self._start(q, target)
-            nudged = settings.start_at(self._nudged(at_start))
-            stay = at_start.reached | ~torch.isfinite(at_start.error)
-            q = torch.where(stay[:, None], q, nudged)
+        if cold and len(q) > 0:
+            q = self._beside_singular_start(q, target)
         best = self._attempt(q, target)
         rows = (~best.reached & row_gram(best.J).is_singular).nonzero()[:, 0]
         self._try_again(best, rows, self._nudged(best)[rows, None])
-        rows = ((self._cost(best) > _DONE) & torch.isfinite(best.error)).nonzero()[:, 0]
-        for some in rows.split(_ROWS) if restarts * len(rows) > 0 else ():
-            size = _per_tip(best.J, best.error)[some]
-            starts = nearest_starts(
-                settings, q[some], size, best.target[some], restarts
-            )
-            for part in starts.tensor_split(_PARTS, dim=1):
-                open_rows = self._cost(best)[some] > _DONE
-                self._try_again(best, some[open_rows], part[open_rows])
-        for _ in range(_RETURNS if settings.tip_limits is not None else 0):
-            way = settings.allowed(best.x) - best.x
-            rows = (~best.reached & ~self._within(way)).nonzero()[:, 0]
-            if rows.numel() == 0:
-                break
-            best.put(rows, self._attempt(best.q[rows], (best.x + 1.5 * way)[rows]))
+        if restarts > 0:
+            self._restart(best, q, restarts)
+        if settings.tip_limits is not None:
+            self._return_inside(best)
         if settings.has_posture:
             self._to_posture(best)
         return best
+
+    def _beside_singular_start(self, q: Tensor, target: Tensor) -> Tensor:
+        """Return the common start q (N, n), moved aside if it is singular.
+
+        At a straight backbone, motions that cancel to first order would be missed.
+        """
+        if not row_gram(self.settings.evaluate(q[:1])[1]).is_singular.all():
+            return q
+        at_start = self._start(q, target)
+        stay = at_start.reached | ~torch.isfinite(at_start.error)
+        nudged = self.settings.start_at(self._nudged(at_start))
+        return torch.where(stay[:, None], q, nudged)
+
+    def _restart(self, best: Found, q: Tensor, restarts: int) -> None:
+        """Search open rows from further starts, a few of them at a time."""
+        is_open = (self._cost(best) > _DONE) & torch.isfinite(best.error)
+        for rows in is_open.nonzero()[:, 0].split(_ROWS):
+            if rows.numel() == 0:
+                break
+            size = _per_tip(best.J, best.error)[rows]
+            target = best.target[rows]
+            starts = nearest_starts(self.settings, q[rows], size, target, restarts)
+            for part in starts.tensor_split(_PARTS, dim=1):
+                still_open = self._cost(best)[rows] > _DONE
+                self._try_again(best, rows[still_open], part[still_open])
+
+    def _return_inside(self, best: Found) -> None:
+        """Return rows that ended outside the tip limits, by targets beyond these limits."""
+        for _ in range(_RETURNS):
+            way = self.settings.allowed(best.x) - best.x
+            rows = (~best.reached & ~self._within(way)).nonzero()[:, 0]
+            if rows.numel() == 0:
+                break
+            target = (best.x + 1.5 * way)[rows]
+            best.put(rows, self._attempt(best.q[rows], target))
 
     def several(self, best: Found, start: Tensor, restarts: int, count: int) -> Found:
         """Return `count` different points for each row of `best`, the nearest to `start` first.
 
         Rows without a further point have NaN as q.
         """
-        settings = self.settings
-        n_starts = restarts + 1
-        spans = settings.spans.to(start)
         if isinstance(self.tol, tuple):
             tol = tuple(_FINE * t for t in self.tol)
         else:
             tol = _FINE * self.tol
         fine = replace(self, tol=tol)
-        rows = torch.arange(len(start), device=start.device)
-        solutions = best.take(rows.repeat_interleave(count))
-        further = torch.arange(len(solutions.q), device=start.device) % count > 0
-        solutions.q[further] = torch.nan
-        for some in (self._cost(best) == _DONE).nonzero()[:, 0].split(_ROWS):
-            near = start[some].repeat_interleave(n_starts, 0)
-            further_solutions = fine._from_even_starts(
-                best.take(some), start[some], restarts
-            )
-            turned = further_solutions.q + settings.whole_turns(
-                near - further_solutions.q
-            )
-            further_solutions.q = torch.where(
-                settings.inside(turned) == turned, turned, further_solutions.q
-            )
-            distance = ((further_solutions.q - near) / spans).norm(dim=-1)
-            distance = torch.where(
-                fine._cost(further_solutions) == _DONE, distance, torch.inf
-            )
-            distance = distance.view(-1, n_starts)
-            first = n_starts * torch.arange(len(some), device=some.device)
-            q = further_solutions.q.unflatten(0, (-1, n_starts))
-            further_solutions.n_starts = (
-                best.n_starts[some].repeat_interleave(n_starts) + n_starts
-            )
-            for place in range(count):
-                nearest, pick = distance.min(1)
-                exists = torch.isfinite(nearest)
-                picked = further_solutions.take(first + pick)
-                solutions.put(count * some[exists] + place, picked.take(exists))
-                apart = q - picked.q[:, None]
-                apart = ((apart - settings.whole_turns(apart)) / spans).abs().amax(-1)
-                distance = torch.where(apart <= _SAME, torch.inf, distance)
+        n_starts = restarts + 1
+        places = torch.arange(count * len(start), device=start.device)
+        solutions = best.take(places // count)
+        solutions.q[places % count > 0] = torch.nan
+        for rows in (self._cost(best) == _DONE).nonzero()[:, 0].split(_ROWS):
+            ends = fine._from_even_starts(best.take(rows), start[rows], restarts)
+            near = start[rows].repeat_interleave(n_starts, 0)
+            # By whole turns towards the start, where the limits allow it.
+            turned = ends.q + self.settings.whole_turns(near - ends.q)
+            allowed = self.settings.inside(turned) == turned
+            ends.q = torch.where(allowed, turned, ends.q)
+            ends.n_starts = best.n_starts[rows].repeat_interleave(n_starts) + n_starts
+            distance = ((ends.q - near) / self.settings.spans.to(near)).norm(dim=-1)
+            distance[fine._cost(ends) != _DONE] = torch.inf
+            for k, row in enumerate(rows.tolist()):
+                block = slice(k * n_starts, (k + 1) * n_starts)
+                picks = self._different(ends.q[block], distance[block], count)
+                first = row * count
+                chosen = ends.take(block.start + picks)
+                solutions.put(places[first : first + len(picks)], chosen)
         return solutions
+
+    def _different(self, q: Tensor, distance: Tensor, count: int) -> Tensor:
+        """Return which of the configurations (s, n) differ, up to `count`, by their distance."""
+        picks = []
+        while len(picks) < count and torch.isfinite(distance).any():
+            pick = distance.argmin()
+            picks.append(pick)
+            apart = q - q[pick]
+            apart = apart - self.settings.whole_turns(apart)
+            same = (apart / self.settings.spans.to(q)).abs().amax(-1) <= _SAME
+            distance = torch.where(same, torch.inf, distance)
+        return torch.stack(picks) if picks else distance.new_zeros(0).long()
 
     def _from_even_starts(self, best: Found, start: Tensor, restarts: int) -> Found:
         """Return the results from the best points and from `restarts` even starts, row by row."""
-        starts = even_starts(
-            self.settings, start, torch.zeros_like(best.error), restarts
-        )
+        anywhere = torch.zeros_like(best.error)
+        starts = even_starts(self.settings, start, anywhere, restarts)
         starts = torch.cat([best.q[:, None], starts.expand(len(start), -1, -1)], dim=1)
         target = best.target.repeat_interleave(restarts + 1, 0)
-        solutions = self._attempt(self.settings.start_at(starts.flatten(0, 1)), target)
+        ends = self._attempt(self.settings.start_at(starts.flatten(0, 1)), target)
         if self.settings.has_posture:
-            self._to_posture(solutions)
-        return solutions
+            self._to_posture(ends)
+        return ends
 
-    def _to_posture(self, found: Found) -> None:
-        self._descend(found, lambda q: self.settings.preferred(q) - q)
+    def _to_posture(self, reached: Found) -> None:
+        self._descend(reached, lambda q: self.settings.preferred(q) - q)
 
     def _attempt(self, q: Tensor, target: Tensor) -> Found:
         """Return the result of one start; results outside the domain are moved towards it."""
@@ -215,32 +222,29 @@ class Search:
         solution.put(rows, part)
         return solution
 
-    def _try_again(self, found: Found, rows: Tensor, starts: Tensor) -> None:
+    def _try_again(self, best: Found, rows: Tensor, starts: Tensor) -> None:
         """Search rows (k,) from further starts (k, s, n) at once, and keep the best results."""
         n_starts = starts.shape[1]
         if rows.numel() == 0 or n_starts == 0:
             return
-        q = starts.flatten(0, 1)
-        target = found.target[rows].repeat_interleave(n_starts, 0)
-        again = self._attempt(self.settings.start_at(q), target)
-        n_iter = found.n_iter[rows] + again.n_iter.view(-1, n_starts).sum(1)
-        n_tried = found.n_starts[rows] + n_starts
-        cost = self._cost(again).nan_to_num(torch.inf).view(-1, n_starts)
-        best = cost.argmin(1)
-        again = again.take(
-            best + n_starts * torch.arange(len(rows), device=best.device)
-        )
-        better = self._cost(again) < self._cost(found)[rows]
-        found.put(rows[better], again.take(better))
-        found.n_iter[rows] = n_iter
-        found.n_starts[rows] = n_tried
+        target = best.target[rows].repeat_interleave(n_starts, 0)
+        ends = self._attempt(self.settings.start_at(starts.flatten(0, 1)), target)
+        best.n_iter[rows] += ends.n_iter.view(-1, n_starts).sum(1)
+        best.n_starts[rows] += n_starts
+        # The best end of every row; the counts are those of the row.
+        cost = self._cost(ends).nan_to_num(torch.inf).view(-1, n_starts)
+        first = n_starts * torch.arange(len(rows), device=rows.device)
+        ends = ends.take(first + cost.argmin(1))
+        ends.n_iter = best.n_iter[rows]
+        ends.n_starts = best.n_starts[rows]
+        better = self._cost(ends) < self._cost(best)[rows]
+        best.put(rows[better], ends.take(better))
 
-    def _cost(self, found: Found) -> Tensor:
+    def _cost(self, ends: Found) -> Tensor:
         """Return the error, or -1 for rows reached outside the domain, -2 for inside."""
-        inside = self.settings.task.in_domain(found.q)
-        return torch.where(
-            found.reached, torch.where(inside, _DONE, _OUTSIDE), found.error
-        )
+        inside = self.settings.task.in_domain(ends.q)
+        reached = torch.where(inside, _DONE, _OUTSIDE)
+        return torch.where(ends.reached, reached, ends.error)
 
     def _point(self, q: Tensor, target: Tensor) -> Point:
         x, J = self.settings.evaluate(q)
@@ -251,6 +255,8 @@ class Search:
         no = torch.zeros(len(q), dtype=torch.bool, device=q.device)
         outcome = (self._within(point.e), no, no, no.long(), (~no).long())
         return Found(*(part.clone() for part in (*vars(point).values(), *outcome)))
+
+    # Levenberg-Marquardt: eq. (19) without posture, at a damping that follows the progress.
 
     def _lower(self, q: Tensor, target: Tensor) -> Found:
         """Lower the error until it is within tol or cannot be lowered."""
@@ -289,7 +295,10 @@ class Search:
         half_turn = 0.5 * settings.periods.to(live.q)
         stays = torch.isinf(half_turn)
         bounds = lower.where(stays, -half_turn), upper.where(stays, half_turn)
-        step = limited_step(settings, live.J, live.e, None, *bounds, trust, quick=True)
+        damping_sq = trust * (live.J * settings.unit(live.J)).flatten(1).square().sum(
+            -1
+        )
+        step = limited_step(settings, live.J, live.e, None, *bounds, damping_sq)
         new = self._point(settings.inside(live.q + step.dq), live.target)
         error_new = new.error
         predicted = (live.e - apply_rows(live.J, step.dq)).norm(dim=-1)
@@ -305,6 +314,21 @@ class Search:
         live.slow = torch.where(little, live.slow + 1.0, 0.0)
         live.held = step.saturated.any(-1)
         live.put(better, new.take(better))
+
+    def _within(self, e: Tensor) -> Tensor:
+        return self.settings.task.reached(e, self.tol)
+
+    def _blocked(self, at: Point) -> Tensor:
+        """Return whether no motion within the limits lowers the error to first order."""
+        q = at.q
+        lower, upper = self.settings.box(at.q)
+        pull = apply_columns(at.J, at.e)
+        out = ((q >= upper) & (pull > 0.0)) | ((q <= lower) & (pull < 0.0))
+        out &= torch.isinf(self.settings.periods.to(q.device))
+        left = torch.where(out, 0.0, pull).norm(dim=-1)
+        return left <= IK_STATIONARY * at.J.flatten(1).norm(dim=-1) * at.error
+
+    # Descent in the null space, towards the posture or into the domain.
 
     def _inward(self, q: Tensor) -> Tensor:
         """Return Newton's step to a domain distance slightly below 1.
@@ -324,7 +348,7 @@ class Search:
         square = slope.square().sum(-1)
         return -(beyond / torch.where(square > 0.0, square, 1.0))[:, None] * slope
 
-    def _descend(self, found: Found, wanted: Callable[[Tensor], Tensor]) -> None:
+    def _descend(self, ends: Found, wanted: Callable[[Tensor], Tensor]) -> None:
         """Move reached rows along their null space in the direction of the desired steps.
 
         The error may exceed tol temporarily, by a fraction of the motion, because the next step
@@ -333,96 +357,89 @@ class Search:
         trapezoidal rule for the Lagrangian, which ignores the task part of the step. The fraction
         of the desired step to take follows from the curvature of the last step.
         """
-        all_rows = rows = found.reached.nonzero()[:, 0]
-        if rows.numel() == 0:
+        all_rows = ends.reached.nonzero()[:, 0]
+        if all_rows.numel() == 0:
             return
+        rows = all_rows
         task = self.settings.task
-        unit = self.settings.unit(found.q)
-        inside = task.in_domain(found.q)
-        live = self._slide(found.take(rows), wanted, torch.ones_like(found.e[rows, 0]))
+        unit = self.settings.unit(ends.q)
+        was_inside = task.in_domain(ends.q)
+        whole = torch.ones_like(ends.e[rows, 0])
+        live = self._slide(ends.take(rows), wanted, whole)
         for iteration in range(IK_NULL_STEPS):
+            # The last step only corrects the error.
             last = iteration == IK_NULL_STEPS - 1
-            step, point = self._try_step(
-                live, None if last else live.share[:, None] * live.free
-            )
-            new = self._slide(point, wanted, live.share)
-            way = (new.q - live.q) / unit
-            gain = 0.5 * ((live.free + new.free) / unit * way).sum(-1)
-            moved = live.J.flatten(1).norm(dim=-1) * step.dq.norm(dim=-1)
-            loose = new.error <= IK_NULL_SLIP * moved
+            way = None if last else live.fraction[:, None] * live.free
+            point = self._after_step(live, way)
+            new = self._slide(point, wanted, live.fraction)
+            moved = (new.q - live.q) / unit
+            gain = 0.5 * ((live.free + new.free) / unit * moved).sum(-1)
+            # Take a step that gains while its error is small, or that corrects a large error, but
+            # none that leaves the domain.
             reached = self._within(live.e)
             reached_new = self._within(new.e)
-            ok = ((loose | reached_new) & (gain > 0.0)) | last
-            ok |= ~reached & (new.error < 0.5 * live.error)
-            ok &= task.in_domain(new.q) | ~inside[rows]
-            record = ok & reached_new
-            found.put(rows[record], point.take(record))
-            found.n_iter[rows] += 1
-            worth = IK_NULL_GAIN * (live.wish / unit).square().sum(-1)
-            far = (gain > worth) | ~reached | ~reached_new
-            going = torch.where(ok, far, live.share > 0.01)
-            curvature = (way * (live.free - new.free) / unit).sum(
-                -1
-            ) / way.square().sum(-1)
-            new.share = torch.where(curvature > 0.0, 1.0 / curvature, 2.0 * live.share)
-            new.share = new.share.clamp(0.1, 4.0)
-            live.share = 0.25 * live.share
-            live.put(ok, new.take(ok))
+            unprojected = live.J.flatten(1).norm(dim=-1) * (new.q - live.q).norm(dim=-1)
+            small = reached_new | (new.error <= IK_NULL_SLIP * unprojected)
+            corrects = ~reached & (new.error < 0.5 * live.error)
+            taken = (small & (gain > 0.0)) | corrects | last
+            taken &= task.in_domain(new.q) | ~was_inside[rows]
+            recorded = taken & reached_new
+            ends.put(rows[recorded], point.take(recorded))
+            ends.n_iter[rows] += 1
+            # Go on while it is worth it, or with shorter steps.
+            least_gain = IK_NULL_GAIN * (live.wish / unit).square().sum(-1)
+            unfinished = (gain > least_gain) | ~reached | ~reached_new
+            going = torch.where(taken, unfinished, live.fraction > 0.01)
+            change = (moved * (live.free - new.free) / unit).sum(-1)
+            curvature = change / moved.square().sum(-1)
+            fraction = torch.where(
+                curvature > 0.0, 1.0 / curvature, 2.0 * live.fraction
+            )
+            new.fraction = fraction.clamp(0.1, 4.0)
+            live.fraction = 0.25 * live.fraction
+            live.put(taken, new.take(taken))
             rows = rows[going]
             live = live.take(going)
             if rows.numel() == 0:
                 break
-        _, ended = self._try_step(found.take(all_rows), None, hold=True)
-        better = (ended.error < found.error[all_rows]) & self._within(ended.e)
-        found.put(all_rows[better], ended.take(better))
+        # A step of the free actuators removes what is left of the error.
+        corrected = self._after_step(ends.take(all_rows), None, hold=True)
+        better = (corrected.error < ends.error[all_rows]) & self._within(corrected.e)
+        ends.put(all_rows[better], corrected.take(better))
 
     def _slide(
-        self, at: Point, wanted: Callable[[Tensor], Tensor], share: Tensor
+        self, at: Point, wanted: Callable[[Tensor], Tensor], fraction: Tensor
     ) -> _Slide:
         wish = wanted(at.q)
         free = null_step(self.settings, at.J, wish)
-        return _Slide(at.q, at.x, at.J, at.e, at.target, wish, free, share)
+        return _Slide(at.q, at.x, at.J, at.e, at.target, wish, free, fraction)
 
-    def _try_step(
+    def _after_step(
         self, at: Point, posture: Tensor | None, hold: bool = False
-    ) -> tuple[StepRows, Point]:
-        """Return a step and the point after it; `hold` fixes actuators at a limit."""
+    ) -> Point:
+        """Return the point after a step; `hold` fixes actuators at a limit."""
         lower, upper = self.settings.step_bounds(at.q)
         if hold:
             held = (lower >= 0.0) | (upper <= 0.0)
-            lower, upper = (torch.where(held, 0.0, bound) for bound in (lower, upper))
-        step = limited_step(
-            self.settings, at.J, at.e, posture, lower, upper, quick=True
-        )
-        return step, self._point(at.q + step.dq, at.target)
+            lower = torch.where(held, 0.0, lower)
+            upper = torch.where(held, 0.0, upper)
+        step = limited_step(self.settings, at.J, at.e, posture, lower, upper)
+        return self._point(at.q + step.dq, at.target)
 
-    def _within(self, e: Tensor) -> Tensor:
-        return self.settings.task.reached(e, self.tol)
-
-    def _blocked(self, at: Point) -> Tensor:
-        """Return whether no motion within the limits lowers the error to first order."""
-        q = at.q
-        lower, upper = self.settings.box(at.q)
-        pull = apply_columns(at.J, at.e)
-        out = ((q >= upper) & (pull > 0.0)) | ((q <= lower) & (pull < 0.0))
-        out &= torch.isinf(self.settings.periods.to(q.device))
-        left = torch.where(out, 0.0, pull).norm(dim=-1)
-        return left <= IK_STATIONARY * at.J.flatten(1).norm(dim=-1) * at.error
-
-    def _nudged(self, found: Found) -> Tensor:
+    def _nudged(self, at: Found) -> Tensor:
         """Return starts beside singular points, where first-order motion does not help.
 
         Examples are a straight backbone that has to shorten, or a stretched arm: the error is
         stationary but not minimal. A second-order motion is needed, which is large even for small
         errors: 5 % of the limits, or the motion that moves a regular tip by a tenth of the error.
         """
-        n = found.q.shape[-1]
+        n = at.q.shape[-1]
         settings = self.settings
-        size = 0.1 * _per_tip(found.J, found.error)[:, None].expand_as(found.q)
-        span = 0.05 * (settings.q_max - settings.q_min).to(found.q)
+        size = 0.1 * _per_tip(at.J, at.error)[:, None].expand_as(at.q)
+        span = 0.05 * (settings.q_max - settings.q_min).to(at.q)
         size = torch.where(torch.isfinite(span), torch.maximum(size, span), size)
         # Unequal factors, because equal ones can cancel in a symmetric robot.
-        return found.q + size * torch.cos(found.q.new_ones(n).cumsum(0))
+        return at.q + size * torch.cos(at.q.new_ones(n).cumsum(0))
 
 
 def _per_tip(J: Tensor, error: Tensor) -> Tensor:

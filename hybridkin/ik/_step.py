@@ -1,4 +1,7 @@
-"""The law of one step, eq. (1): a task, a posture in its null space, and limits of the step."""
+"""The law of one step, eq. (1): a task, a posture in its null space, and limits of the step.
+
+Equations (17) to (20) are those of the page "Theory" of the documentation.
+"""
 
 from __future__ import annotations
 
@@ -23,12 +26,13 @@ from hybridkin.ik._gram import (
     apply_rows,
     damped_solve,
     null_projection,
-    quick_gram,
     row_gram,
+    solve_rows,
 )
 from hybridkin.ik._settings import StepSettings, stopping
 
-# for a step that would leave the tip limits
+# For a step that would leave the tip limits: alternating projections, and how far each one goes
+# in multiples of the violation.
 _PROJECTIONS = 8
 _EXCESS = 1.5
 
@@ -83,17 +87,17 @@ def control_step(
         The steps; sigma_min is NaN for rows that are not finite.
     """
     gain, beta, seconds = settings.rates(period)
-    v = gain * e if feed_forward is None else feed_forward + gain * e
-    sizes = torch.stack([e.norm(dim=-1), v.norm(dim=-1)], dim=-1)
-    fine = _finite(q) & _finite(J.flatten(1)) & _finite(sizes)
-    before = 0.0
-    if last is not None:
-        fine = fine & _finite(last)
-        before = torch.where(_finite(last), last, 0.0)
+    feed = torch.zeros_like(e) if feed_forward is None else feed_forward
+    before = torch.zeros_like(q) if last is None else last
+    # Rows that are not finite, or overflow, get zeros, and no step at the end.
+    sizes = torch.stack([e.norm(dim=-1), (feed + gain * e).norm(dim=-1)], dim=-1)
+    known = _finite(before)
+    fine = _finite(q) & _finite(J.flatten(1)) & _finite(sizes) & known
+    before = torch.where(known, before, 0.0)
     at = torch.where(fine, q, 0.0)
     e = torch.where(fine, e, 0.0)
+    feed = torch.where(fine, feed, 0.0)
     J = _only_taut(settings, torch.where(fine[..., None], J, 0.0))
-    limits = None if tip is None else settings.tip_limits
     posture = None
     if settings.has_posture:
         posture = torch.where(fine, beta * (settings.preferred(at) - at), 0.0)
@@ -103,32 +107,28 @@ def control_step(
         brake = _braking(settings, J, e, change)
         gain = stopping(torch.ones_like(brake), brake).clamp_max(gain)[:, None]
         if posture is not None:
-            most = stopping((posture / beta).abs(), change)
-            posture = torch.clamp(posture, -most, most)
-    if feed_forward is None:
-        v = gain * e
-    else:
-        v = torch.where(fine, feed_forward + gain * e, 0.0)
+            fastest = stopping((posture / beta).abs(), change)
+            posture = torch.clamp(posture, -fastest, fastest)
+    # Eq. (17), within the limits of q, of its speed and acceleration, and of the tip.
+    v = feed + gain * e
     bounds = settings.step_bounds(q, seconds, before)
-    if limits is None:
+    spaces = settings.tip_limits
+    if spaces is None or tip is None:
         step = limited_step(settings, J, v, posture, *bounds)
     else:
-        assert tip is not None
-        margin = limits.margin(torch.where(fine, tip, 0.0))
+        margin = spaces.margin(torch.where(fine, tip, 0.0))
         if settings.accelerates:
-            normals = limits.normals.to(J)
-            brakes = [
-                _braking(settings, J, a.expand(len(J), -1), change) for a in normals
-            ]
+            normals = spaces.normals.to(J)[:, None].expand(-1, len(J), -1)
+            brakes = [_braking(settings, J, normal, change) for normal in normals]
             margin = stopping(margin, torch.stack(brakes, dim=-1))
         step = _step_inside(settings, margin, J, v, posture, *bounds)
-        v = v + limits.way_in(margin - limits.along(v))
+        v = v + spaces.way_in(margin - spaces.along(v))
     if settings.pulls.any():
         step = _arriving(settings, at, J, v, step, *bounds)
+    # The other rows stay, or brake; outside the limits their known actuators return.
     fine = fine & _finite(step.dq)
-    still = torch.where(
-        torch.isfinite(q), torch.clamp(torch.zeros_like(q), *bounds), 0.0
-    )
+    still = torch.clamp(torch.zeros_like(q), *bounds)
+    still = torch.where(torch.isfinite(q), still, 0.0)
     held = (still <= bounds[0]) | (still >= bounds[1])
     return step._replace(
         dq=torch.where(fine, step.dq, still),
@@ -138,17 +138,101 @@ def control_step(
     )
 
 
+def limited_step(
+    settings: StepSettings,
+    J: Tensor,
+    v: Tensor,
+    posture: Tensor | None,
+    lower: Tensor,
+    upper: Tensor,
+    damping_sq: Tensor | None = None,
+) -> StepRows:
+    """Return the step for the task v and the posture step, within the bounds.
+
+    Weights are a change of unit: in u = W^(1/2) q all weights are 1. With `damping_sq`, lambda^2 in
+    this unit, singular values are not computed, and sigma_min is NaN.
+    """
+    unit = settings.unit(v)
+    J = J * unit
+    low = lower / unit
+    high = upper / unit
+    if posture is not None:
+        posture = posture / unit
+    # Eq. (17): damped least squares, and the part of the posture step that does not move the tip.
+    if damping_sq is not None:
+        mu = solve_rows(J, v, damping_sq)
+        sigma_min = torch.full_like(damping_sq, math.nan)
+        z = torch.zeros_like(J[:, 0])
+    else:
+        gram = row_gram(J)
+        sigma_min = gram.sigma_min
+        if isinstance(settings.damping, str):
+            damping_sq = adaptive_damping(gram)
+        else:
+            damping_sq = (settings.damping * gram.sigma_max).square()
+        mu = damped_solve(gram, v, damping_sq)
+        z = torch.zeros_like(J[:, 0])
+        if posture is not None:
+            z = null_projection(J, gram, posture)
+    dq = apply_columns(J, mu) + z
+    if settings.limits != "off":
+        # Rows within all limits keep this step; eq. (19) is solved for the others. Weights turn J
+        # out of the plane.
+        clipped = torch.clamp(dq, low, high)
+        out_of_plane = settings.plane is not None and settings.weights is not None
+        over = ((clipped != dq).any(-1) | out_of_plane).nonzero()[:, 0]
+        if over.numel() > 0:
+            rows, motion = _with_plane(settings, J, v, posture)
+            ends = (low.expand_as(dq), high.expand_as(dq))
+            problem = BoxProblem(rows, motion, z, *ends).take(over)
+            clipped[over] = strict_box_step(problem, damping_sq[over])
+        dq = clipped
+    held = (dq <= low) | (dq >= high)
+    dq = torch.clamp(dq * unit, lower, upper)
+    return StepRows(dq, sigma_min, damping_sq.sqrt(), held)
+
+
+def null_step(settings: StepSettings, J: Tensor, step: Tensor) -> Tensor:
+    """Return the part of steps (N, n) in the null space of J (N, m, n)."""
+    unit = settings.unit(J)
+    J = J * unit
+    return unit * null_projection(J, row_gram(J), step / unit)
+
+
+def _with_plane(
+    settings: StepSettings, J: Tensor, v: Tensor, posture: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """Return J and v with further rows: only `posture` leaves the plane, also at the limits.
+
+    Else a limit that stops one actuator would unbalance the others.
+    """
+    if settings.plane is None:
+        return J, v
+    stiff = IK_BALANCE * J.flatten(1).norm(dim=-1)[:, None, None]
+    rows = stiff * (settings.plane[1].to(J).mT * settings.unit(v))
+    leaving = torch.zeros_like(J[:, 0]) if posture is None else posture
+    aside = apply_rows(rows, leaving)
+    return torch.cat([J, rows], dim=1), torch.cat([v, aside], dim=1)
+
+
 def _finite(rows: Tensor) -> Tensor:
     """Return whether all numbers of rows (N, k) are finite, shape (N, 1)."""
     return torch.isfinite(rows).all(-1, keepdim=True)
 
 
+def _norm(rows: Tensor) -> Tensor:
+    """Return the lengths (N, 1) of rows."""
+    return rows.norm(dim=-1, keepdim=True)
+
+
 def _braking(settings: StepSettings, J: Tensor, way: Tensor, change: Tensor) -> Tensor:
     """Return the largest change of the tip's motion per period, in multiples of `way` (N,)."""
     free = torch.full_like(J[:, 0], math.inf)
-    return (change / limited_step(settings, J, way, None, -free, free).dq.abs()).amin(
-        -1
-    )
+    dq = limited_step(settings, J, way, None, -free, free).dq
+    return (change / dq.abs()).amin(-1)
+
+
+# Limits of the tip.
 
 
 def _step_inside(
@@ -166,104 +250,33 @@ def _step_inside(
     end. A remaining violation is removed by taking a fraction of the way from a safe step, one
     that stays or returns, to this step.
     """
-    # [m]
-    limits = settings.tip_limits
-    close = 32.0 * torch.finfo(v.dtype).eps
-    assert limits is not None
-
-    def taken(way: Tensor, z: Tensor | None = z) -> tuple[StepRows, Tensor]:
-        step = limited_step(settings, J, way, z, *bounds)
-        return step, limits.along(apply_rows(J, step.dq)) - margin
-
-    wanted = v + limits.way_in(margin - limits.along(v))
-    step, over = taken(wanted)
+    spaces = settings.tip_limits
+    assert spaces is not None
+    close = 32.0 * torch.finfo(v.dtype).eps  # [m]
+    wanted = v + spaces.way_in(margin - spaces.along(v))
+    step = limited_step(settings, J, wanted, z, *bounds)
+    over = spaces.along(apply_rows(J, step.dq)) - margin
     for _ in range(_PROJECTIONS):
-        out = (over > close).any(-1, keepdim=True)
-        if not out.any():
+        outside = (over > close).any(-1, keepdim=True)
+        if not outside.any():
             break
-        back = apply_rows(J, step.dq) + _EXCESS * limits.way_in(-over)
-        wanted = torch.where(out, back, wanted)
-        step, over = taken(wanted)
+        back = apply_rows(J, step.dq) + _EXCESS * spaces.way_in(-over)
+        wanted = torch.where(outside, back, wanted)
+        step = limited_step(settings, J, wanted, z, *bounds)
+        over = spaces.along(apply_rows(J, step.dq)) - margin
     else:
-        stay, least = taken(limits.way_in(margin), None)
-        step_size = ((close - least) / (over - least)).clamp(0.0, 1.0)
-        step_size = torch.where(over > close, step_size, 1.0).amin(-1, keepdim=True)
-        dq = torch.clamp(stay.dq + step_size * (step.dq - stay.dq), *bounds)
-        held = (dq <= bounds[0]) | (dq >= bounds[1])
-        step = step._replace(
-            dq=torch.where(step_size < 1.0, dq, step.dq), saturated=held
-        )
+        safe = limited_step(settings, J, spaces.way_in(margin), None, *bounds)
+        over_safe = spaces.along(apply_rows(J, safe.dq)) - margin
+        fraction = ((close - over_safe) / (over - over_safe)).clamp(0.0, 1.0)
+        fraction = torch.where(over > close, fraction, 1.0).amin(-1, keepdim=True)
+        part = torch.clamp(safe.dq + fraction * (step.dq - safe.dq), *bounds)
+        held = (part <= bounds[0]) | (part >= bounds[1])
+        dq = torch.where(fraction < 1.0, part, step.dq)
+        step = step._replace(dq=dq, saturated=held)
     return step._replace(stopped=((wanted - v).abs() > close).any(-1))
 
 
-def limited_step(
-    settings: StepSettings,
-    J: Tensor,
-    v: Tensor,
-    posture: Tensor | None,
-    lower: Tensor,
-    upper: Tensor,
-    trust: Tensor | None = None,
-    *,
-    quick: bool = False,
-) -> StepRows:
-    """Return the step for the task v and the posture step, within the bounds.
-
-    Weights are a change of unit: in u = W^(1/2) q all weights are 1. A search checks all its steps,
-    so it can use estimates of the singular values (`quick`), and `trust`,
-    lambda^2 / sigma_max^2, in place of the damping.
-    """
-    box = (lower, upper)
-    unit = settings.unit(v)
-    if settings.weights is not None:
-        J = J * unit
-        lower = lower / unit
-        upper = upper / unit
-        if posture is not None:
-            posture = posture / unit
-    gram = quick_gram(J, trust is not None) if quick else row_gram(J)
-    if trust is not None:
-        damping_sq = trust * gram.sigma_max.square()
-    elif settings.damping == "adaptive":
-        damping_sq = adaptive_damping(gram)
-    else:
-        damping_sq = (float(settings.damping) * gram.sigma_max).square()
-    dq = apply_columns(J, damped_solve(gram, v, damping_sq))
-    z = torch.zeros_like(dq) if posture is None else null_projection(J, gram, posture)
-    dq = dq + z
-    if settings.limits != "off":
-        # Rows within all limits keep the unlimited step; the others are solved in the box.
-        clipped = torch.clamp(dq, lower, upper)
-        unbalanced = settings.plane is not None and settings.weights is not None
-        over = ((clipped != dq).any(-1) | unbalanced).nonzero()[:, 0]
-        if over.numel() > 0:
-            low, high = (a.expand_as(dq) for a in (lower, upper))
-            rows, motion = _with_plane(settings, J, v, posture)
-            problem = BoxProblem(rows, motion, z, low, high).take(over)
-            clipped[over] = strict_box_step(problem, damping_sq[over])
-        dq = clipped
-    held = (dq <= lower) | (dq >= upper)
-    if settings.weights is not None:
-        dq = torch.clamp(dq * unit, *box)
-    return StepRows(dq, gram.sigma_min, damping_sq.sqrt(), held)
-
-
-def _with_plane(
-    settings: StepSettings, J: Tensor, v: Tensor, posture: Tensor | None
-) -> tuple[Tensor, Tensor]:
-    """Return J and v with further rows: only `posture` leaves the plane, also at the limits.
-
-    Else a limit that stops one actuator would unbalance the others.
-    """
-    if settings.plane is None:
-        return J, v
-    stiff = IK_BALANCE * J.flatten(1).norm(dim=-1)[:, None, None]
-    rows = stiff * (settings.plane[1].to(J).mT * settings.unit(v))
-    if posture is None:
-        aside = torch.zeros_like(rows[..., 0])
-    else:
-        aside = apply_rows(rows, posture)
-    return torch.cat([J, rows], dim=1), torch.cat([v, aside], dim=1)
+# Tendons that can only pull.
 
 
 def _only_taut(settings: StepSettings, J: Tensor) -> Tensor:
@@ -272,10 +285,8 @@ def _only_taut(settings: StepSettings, J: Tensor) -> Tensor:
     A learned error makes them small instead of zero, and a step would drive these tendons far.
     """
     size = J.norm(dim=-2, keepdim=True)
-    slack = (size <= IK_SLACK * size.amax(-1, keepdim=True)) & (
-        settings.pulls.to(J) != 0.0
-    )
-    return torch.where(slack, 0.0, J)
+    small = size <= IK_SLACK * size.amax(-1, keepdim=True)
+    return torch.where(small & (settings.pulls.to(J) != 0.0), 0.0, J)
 
 
 class _End(NamedTuple):
@@ -289,20 +300,48 @@ class _End(NamedTuple):
     def distance(self) -> Tensor:
         return _norm(self.missing)
 
-    def where(self, better: Tensor, other: _End) -> _End:
-        """Return the ends of `other` in the rows (N, 1) where it is better."""
-        pairs = zip(other, self, strict=True)
+    def where(self, better: Tensor, end: _End) -> _End:
+        """Return another end in the rows (N, 1) where it is better."""
         return _End(
-            *(
-                a.where(better if a.ndim == 2 else better[..., None], b)
-                for a, b in pairs
-            )
+            end.dq.where(better, self.dq),
+            end.J.where(better[..., None], self.J),
+            end.missing.where(better, self.missing),
         )
 
 
-def _norm(rows: Tensor) -> Tensor:
-    """Return the lengths (N, 1) of rows."""
-    return rows.norm(dim=-1, keepdim=True)
+class _Arrival(NamedTuple):
+    """Configurations q (N, n) with tips x, and the bounds of their steps."""
+
+    settings: StepSettings
+    q: Tensor
+    x: Tensor
+    lower: Tensor
+    upper: Tensor
+
+    def end(self, dq: Tensor, motion: Tensor) -> _End:
+        """Return the end of steps dq, whose tips shall make a motion (N, m)."""
+        tip, J = self.settings.evaluate(self.q + dq)
+        moved = self.settings.task.difference(self.x, tip)
+        return _End(dq, _only_taut(self.settings, J), motion - moved)
+
+    def approach(self, dq: Tensor, motion: Tensor, close: Tensor) -> _End:
+        """Return the best end of Newton's method from steps dq, within the bounds."""
+        best = end = self.end(dq, motion)
+        for _ in range(IK_CORRECTIONS):
+            going = best.distance > close
+            if not going.any():
+                break
+            low = self.lower - end.dq
+            high = self.upper - end.dq
+            correction = limited_step(
+                self.settings, end.J, end.missing, None, low, high
+            ).dq
+            dq = torch.clamp(end.dq + correction, self.lower, self.upper)
+            dq = torch.where(correction >= high, self.upper, dq)
+            dq = torch.where(correction <= low, self.lower, dq)
+            end = self.end(dq, motion)
+            best = best.where(going & (end.distance < best.distance), end)
+        return best
 
 
 def _arriving(
@@ -320,48 +359,26 @@ def _arriving(
     Newton's method corrects it within the bounds. Where the result is less than half of the motion
     v, slack tendons are pulled in, as far as the tip gets nearer to v or not away.
     """
-    pulls = settings.pulls.to(q)
-    task = settings.task
-    x = settings.evaluate(q)[0]
-
-    def end_of(dq: Tensor, motion: Tensor) -> _End:
-        tip, slope = settings.evaluate(q + dq)
-        return _End(dq, _only_taut(settings, slope), motion - task.difference(x, tip))
-
-    def approach(dq: Tensor, motion: Tensor, close: Tensor) -> _End:
-        best = end = end_of(dq, motion)
-        for _ in range(IK_CORRECTIONS):
-            going = best.distance > close
-            if not going.any():
-                break
-            low = lower - end.dq
-            high = upper - end.dq
-            correction = limited_step(settings, end.J, end.missing, None, low, high).dq
-            dq = torch.clamp(end.dq + correction, lower, upper)
-            dq = torch.where(
-                correction <= low, lower, torch.where(correction >= high, upper, dq)
-            )
-            end = end_of(dq, motion)
-            best = best.where(going & (end.distance < best.distance), end)
-        return best
-
+    x, _ = settings.evaluate(q)
+    arrival = _Arrival(settings, q, x, lower, upper)
     eps = torch.finfo(q.dtype).eps
     slip = _norm(J.flatten(1)) * (IK_SLIP * _norm(step.dq) + 32.0 * eps * _norm(q))
     promised = apply_rows(J, step.dq)
     close = torch.maximum(0.5 * _norm(promised), slip)
-    end = approach(step.dq, promised, close)
+    end = arrival.approach(step.dq, promised, close)
     end = end._replace(missing=v - promised + end.missing)
-    weak = end.distance > torch.maximum(0.5 * _norm(v), slip)
-    to = torch.where(pulls < 0.0, lower, upper)
+    # Pull in the slack tendons of weak steps: the whole way to their bound, then less.
+    pulls = settings.pulls.to(q)
     slack = (end.J == 0.0).all(-2) & (pulls != 0.0)
+    to = torch.where(pulls < 0.0, lower, upper)
     to = torch.where(slack & torch.isfinite(to), to, end.dq)
     way = to - end.dq
+    weak = end.distance > torch.maximum(0.5 * _norm(v), slip)
     weak &= (way != 0.0).any(-1, keepdim=True)
     fraction = 1.0
     while fraction > IK_LEAST_PULL and weak.any():
-        pulled = approach(
-            torch.clamp(to - (1.0 - fraction) * way, lower, upper), v, slip
-        )
+        dq = torch.clamp(to - (1.0 - fraction) * way, lower, upper)
+        pulled = arrival.approach(dq, v, slip)
         # A slack tendon moves the tip by rounding alone.
         better = weak & (pulled.distance <= (1.0 + eps**0.5) * end.distance)
         end = end.where(better, pulled)
@@ -369,10 +386,3 @@ def _arriving(
         fraction *= IK_PULL_RATIO
     held = (end.dq <= lower) | (end.dq >= upper)
     return step._replace(dq=end.dq, saturated=held)
-
-
-def null_step(settings: StepSettings, J: Tensor, step: Tensor) -> Tensor:
-    """Return the part of steps (N, n) in the null space of J (N, m, n)."""
-    unit = settings.unit(J)
-    J = J * unit
-    return unit * null_projection(J, quick_gram(J), step / unit)
