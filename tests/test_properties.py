@@ -102,7 +102,6 @@ CALIBRATE = {
     "x": X,
     "parameters": ["radii"],
     "loss": "linear",
-    "bounds": None,
     "prior": 0.5,
     "groups": GROUPS,
     "sample_weight": np.ones(24),

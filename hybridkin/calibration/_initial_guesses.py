@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Sequence
 from itertools import product
 from typing import NamedTuple, TypeVar
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from hybridkin._core.rotations import rigid_motion
 from hybridkin.calibration._least_squares import Rows
@@ -23,18 +21,20 @@ _ROWS = 300
 _SCALES = (0.6, 1.0, 1.6)
 _TURNS = tuple(0.5 * math.pi * k for k in range(4))
 _SWEEPS = 2
-_KEPT = 2  # guesses per handedness
+_MOST = 2  # guesses per handedness
 _HOPELESS = (
-    3.0  # times the error of the best guess, before any fit; worse ones are dropped
+    3.0  # times the least error of a guess, before any fit; worse ones are dropped
 )
+
+_Rings = tuple[tuple[bool, float], ...]  # for every ring: mirrored or not, and its turn
 
 
 class Guess(NamedTuple):
-    """A chain to start from, a likely factor on its radii, and which rings are mirrored."""
+    """A chain to start from, a likely factor on its radii, and whether a ring is mirrored."""
 
     chain: Chain
     scale: float = 1.0
-    mirrored: tuple[bool, ...] = ()
+    mirrored: bool = False
 
 
 def initial_guesses(chain: Chain, rows: Rows, names: tuple[str, ...]) -> list[Guess]:
@@ -47,16 +47,18 @@ def initial_guesses(chain: Chain, rows: Rows, names: tuple[str, ...]) -> list[Gu
     free_base = "base" in names
     if free_base:
         guesses.append(Guess(aligned(chain, rows)))
-    if isinstance(chain, ArcChain) and {"angles", "turns"} & {*names}:
+    if not isinstance(chain, ArcChain):
+        return guesses
+    if "angles" in names or "turns" in names:
         step = max(1, len(rows.q) // _ROWS)
         few = rows.take(slice(None, None, step))
-        guesses += _searched(chain, few, free_base, "radii" in names)
-    elif free_base and isinstance(chain, ArcChain):
-        counts = chain.actuators_per_segment
-        mirrored = (True,) * len(counts)
-        image = aligned(_ringed(chain, mirrored, np.zeros(len(counts))), rows)
+        scales = _SCALES if "radii" in names else (1.0,)
+        guesses += _best_rings(chain, few, free_base, scales)
+    elif free_base:
+        mirrored = [(True, 0.0)] * len(chain.actuators_per_segment)
+        image = aligned(_with_rings(chain, mirrored), rows)
         if rows.rmse(image) < rows.rmse(guesses[-1].chain):
-            guesses.append(Guess(image, mirrored=mirrored))
+            guesses.append(Guess(image, mirrored=True))
     return guesses
 
 
@@ -68,63 +70,58 @@ def aligned(chain: _Chain, rows: Rows) -> _Chain:
     return chain.with_geometry(base=motion @ chain.geometry()["base"])
 
 
-def _searched(
-    chain: ArcChain, rows: Rows, free_base: bool, free_radii: bool
-) -> Iterator[Guess]:
-    """Yield the best guesses of a search ring by ring, for several scales of the radii."""
-    best: dict[tuple, tuple[float, Guess]] = {}
+def _best_rings(
+    chain: ArcChain, rows: Rows, free_base: bool, scales: tuple[float, ...]
+) -> list[Guess]:
+    """Return the best guesses of a search ring by ring, for several scales of the radii."""
+    best: dict[_Rings, tuple[float, Guess]] = {}
     n_segments = len(chain.actuators_per_segment)
-    for scale in _SCALES if free_radii else (1.0,):
-        for hand in (False, True):
-            choice = [(hand, 0.0)] * n_segments
-            score = math.inf
-            for _ in range(_SWEEPS):
-                for k in range(n_segments):
-                    for option in product((hand, not hand), _TURNS):
-                        tried = [*choice[:k], option, *choice[k + 1 :]]
-                        rms = _chosen(chain, tried, scale, rows, free_base)[1]
-                        if rms < score * (1.0 - 1e-9):
-                            score = rms
-                            choice = tried
-            guess, _ = _chosen(chain, choice, scale, rows, free_base)
-            key = tuple(choice)
-            if key not in best or score < best[key][0]:
-                best[key] = (score, guess)
+    for scale, mirrored in product(scales, (False, True)):
+        rings = [(mirrored, 0.0)] * n_segments
+        error = math.inf
+        for _, k in product(range(_SWEEPS), range(n_segments)):
+            for ring in product((mirrored, not mirrored), _TURNS):
+                changed = [*rings[:k], ring, *rings[k + 1 :]]
+                tried = _guess(chain, changed, scale, rows, free_base)[0]
+                if tried < error * (1.0 - 1e-9):
+                    error = tried
+                    rings = changed
+        key = tuple(rings)
+        if key not in best or error < best[key][0]:
+            best[key] = _guess(chain, rings, scale, rows, free_base)
     ranked = sorted(best.values(), key=lambda pair: pair[0])
-    hopeful = [guess for score, guess in ranked if score < _HOPELESS * ranked[0][0]]
+    limit = _HOPELESS * ranked[0][0]
+    guesses = []
     for mirrored in (False, True):
-        alike = [guess for guess in hopeful if any(guess.mirrored) == mirrored]
-        yield from alike[:_KEPT]
+        alike = [g for error, g in ranked if g.mirrored == mirrored and error < limit]
+        guesses += alike[:_MOST]
+    return guesses
 
 
-def _chosen(
+def _guess(
     chain: ArcChain,
-    choice: list[tuple[bool, float]],
+    rings: Sequence[tuple[bool, float]],
     scale: float,
     rows: Rows,
     align: bool,
-) -> tuple[Guess, float]:
-    """Return a guess, and the root mean square tip distance of its chain with scaled radii."""
-    mirrored, turns = zip(*choice, strict=True)
-    turned = _ringed(chain, mirrored, np.array(turns))
-    scaled = _scaled(turned, scale)
+) -> tuple[float, Guess]:
+    """Return the root mean square tip distance of a guess with scaled radii, and the guess."""
+    changed = _with_rings(chain, rings)
+    scaled = changed
+    if scale != 1.0:
+        scaled = changed.with_geometry(radii=scale * changed.geometry()["radii"])
     if align:
         scaled = aligned(scaled, rows)
-        turned = turned.with_geometry(base=scaled.geometry()["base"])
-    return Guess(turned, scale, mirrored), rows.rmse(scaled)
+        changed = changed.with_geometry(base=scaled.geometry()["base"])
+    is_mirrored = any(mirrored for mirrored, _ in rings)
+    return rows.rmse(scaled), Guess(changed, scale, is_mirrored)
 
 
-def _ringed(chain: ArcChain, mirrored: tuple[bool, ...], turns: NDArray) -> ArcChain:
-    """Return the chain with some rings of actuators mirrored, then all turned."""
-    counts = chain.actuators_per_segment
+def _with_rings(chain: ArcChain, rings: Sequence[tuple[bool, float]]) -> ArcChain:
+    """Return the chain with every ring of actuators mirrored or not, then turned."""
     angles = chain.geometry()["angles"]
-    sign = angles.new_tensor(np.repeat(np.where(mirrored, -1.0, 1.0), counts))
-    return chain.with_geometry(
-        angles=sign * angles + angles.new_tensor(np.repeat(turns, counts))
-    )
-
-
-def _scaled(chain: _Chain, scale: float) -> _Chain:
-    if scale == 1.0:
-        return chain
-    return chain.with_geometry(radii=scale * chain.geometry()["radii"])
+    changed = []
+    parts = angles.split(list(chain.actuators_per_segment))
+    for ring, (mirrored, turn) in zip(parts, rings, strict=True):
+        changed.append((-ring if mirrored else ring) + turn)
+    return chain.with_geometry(angles=torch.cat(changed))

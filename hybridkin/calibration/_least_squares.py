@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -21,26 +21,39 @@ from hybridkin.native.library import evaluate
 _MEDIAN = 2.3660  # of the squared length of a normal vector with three coordinates
 
 
-# rho(s), rho'(s) and rho''(s), for the squared distance s of a row over its noise.
-LOSSES: dict[str, Callable[[NDArray], tuple[NDArray, NDArray, NDArray]]] = {
-    "linear": lambda s: (s, np.ones_like(s), np.zeros_like(s)),
-    "soft_l1": lambda s: (
-        2 * s / (1 + np.sqrt(1 + s)),
-        (1 + s) ** -0.5,
-        -0.5 * (1 + s) ** -1.5,
-    ),
-    "huber": lambda s: _huber(s, np.maximum(s, 1.0)),
-    "cauchy": lambda s: (np.log1p(s), 1 / (1 + s), -((1 + s) ** -2.0)),
-    "arctan": lambda s: (np.arctan(s), 1 / (1 + s * s), -2 * s / (1 + s * s) ** 2),
+_Loss = Callable[[NDArray], tuple[NDArray, NDArray, NDArray]]
+
+
+def _linear(s: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    return s, np.ones_like(s), np.zeros_like(s)
+
+
+def _soft_l1(s: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    return 2 * s / (1 + np.sqrt(1 + s)), (1 + s) ** -0.5, -0.5 * (1 + s) ** -1.5
+
+
+def _huber(s: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    far = np.maximum(s, 1.0)
+    rho = np.where(s > 1, 2 * np.sqrt(far) - 1, s)
+    return rho, far**-0.5, -0.5 * (s > 1) * far**-1.5
+
+
+def _cauchy(s: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    return np.log1p(s), 1 / (1 + s), -((1 + s) ** -2.0)
+
+
+def _arctan(s: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    return np.arctan(s), 1 / (1 + s * s), -2 * s / (1 + s * s) ** 2
+
+
+LOSSES: dict[str, _Loss] = {
+    "linear": _linear,
+    "soft_l1": _soft_l1,
+    "huber": _huber,
+    "cauchy": _cauchy,
+    "arctan": _arctan,
 }
-
-
-def _huber(s: NDArray, far: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    return (
-        np.where(s > 1, 2 * np.sqrt(far) - 1, s),
-        far**-0.5,
-        -0.5 * (s > 1) * far**-1.5,
-    )
+"""rho(s), rho'(s) and rho''(s), for the squared distance s of a row over its noise."""
 
 
 class Accuracy(NamedTuple):
@@ -88,12 +101,9 @@ class Rows(NamedTuple):
         """Return the derivative of the residual, times the roots of the weights, (3 M, P)."""
         with torch.no_grad():
             tangents = problem.tangents(torch.from_numpy(theta).to(self.q))
-            J = (
-                chain.geometry_jacobian(self.q, tangents)
-                .unflatten(1, (-1, 3))
-                .numpy()[self.seen]
-            )
-            return (np.sqrt(self.weights)[:, None, None] * J).reshape(-1, theta.size)
+            J = chain.geometry_jacobian(self.q, tangents).unflatten(1, (-1, 3))
+        J = J.numpy()[self.seen] * np.sqrt(self.weights)[:, None, None]
+        return J.reshape(-1, theta.size)
 
     def rmse(self, chain: Chain) -> float:
         """Return the root mean square tip distance of a chain [m]."""
@@ -158,47 +168,54 @@ def solve(
     """Return a fit that alternates least squares and the noise level, the weight of the prior."""
     weight = rows.weights
     root = np.sqrt(weight)[:, None]
+    floor = 1e-12 * float(problem.chain.reach)
+    robust = loss != "linear"
 
     @lru_cache(1)
-    def known(key: bytes) -> tuple[Chain, NDArray]:
+    def chain_and_residual(key: bytes) -> tuple[Chain, NDArray]:
         chain = problem.chain_at(np.frombuffer(key).copy())
         return chain, rows.residual(chain)
 
-    def residual(theta: NDArray) -> NDArray:
-        return known(theta.tobytes())[1]
-
     def jacobian(theta: NDArray) -> NDArray:
-        return rows.jacobian(problem, theta, known(theta.tobytes())[0])
+        chain, _ = chain_and_residual(theta.tobytes())
+        return rows.jacobian(problem, theta, chain)
+
+    def noise(theta: NDArray) -> float:
+        _, residual = chain_and_residual(theta.tobytes())
+        return max(rows.noise(residual, robust), floor)
 
     def whitened(theta: NDArray, sigma: float) -> NDArray:
-        return np.concatenate(
-            [(root * residual(theta)).ravel() / sigma, theta / problem.prior_std]
-        )
+        _, residual = chain_and_residual(theta.tobytes())
+        prior = theta / problem.prior_std
+        return np.concatenate([(root * residual).ravel() / sigma, prior])
 
     def slope(theta: NDArray, sigma: float) -> NDArray:
         return np.vstack([jacobian(theta) / sigma, np.diag(1.0 / problem.prior_std)])
 
-    floor = 1e-12 * float(problem.chain.reach)
-    robust = loss != "linear"
-    sigma = max(rows.noise(residual(theta), robust), floor)
+    sigma = noise(theta)
     converged = False
-    options: dict[str, Any] = dict.fromkeys(
-        ("ftol", "xtol", "gtol"), accuracy.tolerance
-    )
-    options |= {"jac": slope, "bounds": (problem.low, problem.high), "max_nfev": 100}
-    options |= {
-        "loss": partial(row_loss, weight=weight, loss=loss) if robust else "linear"
-    }
     for _ in range(accuracy.rounds):
-        solution = least_squares(whitened, theta, args=(sigma,), **options)
+        solution = least_squares(
+            whitened,
+            theta,
+            slope,
+            bounds=(problem.low, problem.high),
+            ftol=accuracy.tolerance,
+            xtol=accuracy.tolerance,
+            gtol=accuracy.tolerance,
+            loss=partial(row_loss, weight=weight, loss=loss) if robust else "linear",
+            max_nfev=100,
+            args=(sigma,),
+        )
         theta = solution.x
         converged = solution.status > 0
         previous = sigma
-        sigma = max(rows.noise(residual(theta), robust), floor)
+        sigma = noise(theta)
         if abs(sigma - previous) <= 0.02 * previous:
             break
-    rmse = rows.rmse(known(theta.tobytes())[0])
-    count = float(weight.sum())
-    free = max(3.0 * count - theta.size, 1.0)
-    noise = max(sigma if robust else rmse * (count / free) ** 0.5, floor)
-    return Fit(problem, theta, jacobian(theta), noise, rmse, bool(converged))
+    rmse = rows.rmse(problem.chain_at(theta))
+    if not robust:
+        count = float(weight.sum())
+        n_free = max(3.0 * count - theta.size, 1.0)
+        sigma = max(rmse * (count / n_free) ** 0.5, floor)
+    return Fit(problem, theta, jacobian(theta), sigma, rmse, bool(converged))

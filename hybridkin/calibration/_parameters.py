@@ -3,32 +3,37 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from hybridkin._core.arrays import identity
 from hybridkin._core.rotations import cross_matrix, rotation
 from hybridkin.chains.arc_chain import ALIASES, ArcChain
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.rigid import RigidChain
 
-_Vector = TypeVar("_Vector", NDArray, Tensor)
-
 # Geometry that keeps its sign, and the factor by which it can grow or shrink from its start.
-SCALED: dict[str, float] = {"bending_stiffness": 1e4, "axial_stiffness": 1e4}
-SCALED |= {"radii": 5.0, "lengths": 5.0, "gains": 5.0}
+_FACTORS = {
+    "radii": 5.0,
+    "lengths": 5.0,
+    "gains": 5.0,
+    "bending_stiffness": 1e4,
+    "axial_stiffness": 1e4,
+}
+PRIOR = 0.5
+_WIDEST = 1e6  # a prior of a million natural units has no effect, and is finite
 _SHORTEST = -0.1  # of the robot's length: a marker may sit a little before the end
 
 
 @dataclass(frozen=True, eq=False)
-class _Named:
-    """One parameter of `calibrate`, and how its free directions change an entry of the geometry.
+class Parameter(ABC):
+    """One parameter of `calibrate`, and how its free directions change the geometry.
 
     Attributes
     ----------
@@ -41,8 +46,10 @@ class _Named:
     units : ndarray
         Size of one natural unit of each direction: [m], [rad], [unit of q], or [-] as a fraction
         of its start.
-    kind : tuple of str
+    kinds : tuple of str
         Kind of each unit: "m", "rad", "q" or "-".
+    shape : tuple of int
+        Shape of the user's value of each direction.
     """
 
     name: str
@@ -50,212 +57,212 @@ class _Named:
     start: Tensor
     labels: tuple[str, ...]
     units: NDArray
-    kind: tuple[str, ...]
+    kinds: tuple[str, ...]
+    shape: tuple[int, ...]
 
     @property
     def size(self) -> int:
         """Number of free directions."""
         return len(self.labels)
 
-
-@dataclass(frozen=True, eq=False)
-class Entries(_Named):
-    """Numbers that change along constant directions, each number along at most one of them.
-
-    Numbers that keep their sign (`log`) change by the logarithm of their absolute value, which the
-    bounds refer to. `physical` are the default bounds. The user's value has the entries with the
-    indices `shown`, in `shape`.
-    """
-
-    directions: NDArray  # (numel, size)
-    physical: tuple[ArrayLike, ArrayLike]
-    shown: NDArray
-    shape: tuple[int, ...]
-    log: bool
-
-    def moved(self, part: Tensor) -> Tensor:
+    @abstractmethod
+    def moved(self, theta: Tensor) -> Tensor:
         """Return the entry at a point of the free directions (size,)."""
-        change = (torch.from_numpy(self.directions).to(part) @ part).reshape(
-            self.start.shape
-        )
-        return self.start * torch.exp(change) if self.log else self.start + change
 
-    def tangents(self, part: Tensor) -> Tensor:
+    @abstractmethod
+    def tangents(self, theta: Tensor) -> Tensor:
         """Return the derivatives of `moved`, shape (size, ...)."""
-        slope = (
-            torch.from_numpy(self.directions.T.copy())
-            .to(part)
-            .reshape(-1, *self.start.shape)
-        )
-        return slope * self.moved(part) if self.log else slope
 
-    def bounds(self, bound: tuple[float, float] | None) -> tuple[NDArray, NDArray]:
-        """Return the limits of the free directions, by default the physical ones."""
-        origin = self.start.numpy().ravel()[self.shown]
-        if self.log:
-            origin = np.abs(origin)
-        low, high = self.physical if bound is None else bound
-        if bound is None:  # the start itself is always allowed
-            low = np.minimum(low, origin)
-            high = np.maximum(high, origin)
-        if not np.all(np.less(low, high)) or (self.log and np.any(np.less(low, 0.0))):
-            need = (
-                "(low, high) with low < high" + ", and must not be negative" * self.log
-            )
-            raise ValueError(f"`bounds` of {self.name!r} must be {need}, got {bound}.")
-        if not self.log:
-            return (low - origin) / self.units, (high - origin) / self.units
-        with np.errstate(divide="ignore"):
-            return np.log(low / origin), np.log(high / origin)
+    @abstractmethod
+    def bounds(self) -> tuple[NDArray, NDArray]:
+        """Return the physical limits of the free directions; the start is within them."""
 
+    @abstractmethod
     def value(self, entry: Tensor) -> Tensor:
         """Return the part of the entry that this parameter stands for."""
-        return entry.flatten()[
-            torch.as_tensor(self.shown, device=entry.device)
-        ].reshape(self.shape)
 
     def std_errors(self, std: NDArray, value: NDArray) -> NDArray:
         """Return the standard errors of `value` from those of the free directions."""
-        error = (np.abs(self.directions) @ std)[self.shown].reshape(self.shape)
-        return error * np.abs(value) if self.log else error
-
-    def flags(self, identified: NDArray) -> NDArray:
-        """Return for each entry of `value` whether the directions that change it are identified."""
-        flags = ~((self.directions != 0) & ~identified).any(axis=1)
-        return flags[self.shown].reshape(self.shape)
+        return (self.units * std).reshape(self.shape)
 
 
-class Posed(_Named):
-    """A pose that changes by a rotation vector and a translation, both in the measuring frame.
+@dataclass(frozen=True, eq=False)
+class Shifts(Parameter):
+    """Numbers that change by addition along constant directions.
 
-    It has the same methods as `Entries`.
+    Direction k changes the number with the index ``shown[k]``, and maybe others with it. `low` and
+    `high` are the default bounds.
     """
 
-    def moved(self, part: Tensor) -> Tensor:
-        turned = rotation(part[:3])[0] @ self.start[:3, :3]
-        position = self.start[:3, 3] + part[3:] * torch.from_numpy(self.units[3:]).to(
-            part
+    directions: Tensor  # (numel, size)
+    shown: NDArray
+    low: float
+    high: float
+
+    def moved(self, theta: Tensor) -> Tensor:
+        return self.start + self._change(theta)
+
+    def tangents(self, theta: Tensor) -> Tensor:
+        return self.directions.to(theta).T.reshape(-1, *self.start.shape)
+
+    def _change(self, theta: Tensor) -> Tensor:
+        return (self.directions.to(theta) @ theta).reshape(self.start.shape)
+
+    def bounds(self) -> tuple[NDArray, NDArray]:
+        origin = self.start.numpy().ravel()[self.shown]
+        low = (self.low - origin) / self.units
+        high = (self.high - origin) / self.units
+        return np.minimum(low, 0.0), np.maximum(high, 0.0)
+
+    def value(self, entry: Tensor) -> Tensor:
+        shown = torch.as_tensor(self.shown, device=entry.device)
+        return entry.flatten()[shown].reshape(self.shape)
+
+
+class Factors(Shifts):
+    """Numbers that keep their sign: they change by the logarithm of their absolute value.
+
+    The limits are those of the factor.
+    """
+
+    def moved(self, theta: Tensor) -> Tensor:
+        return self.start * torch.exp(self._change(theta))
+
+    def tangents(self, theta: Tensor) -> Tensor:
+        return super().tangents(theta) * self.moved(theta)
+
+    def bounds(self) -> tuple[NDArray, NDArray]:
+        low = np.full(self.size, np.log(self.low))
+        high = np.full(self.size, np.log(self.high))
+        return low, high
+
+    def std_errors(self, std: NDArray, value: NDArray) -> NDArray:
+        return super().std_errors(std, value) * np.abs(value)
+
+
+class Pose(Parameter):
+    """A pose that changes by a rotation vector and a translation, both in the measuring frame."""
+
+    def moved(self, theta: Tensor) -> Tensor:
+        turned = rotation(theta[:3])[0] @ self.start[:3, :3]
+        position = self.start[:3, 3] + theta[3:] * torch.from_numpy(self.units[3:]).to(
+            theta
         )
         pose = torch.cat([turned, position[:, None]], dim=1)
         return torch.cat([pose, self.start[3:]], dim=0)
 
-    def tangents(self, part: Tensor) -> Tensor:
-        turned, left = rotation(part[:3])
+    def tangents(self, theta: Tensor) -> Tensor:
+        turned, left = rotation(theta[:3])
         tangents = self.start.new_zeros(6, 4, 4)
         # Spins about the columns of the left Jacobian.
         tangents[:3, :3, :3] = cross_matrix(left.T) @ (turned @ self.start[:3, :3])
-        tangents[3:, :3, 3] = torch.diag(torch.from_numpy(self.units[3:]).to(part))
+        tangents[3:, :3, 3] = torch.diag(torch.from_numpy(self.units[3:]))
         return tangents
 
-    def bounds(self, bound: tuple[float, float] | None) -> tuple[NDArray, NDArray]:
-        if bound is not None:
-            raise ValueError(
-                f"`bounds` cannot hold {self.name!r}; use `prior={{{self.name!r}: ...}}` instead."
-            )
+    def bounds(self) -> tuple[NDArray, NDArray]:
         return np.full(6, -np.inf), np.full(6, np.inf)
 
     def value(self, entry: Tensor) -> Tensor:
         return entry
 
-    def std_errors(self, std: NDArray, value: NDArray) -> NDArray:
-        return std * self.units
-
-    def flags(self, identified: NDArray) -> NDArray:
-        return identified
-
-
-Parameter = Entries | Posed
-
 
 def parameter_names(chain: Chain) -> list[str]:
     """Return the names that `calibrate` accepts for a chain."""
-    aliases = ALIASES if isinstance(chain, ArcChain) else ()
-    return [*chain.geometry(), *aliases]
+    names = [*chain.geometry()]
+    if isinstance(chain, ArcChain):
+        names += ALIASES
+    return names
 
 
 def parameter(chain: Chain, name: str) -> Parameter:
-    """Return the free directions of one parameter, at the chain's present geometry."""
+    """Return one parameter at the chain's present geometry."""
     geometry = {key: value.detach().cpu() for key, value in chain.geometry().items()}
-    entry = name if name in geometry else ALIASES[name]
+    entry = name
+    if name not in geometry:
+        entry = ALIASES[name]
     start = geometry[entry]
-    reach = float(chain.reach)
-    shape = tuple(start.shape)
-    size = start.numel()
-    if name == "base":
-        labels = tuple(
-            f"base[{axis}]" for axis in ("rot x", "rot y", "rot z", "x", "y", "z")
-        )
+    if entry == "base":
+        reach = float(chain.reach)
         units = np.array([1.0, 1.0, 1.0, reach, reach, reach])
-        return Posed(name, name, start, labels, units, (*("rad",) * 3, *("m",) * 3))
-    unit = reach
-    kind = "m"
-    physical = (-np.inf, np.inf)
-    origin = np.abs(start.numpy().ravel())
-    joints = chain.units if isinstance(chain, RigidChain) else []
-    kinds = tuple(joints) if entry == "joint_zeros" else ()
-    if entry in SCALED:
-        unit = 1.0
-        kind = "-"
-        physical = origin / SCALED[entry], origin * SCALED[entry]
-    elif entry == "rest_bends":
-        unit = 1.0
-        kind = "rad"
-        physical = (-math.pi, math.pi)
-    elif entry == "angles":
-        unit = 1.0
-        kind = "rad"
-    elif entry == "offsets":
-        physical = (_SHORTEST * reach, np.inf)
-    elif kinds:
-        unit = np.where(np.array(kinds) == "m", reach, 1.0)
-    elif entry == "tendon_zeros":
-        unit = float(geometry["radii"].mean())
-    elif entry == "actuator_zeros":
-        unit = float(geometry["radii"].mean() / geometry["gains"].abs().mean())
-        kind = "m" if (geometry["gains"] == 1.0).all() else "q"
-    directions = unit * np.eye(size)
-    shown = np.arange(size)
-    if name == "turns" and isinstance(
-        chain, ArcChain
-    ):  # each segment's actuators together
+        axes = ("rot x", "rot y", "rot z", "x", "y", "z")
+        labels = tuple(f"base[{axis}]" for axis in axes)
+        kinds = ("rad", "rad", "rad", "m", "m", "m")
+        return Pose(name, entry, start, labels, units, kinds, (6,))
+    shape = tuple(start.shape)
+    directions = np.eye(start.numel())
+    shown = np.arange(start.numel())
+    if name == "turns" and isinstance(chain, ArcChain):
         counts = np.array(chain.actuators_per_segment)
         directions = np.repeat(np.eye(len(counts)), counts, axis=0)
         shown = np.cumsum(counts) - counts
         shape = (len(counts),)
-    elif name == "gain":  # a common factor
-        directions = np.ones((size, 1))
+    elif name == "gain":
+        directions = np.ones((start.numel(), 1))
         shown = shown[:1]
         shape = ()
-        physical = origin[:1] / SCALED[entry], origin[:1] * SCALED[entry]
-    elif name != entry:  # "tool", the last of the offsets
+    elif name != entry:  # "tool"
         directions = directions[:, -1:]
         shown = shown[-1:]
         shape = ()
-    labels = _labels(name, shape)
-    size = len(shown)
-    basic = (
+    unit, kind, low, high = _scale(chain, geometry, entry)
+    units = np.broadcast_to(unit, len(shown))
+    form = Factors if entry in _FACTORS else Shifts
+    return form(
         name,
         entry,
         start,
-        labels,
-        np.broadcast_to(unit, size),
-        kinds or (kind,) * size,
+        _labels(name, shape),
+        units,
+        tuple(np.broadcast_to(kind, len(shown)).tolist()),
+        shape,
+        torch.from_numpy(directions * units),
+        shown,
+        low,
+        high,
     )
-    return Entries(*basic, directions, physical, shown, shape, log=entry in SCALED)
+
+
+class _Scale(NamedTuple):
+    """Natural unit of an entry, the kind of this unit, and the physical limits of its numbers."""
+
+    unit: ArrayLike
+    kind: str | list[str]
+    low: float = -math.inf
+    high: float = math.inf
+
+
+def _scale(chain: Chain, geometry: Mapping[str, Tensor], entry: str) -> _Scale:
+    reach = float(chain.reach)
+    if entry in _FACTORS:
+        return _Scale(1.0, "-", 1.0 / _FACTORS[entry], _FACTORS[entry])
+    if entry == "rest_bends":
+        return _Scale(1.0, "rad", -math.pi, math.pi)
+    if entry == "angles":
+        return _Scale(1.0, "rad")
+    if entry == "offsets":
+        return _Scale(reach, "m", low=_SHORTEST * reach)
+    if entry == "joint_zeros" and isinstance(chain, RigidChain):
+        kinds = list(chain.units)
+        return _Scale(np.where(np.array(kinds) == "m", reach, 1.0), kinds)
+    if entry == "tendon_zeros":
+        return _Scale(float(geometry["radii"].mean()), "m")
+    if entry == "actuator_zeros":
+        gains = geometry["gains"]
+        kind = "m" if (gains == 1.0).all() else "q"
+        return _Scale(float(geometry["radii"].mean() / gains.abs().mean()), kind)
+    return _Scale(reach, "m")
 
 
 def _labels(name: str, shape: tuple[int, ...]) -> tuple[str, ...]:
-    if len(shape) == 2 and shape[1] in (2, 3):
-        return tuple(
-            f"{name}[{k}, {axis}]"
-            for k in range(shape[0])
-            for axis in "xyz"[: shape[1]]
-        )
     if not shape:
         return (name,)
-    return tuple(
-        f"{name}[{', '.join(map(str, index))}]" for index in np.ndindex(*shape)
-    )
+    labels = []
+    for index in np.ndindex(*shape):
+        words = [str(i) for i in index]
+        if len(shape) == 2 and shape[1] in (2, 3):
+            words[1] = "xyz"[index[1]]
+        labels.append(f"{name}[{', '.join(words)}]")
+    return tuple(labels)
 
 
 @dataclass(frozen=True, eq=False)
@@ -269,56 +276,63 @@ class Problem:
     high: NDArray
 
     @classmethod
-    def of(
-        cls,
-        chain: Chain,
-        names: tuple[str, ...],
-        bounds: Mapping[str, tuple[float, float]],
-        prior: Mapping[str, float],
-    ) -> Problem:
-        """Return the problem for these names, with limits and priors from the user's."""
+    def of(cls, chain: Chain, names: tuple[str, ...], prior: float = PRIOR) -> Problem:
+        """Return the problem for these names; the priors have the same standard deviation."""
         parameters = tuple(parameter(chain, name) for name in names)
-        limits = [part.bounds(bounds.get(part.name)) for part in parameters]
-        stds = [np.full(part.size, prior[part.name]) for part in parameters]
-        low, high = (np.concatenate(side) for side in zip(*limits, strict=True))
-        return cls(chain, parameters, np.concatenate(stds), low, high)
+        lows = []
+        highs = []
+        for part in parameters:
+            low, high = part.bounds()
+            lows.append(low)
+            highs.append(high)
+        low = np.concatenate(lows)
+        return cls(
+            chain,
+            parameters,
+            np.full(len(low), min(prior, _WIDEST)),
+            low,
+            np.concatenate(highs),
+        )
+
+    def places(self) -> Iterator[tuple[Parameter, slice]]:
+        """Yield every parameter, and its place in theta."""
+        first = 0
+        for part in self.parameters:
+            yield part, slice(first, first + part.size)
+            first += part.size
 
     @property
     def labels(self) -> tuple[str, ...]:
         """Names of all free directions."""
         return tuple(label for part in self.parameters for label in part.labels)
 
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Kinds of the units of all free directions."""
+        return tuple(kind for part in self.parameters for kind in part.kinds)
+
     def start(self, scale: float) -> NDArray:
         """Return the start with all radii times a factor, clipped to the limits."""
-        logs = [
-            np.log(scale) if part.name == "radii" else 0.0 for part in self.parameters
-        ]
-        sizes = [part.size for part in self.parameters]
-        return np.clip(np.repeat(logs, sizes), self.low, self.high)
-
-    def parts(self, theta: _Vector) -> list[_Vector]:
-        """Return theta (P,), split by parameters."""
-        ends = np.cumsum([part.size for part in self.parameters])
-        starts = [0, *ends[:-1]]
-        return [theta[a:b] for a, b in zip(starts, ends, strict=True)]
+        theta = np.zeros(len(self.low))
+        for part, place in self.places():
+            if part.name == "radii":
+                theta[place] = np.log(scale)
+        return np.clip(theta, self.low, self.high)
 
     def chain_at(self, theta: NDArray) -> Chain:
         """Return the chain at theta (P,), without a graph."""
         with torch.no_grad():
-            return self.moved(torch.from_numpy(theta).to(self.chain.geometry()["base"]))
-
-    def moved(self, theta: Tensor) -> Chain:
-        """Return the chain at theta (P,), differentiable in it."""
-        pairs = zip(self.parameters, self.parts(theta), strict=True)
-        return self.chain.with_geometry(
-            **{part.entry: part.moved(at) for part, at in pairs}
-        )
+            at = torch.from_numpy(theta).to(self.chain.geometry()["base"])
+            geometry = {}
+            for part, place in self.places():
+                geometry[part.entry] = part.moved(at[place])
+            return self.chain.with_geometry(**geometry)
 
     def tangents(self, theta: Tensor) -> dict[str, Tensor]:
         """Return the derivatives of the geometry by theta, (P, ...) for every changed entry."""
-        rows = self.parts(identity(len(theta), theta))
-        pairs = zip(self.parameters, self.parts(theta), rows, strict=True)
-        return {
-            part.entry: torch.tensordot(own.mT, part.tangents(at), 1)
-            for part, at, own in pairs
-        }
+        tangents = {}
+        for part, place in self.places():
+            of_entry = theta.new_zeros(len(theta), *part.start.shape)
+            of_entry[place] = part.tangents(theta[place])
+            tangents[part.entry] = of_entry
+        return tangents

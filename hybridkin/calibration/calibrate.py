@@ -5,9 +5,8 @@ from __future__ import annotations
 import copy
 import difflib
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from types import NoneType
 from typing import Any
 
 import numpy as np
@@ -21,13 +20,14 @@ from hybridkin._core.arrays import (
     as_tensor,
     check_shape,
     labels,
+    number,
     one_of,
 )
 from hybridkin._core.distinct import distinct_rows
 from hybridkin._core.model import Portable
 from hybridkin._core.units import motion_message
 from hybridkin.calibration._least_squares import HELD_OUT, LOSSES, Fit, Rows, solve
-from hybridkin.calibration._parameters import ALIASES, parameter_names
+from hybridkin.calibration._parameters import PRIOR, parameter_names
 from hybridkin.calibration._search import Start, search
 from hybridkin.calibration._unidentified import sentences
 from hybridkin.calibration.measured import (
@@ -36,6 +36,7 @@ from hybridkin.calibration.measured import (
     points,
     with_missing_markers,
 )
+from hybridkin.chains.arc_chain import ALIASES
 from hybridkin.chains.chain import Chain
 
 __all__ = ["CalibrationResult", "calibrate"]
@@ -113,14 +114,19 @@ class CalibrationResult(Portable):
             lines.append(f"    std. error {_shown(self.std_errors[name])}")
         if self.unidentified:
             lines.append("  Not identified by the data, the values are from the prior:")
-            lines += [f"    {sentence}" for sentence in self.unidentified]
+        for sentence in self.unidentified:
+            lines.append(f"    {sentence}")
         return "\n".join(lines)
 
 
 def _shown(value: Numbers) -> str:
     array = np.asarray(value)
-    rows = array[:3].reshape(3, 4) if array.shape == (4, 4) else np.atleast_2d(array)
-    return "; ".join(" ".join(f"{entry:.4g}" for entry in row) for row in rows)
+    if array.shape == (4, 4):
+        array = array[:3]
+    rows = []
+    for row in np.atleast_2d(array):
+        rows.append(" ".join(f"{entry:.4g}" for entry in row))
+    return "; ".join(rows)
 
 
 def calibrate(
@@ -130,8 +136,7 @@ def calibrate(
     parameters: Sequence[str] = ("radii", "base"),
     *,
     loss: str = "linear",
-    bounds: Mapping[str, tuple[float, float]] | None = None,
-    prior: float | Mapping[str, float] = 0.5,
+    prior: float = PRIOR,
     groups: ArrayLike | None = None,
     sample_weight: Numbers | None = None,
 ) -> CalibrationResult:
@@ -164,16 +169,14 @@ def calibrate(
     loss : {"linear", "soft_l1", "huber", "cauchy", "arctan"}, default="linear"
         All but "linear" bound the influence of outliers: ``rho(|e|^2 / 3)`` of SciPy's
         ``least_squares``, with the distance ``|e|`` of a row over the noise, times its weight.
-    bounds : dict of str to (low, high), optional
-        Limits of all entries of a name, in its own unit; for gains limits of their absolute value.
-        Default: a factor of 5 on radii, lengths and gains and of 10 000 on stiffnesses, half a
-        turn on rest bends, and offsets above minus a tenth of the robot's length.
-    prior : float or dict of str to float, default=0.5
+    prior : float, default=0.5
         Standard deviation of the weak prior in natural units: a fraction of the start for radii,
         lengths, gains and stiffnesses; of the mean radius (over the mean gain if q is not a length)
         for actuator and tendon zeros; of the robot's length for "offsets", "links", "tool", zeros
         of sliding joints and the base position; radians for angles, rest bends, zeros of turning
-        joints and the base orientation. ``inf`` turns it off.
+        joints and the base orientation. ``inf`` turns it off. Values also stay within a factor of 5
+        of the start for radii, lengths and gains and of 10 000 for stiffnesses, half a turn for
+        rest bends, and above minus a tenth of the robot's length for offsets.
     groups : array-like of shape (N,), optional
         Motion of every row; required for `cv_rmse` on held-out motions.
     sample_weight : array-like of shape (N,), optional
@@ -214,7 +217,7 @@ def calibrate(
     tensor([0.0500, 0.0400], dtype=torch.float64)
     """
     result, messages = fit_geometry(
-        chain, q, x, parameters, loss, bounds, prior, groups, sample_weight
+        chain, q, x, parameters, loss, prior, groups, sample_weight
     )
     for message in messages:
         warnings.warn(message, stacklevel=2)
@@ -227,8 +230,7 @@ def fit_geometry(
     x: Numbers,
     parameters: Sequence[str],
     loss: str = "linear",
-    bounds: Mapping[str, tuple[float, float]] | None = None,
-    prior: float | Mapping[str, float] = 0.5,
+    prior: float = PRIOR,
     groups: ArrayLike | None = None,
     sample_weight: Numbers | None = None,
     start: Start | None = None,
@@ -242,34 +244,40 @@ def fit_geometry(
             "`chain` must be a ConstantCurvatureChain, an ElasticTendonChain, a RigidChain or "
             f"another Chain, got {type(chain).__name__}."
         )
-    names = _check_parameters(chain, parameters, bounds, prior)
+    names = _check_parameters(chain, parameters)
+    prior = number(prior, "prior")
+    if not prior > 1.0 / LARGEST:
+        need = f"must be a positive standard deviation, over {1.0 / LARGEST:g}"
+        raise ValueError(f"`prior` {need}, got {prior}.")
     one_of(loss, "loss", LOSSES)
-    torch_given = isinstance(q, Tensor)
+    returns_tensors = isinstance(q, Tensor)
     device = chain.geometry()["base"].device
     chain = copy.deepcopy(chain).cpu()  # the solver runs on the CPU, without a graph
-    q, x, messages = check_data(chain, q, x)
+    q, x, unit_messages = check_data(chain, q, x)
     if groups is not None:
         groups = labels(groups, len(q))
     weights = _check_weights(sample_weight, q)
     first, counts, _ = distinct_rows(q, x, weights, groups)
     if counts is None:
-        weights = q.new_ones(len(first))
-    else:
-        weights = torch.from_numpy(counts).to(q)
-    rows = Rows(q[first], x[first], weights)
+        counts = np.ones(len(first))
+    rows = Rows(q[first], x[first], torch.from_numpy(counts).to(q))
     if start is None:
-        stds = prior if isinstance(prior, Mapping) else dict.fromkeys(names, prior)
-        stds = {name: float(stds.get(name, 0.5)) for name in names}
-        start = search(chain, rows, names, loss, bounds or {}, stds)
+        start = search(chain, rows, names, loss, prior)
     best = solve(start.problem, rows, start.theta, loss)
-    unphysical, left = _unphysical(best)
-    messages += [start.message, _few(best, rows), left, best.chain().contradiction(q)]
-    if not any(messages[:-4]):  # of the units
+    unphysical, unphysical_message = _unphysical(best)
+    messages = [
+        *unit_messages,
+        start.message,
+        _few(best, rows),
+        unphysical_message,
+        best.chain().contradiction(q),
+    ]
+    if not unit_messages:
         messages.append(_unexplained(best, rows))
     cv_rmse = None
     if groups is not None:
         cv_rmse = _cross_validate(best, rows, groups[first], loss)
-    result = _result(best, rows, cv_rmse, unphysical, torch_given)
+    result = _result(best, rows, cv_rmse, unphysical, returns_tensors)
     result.chain.to(device)
     return result, [message for message in messages if message is not None]
 
@@ -281,9 +289,9 @@ def refitted(start: Start, q: Tensor, x: Tensor, weights: Tensor) -> Chain:
     spaced ones determine the few parameters.
     """
     like = start.problem.chain.geometry()["base"]
-    rows = Rows(*(part.to(like) for part in (q, x, weights)))
-    some = rows.take(evenly_spaced(len(q), _ENOUGH))
-    return solve(start.problem, some, start.theta, "linear", HELD_OUT).chain()
+    rows = Rows(q.to(like), x.to(like), weights.to(like))
+    rows = rows.take(evenly_spaced(len(q), _ENOUGH))
+    return solve(start.problem, rows, start.theta, "linear", HELD_OUT).chain()
 
 
 def _few(fit: Fit, rows: Rows) -> str | None:
@@ -300,47 +308,48 @@ def _few(fit: Fit, rows: Rows) -> str | None:
 
 def _unexplained(fit: Fit, rows: Rows) -> str | None:
     """Return a warning if the median residual is large, which a few outliers cannot cause."""
-    left = np.median(np.linalg.norm(rows.residual(fit.chain()), axis=1))
-    around = points((rows.x - rows.x.nanmedian(dim=0).values).numpy())[rows.seen]
-    spread = np.median(np.linalg.norm(around, axis=1))
-    if len(rows.x) < _FEW or not 0 < _LEFT * spread < left:
+    residual = np.median(np.linalg.norm(rows.residual(fit.chain()), axis=1))
+    centred = points((rows.x - rows.x.nanmedian(dim=0).values).numpy())[rows.seen]
+    spread = np.median(np.linalg.norm(centred, axis=1))
+    if len(rows.x) < _FEW or not 0 < _LEFT * spread < residual:
         return None
     return (
-        f"the calibrated model has a median residual of {1e3 * left:.3g} mm, but the tip moves by "
-        f"only {1e3 * spread:.3g} mm. Order or sign of the columns of `q`, or the description of "
-        "the robot, may be wrong: datasets.check_log(Log(q, x), chain=chain) looks for better ones."
+        f"the calibrated model has a median residual of {1e3 * residual:.3g} mm, but the tip moves "
+        f"by only {1e3 * spread:.3g} mm. Order or sign of the columns of `q`, or the description "
+        "of the robot, may be wrong: datasets.check_log(Log(q, x), chain=chain) looks for better "
+        "ones."
     )
 
 
 def _unphysical(fit: Fit) -> tuple[tuple[str, ...], str | None]:
     """Return the parameters at a bound or outside the physical range, and a warning."""
     problem = fit.problem
-    names = {}
-    words = []
-    pieces = map(problem.parts, (fit.theta, problem.low, problem.high))
-    for part, *values in zip(problem.parameters, *pieces, strict=True):
-        n = len(words)
-        for label, at, low, high in zip(part.labels, *values, strict=True):
-            if min(at - low, high - at) < 1e-6:
-                side = "lower" if at - low < high - at else "upper"
-                words.append(f"{label} is at its {side} bound")
-            if part.name in _MEASURED and abs(at) > np.log(_UNPHYSICAL):
-                words.append(f"{label} is {np.exp(at):.2g} times its start")
+    problems = []
+    for part, place in problem.places():
+        theta = fit.theta[place]
+        below = theta - problem.low[place]
+        above = problem.high[place] - theta
+        for k, label in enumerate(part.labels):
+            if min(below[k], above[k]) < 1e-6:
+                side = "lower" if below[k] < above[k] else "upper"
+                problems.append((part.name, f"{label} is at its {side} bound"))
+            if part.name in _MEASURED and abs(theta[k]) > np.log(_UNPHYSICAL):
+                times = f"{np.exp(theta[k]):.2g} times its start"
+                problems.append((part.name, f"{label} is {times}"))
         if part.entry == "offsets":
-            before, after = (
-                c.geometry()["offsets"] for c in (problem.chain, fit.chain())
-            )
-            worse = (before - after > 1e-3 * part.units[0]) & (
-                after < -0.02 * part.units[0]
-            )
-            for k in worse.nonzero().flatten().tolist():
-                label = "tool" if part.name == "tool" else part.labels[k]
-                words.append(f"{label} is {1e3 * float(after[k]):.3g} mm")
-        names[part.name] = len(words) > n
-    if not words:
+            before = part.value(part.start).reshape(-1)
+            after = part.value(fit.chain().geometry()["offsets"]).reshape(-1)
+            for k, label in enumerate(part.labels):
+                shorter = float(before[k] - after[k]) > 1e-3 * part.units[k]
+                if shorter and float(after[k]) < -0.02 * part.units[k]:
+                    length = f"{1e3 * float(after[k]):.3g} mm"
+                    problems.append((part.name, f"{label} is {length}"))
+    if not problems:
         return (), None
-    return tuple(name for name, left in names.items() if left), (
-        f"calibration gave unphysical values: {'; '.join(words)}. Check the units and the start, "
+    names = dict.fromkeys(name for name, _ in problems)
+    words = "; ".join(problem for _, problem in problems)
+    return tuple(names), (
+        f"calibration gave unphysical values: {words}. Check the units and the start, "
         "narrow the `prior`, or fit fewer `parameters`; the robot may have effects that this model "
         "does not describe (slack tendons, gravity, twist)."
     )
@@ -351,34 +360,31 @@ def _result(
     rows: Rows,
     cv_rmse: float | None,
     unphysical: tuple[str, ...],
-    torch_given: bool,
+    returns_tensors: bool,
 ) -> CalibrationResult:
     problem = fit.problem
     chain = fit.chain()
     prior_std = problem.prior_std
     # Singular values of J in units of the prior; those of J'J would lose small ones to rounding.
-    J = fit.jacobian * prior_std
-    _, narrowed, directions = np.linalg.svd(
-        J / fit.noise, full_matrices=len(J) < J.shape[1]
-    )
+    J = fit.jacobian * prior_std / fit.noise
+    _, narrowed, directions = np.linalg.svd(J, full_matrices=len(J) < J.shape[1])
     narrowed = np.pad(narrowed, (0, len(prior_std) - narrowed.size))
     factor = prior_std[:, None] * directions.T / np.sqrt(narrowed**2 + 1.0)
     covariance = factor @ factor.T
     std = np.sqrt(np.diag(covariance))
-    safe = np.where(std > 0, std, 1.0)
-    geometry = {name: value.detach() for name, value in chain.geometry().items()}
+    identified = std < _IDENTIFIED * prior_std
     values = {}
     std_errors = {}
     identifiable = {}
-    pieces = (problem.parts(part) for part in (std, std < _IDENTIFIED * prior_std))
-    for part, error, identified in zip(problem.parameters, *pieces, strict=True):
-        value = part.value(geometry[part.entry])
-        # For one gain a plain number.
-        error = np.asarray(part.std_errors(error, value.numpy()))
-        values[part.name] = value if torch_given else value.numpy()
-        std_errors[part.name] = torch.from_numpy(error) if torch_given else error
-        identifiable[part.name] = np.asarray(part.flags(identified))
+    for part, place in problem.places():
+        value = part.value(chain.geometry()[part.entry].detach())
+        errors = np.asarray(part.std_errors(std[place], value.numpy()))
+        identifiable[part.name] = identified[place].reshape(part.shape)
+        values[part.name] = value if returns_tensors else value.numpy()
+        std_errors[part.name] = torch.from_numpy(errors) if returns_tensors else errors
     unidentified = directions[narrowed * _IDENTIFIED < 1.0]
+    n_rows = float(rows.weights.sum())
+    safe = np.where(std > 0, std, 1.0)
     return CalibrationResult(
         chain=chain,
         values=values,
@@ -388,9 +394,7 @@ def _result(
         narrowing=prior_std / safe,
         identifiable=identifiable,
         singular_values=narrowed,
-        unidentified=sentences(
-            fit, unidentified, covariance, float(rows.weights.sum())
-        ),
+        unidentified=sentences(fit, unidentified, covariance, n_rows),
         unphysical=unphysical,
         rmse=fit.rmse,
         cv_rmse=cv_rmse,
@@ -407,45 +411,30 @@ def _cross_validate(best: Fit, rows: Rows, groups: NDArray, loss: str) -> float:
     return float(np.sqrt(squares / float(rows.weights.sum())))
 
 
-def _check_parameters(
-    chain: Chain,
-    parameters: Sequence[str],
-    bounds: Mapping | None,
-    prior: float | Mapping,
-) -> tuple[str, ...]:
+def _check_parameters(chain: Chain, parameters: Sequence[str]) -> tuple[str, ...]:
     names = (parameters,) if isinstance(parameters, str) else tuple(parameters)
     available = parameter_names(chain)
-    unknown = [name for name in names if name not in available]
+    unknown = [str(name) for name in names if name not in available]
     if unknown or not names or len(set(names)) < len(names):
-        close = [difflib.get_close_matches(str(name), available, 1) for name in unknown]
-        hint = "".join(f"; did you mean {near[0]!r}?" for near in close[:1] if near)
+        hint = "."
+        if unknown and (near := difflib.get_close_matches(unknown[0], available, 1)):
+            hint = f"; did you mean {near[0]!r}?"
         raise ValueError(
             f"`parameters` must name different entries of {available} for this chain, got "
-            f"{names}{hint or '.'}"
+            f"{names}{hint}"
         )
     for alias, entry in ALIASES.items():
-        if {alias, entry} <= set(names):
+        if alias in names and entry in names:
             raise ValueError(
                 f"`parameters` must not hold both {entry!r} and {alias!r}, which is a part of it; "
                 f"leave {alias!r} out."
             )
-    if not isinstance(bounds, (Mapping, NoneType)):
-        raise TypeError(f"`bounds` must map names to (low, high), got {bounds!r:.80}.")
-    for argument, given in (("bounds", bounds), ("prior", prior)):
-        if isinstance(given, Mapping) and not set(given) <= set(names):
-            raise ValueError(
-                f"`{argument}` must name only {names}, got {sorted(given)}."
-            )
-    stds = list(prior.values()) if isinstance(prior, Mapping) else [prior]
-    if not all(std > 1.0 / LARGEST for std in stds):
-        need = f"must be positive standard deviations, over {1.0 / LARGEST:g}"
-        raise ValueError(f"`prior` {need}, got {prior}.")
     return names
 
 
 def check_data(
     chain: Chain, q: Numbers, x: Numbers
-) -> tuple[Tensor, Tensor, list[str | None]]:
+) -> tuple[Tensor, Tensor, list[str]]:
     """Return the data as tensors in the dtype of the chain, and warnings about their units."""
     dtype = chain.geometry()["base"].dtype
     q = as_tensor(q, "q").to("cpu", dtype)
@@ -458,14 +447,11 @@ def check_data(
     x = torch.from_numpy(with_missing_markers(x.numpy(force=True), "x"))
     predicted = chain(q)
     measured = torch.where(x.isnan(), predicted, x)
-    return (
-        q,
-        x,
-        [
-            *messages,
-            motion_message("x", measured, predicted, float(chain.reach.detach())),
-        ],
-    )
+    reach = float(chain.reach.detach())
+    motion = motion_message("x", measured, predicted, reach)
+    if motion is not None:
+        messages = [*messages, motion]
+    return q, x, messages
 
 
 def _check_weights(sample_weight: Numbers | None, q: Tensor) -> Tensor:

@@ -83,9 +83,9 @@ class Errors(NamedTuple):
 
     def known(self) -> dict[str, float]:
         """Return the errors by name, without those that were not computed."""
-        return {
-            name: error for name, error in self._asdict().items() if not np.isnan(error)
-        }
+        if np.isnan(self.io):
+            return {"cv": self.cv}
+        return {"cv": self.cv, "io": self.io}
 
 
 @dataclass(frozen=True)
@@ -119,12 +119,30 @@ class GeometryChoice:
     rivals: tuple[GeometryChoice, ...] = ()
 
 
-class _Rung(NamedTuple):
-    """One set of parameters."""
+class _Candidate(NamedTuple):
+    """One set of parameters to choose from."""
 
     name: str
     chain: Chain
     parameters: tuple[str, ...]
+
+    @property
+    def free_rings(self) -> set[str]:
+        """The free parameters of the actuator rings that require a search."""
+        names = set(self.parameters)
+        rings = set()
+        if "angles" in names or "turns" in names:
+            rings.add("angles")
+        if "radii" in names and not isinstance(self.chain, ElasticTendonChain):
+            rings.add("radii")
+        return rings
+
+
+class _Split(NamedTuple):
+    """Rows to fit, and rows to predict: held-out motions, or the outer rows."""
+
+    fitted: NDArray
+    predicted: NDArray
 
 
 def choose_geometry(
@@ -178,215 +196,212 @@ def choose_geometry(
     nominal = chain
     chain = copy.deepcopy(chain).cpu()
     q, x, _ = check_data(chain, q, x)
+    order = np.arange(len(q))
     if groups is not None:
         groups = labels(groups, len(q))
-    if groups is None:
-        chosen_rows = np.arange(len(q))
-    else:
-        chosen_rows = np.argsort(groups, kind="stable")
-    chosen_rows = np.sort(chosen_rows[evenly_spaced(len(q), _MOST)])
+        order = np.argsort(groups, kind="stable")
     if weights is None:
-        counts = q.new_ones(len(q))
-    else:
-        counts = as_tensor(weights, "weights").to(q)
-    rows = Rows(q[chosen_rows], x[chosen_rows], counts[chosen_rows])
+        weights = q.new_ones(len(q))
+    chosen = np.sort(order[evenly_spaced(len(q), _MOST)])
+    rows = Rows(q, x, as_tensor(weights, "weights").to(q)).take(chosen)
     with torch.no_grad():
-        rungs = _rungs(chain, q, parameters)
-        tied = () if parameters is not None else unmoved(chain, q)
-    starts = _starts(rungs, rows, loss)
+        candidates = _candidates(chain, q, parameters)
+        messages = () if parameters is not None else unmoved(chain, q)
+    starts = _starts(candidates, rows, loss)
     best = 0
-    errors = {}
     near = []
-    if len(rungs) > 1:
-        motions = None if groups is None else groups[chosen_rows]
-        splits = [(1, *split) for split in _splits(rows, motions)]
-        if outside and len(chosen_rows) >= _FEW:
-            splits.append((0, *inner_and_outer(rows.q.numpy())))
-        rung_errors = [
-            _errors(rung, at, rows, splits, loss)
-            for rung, at in zip(rungs, starts, strict=True)
-        ]
-        free = np.array([0 if at is None else at.theta.size for at in starts])
-        sure = (free <= len(chosen_rows) / _ROWS) | [
-            rung.name in _USUAL for rung in rungs
-        ]
-        enough = free <= len(splits[-1][1]) / _ROWS
-        table = np.maximum(rung_errors, _EXACT * float(chain.reach))
-        best = _best(table, sure, enough)
-        errors = {rung.name: one for rung, one in zip(rungs, rung_errors, strict=True)}
+    errors = {}
+    if len(candidates) > 1:
+        motions = None if groups is None else groups[chosen]
+        splits = _splits(rows, motions)
+        outer = None
+        if outside and len(chosen) >= _FEW:
+            outer = _Split(*inner_and_outer(rows.q.numpy()))
+        for candidate, start in zip(candidates, starts, strict=True):
+            cv = _mean_distance(candidate, start, rows, splits, loss)
+            io = np.nan
+            if outer is not None:
+                io = _mean_distance(candidate, start, rows, [outer], loss)
+            errors[candidate.name] = Errors(cv, io)
+        n_inner = len((outer or splits[-1]).fitted)
+        table = np.maximum([*errors.values()], _EXACT * float(chain.reach))
+        best = _best(table, candidates, starts, len(chosen), n_inner)
         near = np.flatnonzero(~(table > _WORSE * table[best]).any(axis=1)).tolist()
 
     def choice(k: int) -> GeometryChoice:
-        name, chosen, names = rungs[k]
-        if chosen is chain:
-            chosen = nominal
-        return GeometryChoice(chosen, names, starts[k], name, errors, tied)
+        name, chosen_chain, names = candidates[k]
+        if chosen_chain is chain:
+            chosen_chain = nominal
+        return GeometryChoice(chosen_chain, names, starts[k], name, errors, messages)
 
-    rivals = tuple(choice(k) for k in near if k != best and rungs[k].parameters)
-    return replace(choice(best), rivals=rivals)
+    rivals = [choice(k) for k in near if k != best and candidates[k].parameters]
+    return replace(choice(best), rivals=tuple(rivals))
 
 
-def _best(errors: NDArray, sure: NDArray, enough: NDArray) -> int:
-    """Return the index of the chosen one of K sets.
-
-    Parameters
-    ----------
-    errors : ndarray of shape (K, 2)
-        Their `Errors`, smaller sets first.
-    sure : ndarray of bool of shape (K,)
-        Whether all rows suffice for the parameters of a set; else it must be clearly better.
-    enough : ndarray of bool of shape (K,)
-        Whether the inner rows suffice; else `io` is at most that of the last set for which they
-        do, times the ratio of their `cv`.
-    """
+def _best(
+    errors: NDArray,
+    candidates: Sequence[_Candidate],
+    starts: Sequence[Start | None],
+    n_rows: int,
+    n_inner: int,
+) -> int:
+    """Return the index of the chosen one of K sets, with `Errors` (K, 2), smaller sets first."""
+    n_free = np.array([0 if start is None else start.theta.size for start in starts])
+    usual = np.array([candidate.name in _USUAL for candidate in candidates])
     cv, io = errors.T
+    # Where the inner rows do not suffice, `io` is at most that of the last set for which they do.
+    enough = n_free <= n_inner / _ROWS
     last = np.maximum.accumulate(np.where(enough, np.arange(len(cv)), 0))
     io = np.minimum(io, io[last] * cv / cv[last])
-    scores = cv if np.isnan(io).any() else np.cbrt(cv * io**2)
+    scores = cv
+    if not np.isnan(io).any():
+        scores = np.cbrt(cv * io**2)
+    # Sets for which all rows do not suffice must be clearly better.
+    sure = usual | (n_free <= n_rows / _ROWS)
     sure = sure | (scores < _CLEARLY * scores[sure].min(initial=np.inf))
     good = sure & (cv <= _WORSE * cv[sure].min())
     return int(np.argmax(good & (scores <= (1.0 + _EQUAL) * scores[good].min())))
 
 
-def _rungs(chain: Chain, q: Tensor, parameters: Sequence[str] | None) -> list[_Rung]:
+def _candidates(
+    chain: Chain, q: Tensor, parameters: Sequence[str] | None
+) -> list[_Candidate]:
     """Return the sets to choose from, the smaller ones first."""
     elastic = None
     if isinstance(chain, ConstantCurvatureChain) and not any(chain.extensible):
         if chain.contradictory(q).any():
             elastic = ElasticTendonChain.from_chain(chain)
+    elastic_sets = _ELASTIC
     if parameters is not None:
-        names = tuple(parameters)
-        rungs = [_Rung(_name(names), chain, names)]
+        sets = [tuple(parameters)]
         if elastic is not None:
-            elastic_names = elastic.default_parameters
-            # Lengths and radii of a plain chain compensate for slack; elastic tendons keep them.
-            not_elastic = [
-                name
-                for name in names
-                if name not in ("radii", "lengths", "actuator_zeros")
-            ]
-            if names != chain.default_parameters:
-                elastic_names = (
-                    *not_elastic,
-                    *(
-                        name
-                        for name in elastic_names
-                        if name not in ("radii", "lengths", *not_elastic)
-                    ),
-                )
-            rungs.append(_Rung(_RIVAL + _name(elastic_names), elastic, elastic_names))
-        return rungs
-    if not isinstance(chain, ArcChain):
-        sets = ((), chain.default_parameters)
-    elif isinstance(chain, ElasticTendonChain):
-        sets = ((), ("base",), *_ELASTIC)
+            elastic_sets = [_elastic_parameters(chain, elastic, sets[0])]
+    elif not isinstance(chain, ArcChain):
+        sets = [(), chain.default_parameters]
     else:
-        sets = ((), ("base",), *(_EXTENSIBLE if chain.lengths is None else _TENDONS))
-    rungs = [_Rung(_name(names), chain, names) for names in _with_gain(sets, chain)]
+        sets = [(), ("base",)]
+        if isinstance(chain, ElasticTendonChain):
+            sets += _ELASTIC
+        elif chain.lengths is None:
+            sets += _EXTENSIBLE
+        else:
+            sets += _TENDONS
+        if not chain.in_metres:
+            sets = _with_gain(sets)
+            elastic_sets = _with_gain(elastic_sets)
+    candidates = [_Candidate(_name(names), chain, names) for names in sets]
     if elastic is not None:
-        sets = _with_gain(_ELASTIC, chain)
-        rungs += [_Rung(_RIVAL + _name(names), elastic, names) for names in sets]
-    return rungs
+        for names in elastic_sets:
+            candidates.append(_Candidate(_RIVAL + _name(names), elastic, names))
+    return candidates
 
 
-def _with_gain(
-    sets: Sequence[tuple[str, ...]], chain: Chain
-) -> Sequence[tuple[str, ...]]:
-    """Return the sets with the gain beside the radii, if the chain has gains.
+def _elastic_parameters(
+    chain: Chain, elastic: Chain, names: tuple[str, ...]
+) -> tuple[str, ...]:
+    """Return the parameters of elastic tendons in place of those of a plain chain.
+
+    Lengths and radii of a plain chain compensate for slack; elastic tendons keep them.
+    """
+    if names == chain.default_parameters:
+        return elastic.default_parameters
+    both = dict.fromkeys((*names, *elastic.default_parameters))
+    plain = ("radii", "lengths", "actuator_zeros")
+    return tuple(name for name in both if name not in plain)
+
+
+def _with_gain(sets: Sequence[tuple[str, ...]]) -> list[tuple[str, ...]]:
+    """Return the sets with the gain beside the radii.
 
     Tips of tendons determine only their ratio: without the gain, its error moves into the radii.
     """
-    if not isinstance(chain, ArcChain) or chain.in_metres:
-        return sets
     return [(*names, "gain") if "radii" in names else names for names in sets]
 
 
 def _name(names: tuple[str, ...]) -> str:
     words = [name for name in names if name not in _STIFF]
-    words += ["stiffnesses"] if len(words) < len(names) else []
+    if len(words) < len(names):
+        words.append("stiffnesses")
     return " + ".join(words) or "nothing"
 
 
-def _starts(rungs: Sequence[_Rung], rows: Rows, loss: str) -> list[Start | None]:
+def _starts(
+    candidates: Sequence[_Candidate], rows: Rows, loss: str
+) -> list[Start | None]:
     """Return the start of the fit of every set; initial guesses are searched if rings become free.
 
     Other sets start from the previous one; elastic tendons also from a plain chain with the same
     free rings.
     """
     starts: list[Start | None] = []
-    for chain, names, free in (
-        (rung.chain, rung.parameters, _rings(rung)) for rung in rungs
-    ):
-        stds = dict.fromkeys(names, 0.5)
-        near = None
-        far = None
-        enough = False
-        for one, start in zip(rungs, starts, strict=False):
-            if start is not None and one.chain is chain:
-                near = start
-                enough = free <= _rings(one)
-            elif start is not None and ("angles" in free) == ("angles" in _rings(one)):
-                far = start
+    for candidate in candidates:
+        names = candidate.parameters
+        free = candidate.free_rings
+        previous = None
+        plain = None
+        searched = False
+        for other, start in zip(candidates, starts, strict=False):
+            if start is None:
+                continue
+            if other.chain is candidate.chain:
+                previous = start
+                searched = free <= other.free_rings
+            elif ("angles" in free) == ("angles" in other.free_rings):
+                plain = start
         if not names:
             starts.append(None)
-        elif near and enough:
-            starts.append(_refitted([widened(near, names, stds)], rows, loss))
-        elif far is not None:
-            tried = [
-                widened(start, names, stds, True) for start in (near, far) if start
-            ]
+        elif previous is not None and searched:
+            starts.append(_refitted([widened(previous, names)], rows, loss))
+        elif plain is not None:
+            tried = [widened(plain, names, elastic=True)]
+            if previous is not None:
+                tried.insert(0, widened(previous, names))
             starts.append(_refitted(tried, rows, loss))
         else:
-            starts.append(search(chain, rows, names, loss, {}, stds))
+            starts.append(search(candidate.chain, rows, names, loss))
     return starts
-
-
-def _rings(rung: _Rung) -> set[str]:
-    """Return the free parameters of the actuator rings that require a search."""
-    free = {"angles" if name == "turns" else name for name in rung.parameters}
-    return free & (
-        {"angles"}
-        if isinstance(rung.chain, ElasticTendonChain)
-        else {"angles", "radii"}
-    )
 
 
 def _refitted(starts: list[Start], rows: Rows, loss: str) -> Start:
     """Return the start with the smallest error of a rough fit; the first one if nearly equal."""
-    fits = [solve(start.problem, rows, start.theta, loss, ROUGH) for start in starts]
-    best = min(range(len(fits)), key=lambda k: fits[k].rmse * (1.0 + (k > 0) * _ALIKE))
-    return starts[best]._replace(theta=fits[best].theta)
+    best = starts[0]
+    least = np.inf
+    for start in starts:
+        fit = solve(start.problem, rows, start.theta, loss, ROUGH)
+        if fit.rmse * (1.0 + _ALIKE) < least:
+            best = start._replace(theta=fit.theta)
+            least = fit.rmse
+    return best
 
 
-def _splits(rows: Rows, groups: NDArray | None) -> list[tuple[NDArray, NDArray]]:
+def _splits(rows: Rows, groups: NDArray | None) -> list[_Split]:
     """Return folds of motions or rows; for a single motion, of parts of it."""
     n = len(rows.q)
     if groups is not None and len(np.unique(groups)) < 2:
         groups = np.arange(n) * 10 // n
-    return folds(rows.q, groups, _FOLDS, shuffle=True)
+    return [_Split(*split) for split in folds(rows.q, groups, _FOLDS, shuffle=True)]
 
 
-def _errors(
-    rung: _Rung,
+def _mean_distance(
+    candidate: _Candidate,
     start: Start | None,
     rows: Rows,
-    splits: list[tuple[int, NDArray, NDArray]],
+    splits: Sequence[_Split],
     loss: str,
-) -> Errors:
-    """Return the errors of a set; splits are (1, ...) of held-out rows, (0, ...) of outer rows."""
-    totals = np.zeros((2, 2))  # of io and cv: weighted distances, and weights
-    for kind, train, test in splits:
-        chain = rung.chain
-        training = rows.take(train)
-        new = rows.take(test)
+) -> float:
+    """Return the mean tip distance of a set on the predicted rows of splits [m]."""
+    total = 0.0
+    total_weight = 0.0
+    for split in splits:
+        chain = candidate.chain
         if start is not None:
-            chain = solve(start.problem, training, start.theta, loss, ROUGH).chain()
-        residual = new.residual(chain)
-        weight = new.weights
-        totals[kind] += weight @ np.linalg.norm(residual, axis=1), weight.sum()
-    with np.errstate(invalid="ignore"):
-        io, cv = (totals[:, 0] / totals[:, 1]).tolist()
-    return Errors(cv, io)
+            fitted = rows.take(split.fitted)
+            chain = solve(start.problem, fitted, start.theta, loss, ROUGH).chain()
+        predicted = rows.take(split.predicted)
+        weights = predicted.weights
+        total += weights @ np.linalg.norm(predicted.residual(chain), axis=1)
+        total_weight += weights.sum()
+    return float(total / total_weight)
 
 
 def unmoved(model: ForwardModel | None, q: Tensor) -> tuple[str, ...]:

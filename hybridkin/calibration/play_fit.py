@@ -92,7 +92,7 @@ def fit_play(
     parameters : sequence of str, optional
         Parameters to calibrate, see `calibrate`. Default: the chain's own list.
     **calibrate_options
-        `loss`, `prior` and `bounds` of `calibrate`.
+        `loss` and `prior` of `calibrate`.
 
     Returns
     -------

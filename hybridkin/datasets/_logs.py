@@ -29,20 +29,9 @@ from hybridkin.datasets._log_report import named_rows
 from hybridkin.datasets._npz import arrays_of, check_expansion
 
 _DELIMITERS = (",", ";", "\t")
-# a missing name of a motion, as text.
-_UNNAMED = (
-    "",
-    "nan",
-    "NaN",
-    "NaT",
-    "None",
-    "<NA>",
-)
-# Columns of a file; characters of a motion's name.
-_MOST_COLUMNS, _LONGEST = (
-    10_000,
-    256,
-)
+_UNNAMED = ("", "nan", "NaN", "NaT", "None", "<NA>")  # a missing motion, as text
+_MOST_COLUMNS = 10_000  # of an array
+_LONGEST = 256  # characters of a motion's name
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -89,60 +78,57 @@ class Log:
 
     def __post_init__(self) -> None:
         for name in ("q", "x", "time"):
-            if vars(self)[name] is not None:
-                vars(self)[name] = real_array(vars(self)[name], name)
+            column = getattr(self, name)
+            if column is not None:
+                object.__setattr__(self, name, real_array(column, name))
         q = np.shape(self.q)
         x = np.shape(self.x)
-        if (
-            len(q) != 2
-            or len(x) != 2
-            or x[0] != q[0]
-            or x[1] % 3
-            or 0 in (*q[:1], x[1])
-        ):
+        rows_fit = len(q) == len(x) == 2 and q[0] == x[0] > 0
+        if not rows_fit or x[1] % 3 or x[1] == 0:
             raise ValueError(
                 f"`Log` needs q of shape (N, n) and x of shape (N, 3), or (N, 3 K) of K markers, "
                 f"got {q} and {x}."
             )
         if self.groups is not None:
-            vars(self)["groups"] = labels(self.groups, q[0])
-        for name in ("time", "line"):
-            if vars(self)[name] is not None:
-                check_shape(
-                    np.asarray(vars(self)[name]), name, [q[0]], "one for each row"
-                )
+            object.__setattr__(self, "groups", labels(self.groups, q[0]))
+        for name, column in (("time", self.time), ("line", self.line)):
+            if column is not None:
+                check_shape(np.asarray(column), name, [q[0]], "one for each row")
 
     def __repr__(self) -> str:
         """Return a summary of a few lines."""
         tips = self.x[:, -3:]
         sides = np.fmax.reduce(tips) - np.fmin.reduce(tips)
         span = " x ".join(f"{side:.3g}" for side in sides)
-        if self.groups is None:
-            motions = ""
-        else:
-            motions = f", {len(np.unique(self.groups))} motions"
-        lines = [f"{type(self).__name__} of {self.source}: {len(self.q)} rows{motions}"]
-        lines += [f"{self.q.shape[1]} actuators: {', '.join(column_names(self, 'q'))}"]
-        lines[-1] += f"; {self.q.min():.4g} to {self.q.max():.4g} {self.units['q']}"
-        lines += [f"tips within {span} {self.units['x']}"]
+        head = f"{type(self).__name__} of {self.source}: {len(self.q)} rows"
+        if self.groups is not None:
+            head += f", {len(np.unique(self.groups))} motions"
+        names = ", ".join(column_names(self, "q"))
+        values = f"{self.q.min():.4g} to {self.q.max():.4g} {self.units['q']}"
+        lines = [
+            head,
+            f"{self.q.shape[1]} actuators: {names}; {values}",
+            f"tips within {span} {self.units['x']}",
+        ]
         if self.time is not None:
-            lines += [f"time from {self.time[0]:.6g} to {self.time[-1]:.6g} s"]
+            lines.append(f"time from {self.time[0]:.6g} to {self.time[-1]:.6g} s")
         return "\n  ".join(lines)
 
-    def rows(self, kept: NDArray | slice) -> Self:
+    def rows(self, chosen: NDArray | slice) -> Self:
         """Return a log of some of the rows."""
-        columns = {
-            name: vars(self)[name] for name in ("q", "x", "groups", "time", "line")
-        }
-        return replace(
-            self, **{k: v[kept] for k, v in columns.items() if v is not None}
-        )
+        columns = {}
+        for name in ("q", "x", "groups", "time", "line"):
+            column = getattr(self, name)
+            if column is not None:
+                columns[name] = column[chosen]
+        return replace(self, **columns)
 
 
 def column_names(log: Log, which: str) -> list[str]:
     """Return the names of the columns of "q" or "x"; without names, their numbers."""
-    n = vars(log)[which].shape[1]
-    return [*(vars(log)[f"{which}_names"] or (f"{which}[{i}]" for i in range(n)))]
+    names = log.q_names if which == "q" else log.x_names
+    values = log.q if which == "q" else log.x
+    return list(names) or [f"{which}[{i}]" for i in range(values.shape[1])]
 
 
 def load_log(
@@ -233,28 +219,37 @@ def load_log(
             f"`x` must name 3 columns, or 3 for each of several markers, got {len(x)}: {x}."
         )
     factor = _checked_factor(len(q), q_unit, x_unit, q_sign)
-    values, motions = table.rows(
-        [*q, *x, *([] if time is None else [time])], time, groups
-    )
-    places = np.arange(len(values)) if table.lines is None else table.lines
-    tips = slice(len(q), len(q) + len(x))
-    readable = countable(values)
-    complete = readable[:, tips].reshape(len(readable), -1, 3).all(axis=2)
-    values[:, tips][~complete.repeat(3, axis=1)] = np.nan
-    valid = np.delete(readable, tips, axis=1).all(axis=1) & complete.any(axis=1)
+    names = [*q, *x]
+    if time is not None:
+        names.append(time)
+    values = table.values(names, time)
+    motions = None
+    if groups is not None:
+        motions = table.motions(groups, len(values))
+    commands = values[:, : len(q)]
+    tips = values[:, len(q) : len(names) - (time is not None)]
+    complete = countable(tips).reshape(len(tips), -1, 3).all(axis=2)
+    tips = np.where(complete.repeat(3, axis=1), tips, np.nan)
+    valid = countable(commands).all(axis=1) & complete.any(axis=1)
+    if time is not None:
+        valid &= countable(values[:, -1])
     if motions is not None:
         valid &= ~np.isin(motions, _UNNAMED)
+    kind = "line"
+    places = table.lines
+    if places is None:
+        kind = "row"
+        places = np.arange(len(values))
     if not valid.any() or not (drop_invalid or valid.all()):
-        where = named_rows(places[~valid], "row" if table.lines is None else "line")
         raise ValueError(
             f"{(~valid).sum()} of {len(values)} rows of {str(path)!r} have a missing, NaN or "
-            f"infinite value, or no motion ({where}); correct them, or leave them out with "
-            "drop_invalid=True if others are left."
+            f"infinite value, or no motion ({named_rows(places[~valid], kind)}); correct them, or "
+            "leave them out with drop_invalid=True if others are left."
         )
-    values = values[valid]
-    columns = values[:, : len(q)], values[:, tips]
-    for name, unit, column in zip("qx", (q_unit, x_unit), columns, strict=True):
-        span = np.nanmax(np.nanmax(column, axis=0) - np.nanmin(column, axis=0))
+    commands = commands[valid]
+    tips = tips[valid]
+    for name, unit, column in (("q", q_unit, commands), ("x", x_unit, tips)):
+        span = (np.nanmax(column, axis=0) - np.nanmin(column, axis=0)).max()
         middle = np.nanmedian(np.abs(column))
         if unit == "m" and (middle > 10 or span > 5):
             warnings.warn(
@@ -262,22 +257,20 @@ def load_log(
                 f"millimetres, give {name}_unit='mm'.",
                 stacklevel=2,
             )
-    units = {"q": "rad", "x": "m"}
+    si_unit = q_unit if q_unit == "1" else "rad"
     if q_unit in METRES:
-        units["q"] = "m"
-    elif q_unit == "1":
-        units["q"] = "1"
+        si_unit = "m"
     return Log(
-        columns[0] * factor,
-        columns[1] * METRES[x_unit],
+        commands * factor,
+        tips * METRES[x_unit],
         groups=None if motions is None else motions[valid],
-        time=None if time is None else values[:, -1],
+        time=None if time is None else values[valid, -1],
         line=places[valid],
         invalid_lines=places[~valid],
         q_names=q,
         x_names=x,
         q_sign=q_sign,
-        units=units,
+        units={"q": si_unit, "x": "m"},
         file_units={"q": q_unit, "x": x_unit},
         source=str(path),
     )
@@ -306,9 +299,11 @@ def _read(path: Path, delimiter: str | None) -> _Table:
         raise FileNotFoundError(
             f"`path` must be a log file, there is none at {str(path)!r}."
         )
-    read = {".npz": _read_npz, ".parquet": _read_parquet, ".pq": _read_parquet}
-    suffix = path.suffix.lower()
-    return read[suffix](path) if suffix in read else _read_text(path, delimiter)
+    if path.suffix.lower() == ".npz":
+        return _read_npz(path)
+    if path.suffix.lower() in (".parquet", ".pq"):
+        return _read_parquet(path)
+    return _read_text(path, delimiter)
 
 
 @dataclass(frozen=True)
@@ -336,15 +331,16 @@ class _Table(NamedTuple):
             raise ValueError(f"`{argument}` must be column names, got {asked!r}.")
         if len(set(asked)) < len(asked):
             raise ValueError(f"`{argument}` names a column twice: {asked}.")
-        found: list[str] = []
+        names = []
         for name in asked:
-            parts = [
-                c for c in self.header if re.fullmatch(rf"{re.escape(name)}\[\d+\]", c)
-            ]
-            found += [name] if name in self.header or not parts else parts
-        for name in found:
+            parts = re.compile(rf"{re.escape(name)}\[\d+\]").fullmatch
+            columns = [name]
+            if name not in self.header:
+                columns = [*filter(parts, self.header)] or columns
+            names += columns
+        for name in names:
             self.column(name)
-        return found
+        return names
 
     def column(self, name: str) -> NDArray | Sequence[str]:
         """Return the column of that name."""
@@ -373,45 +369,32 @@ class _Table(NamedTuple):
         """Return the column of that name as numbers, NaN for empty cells; times in seconds."""
         column = self.column(name)
         if self.lines is not None:
-            cells = zip(column, self.lines, strict=True)
-            return np.array(
-                [_number(str(cell), name, line, self.path) for cell, line in cells]
-            )
+            numbers = []
+            for cell, line in zip(column, self.lines, strict=True):
+                numbers.append(_number(str(cell), name, line, self.path))
+            return np.array(numbers)
         values = np.asarray(column)
         kind = values.dtype
+        if as_time and kind.kind in "mM":
+            return (values - kind.type(0, "s")) / np.timedelta64(1, "s")
         try:
-            if as_time and kind.kind in "mM":
-                return (values - kind.type(0, "s")) / np.timedelta64(1, "s")
-            if (
-                kind.kind in "cVmM"
-            ):  # astype would use a real part, or ticks of some unit
-                raise TypeError(kind)
-            return values.astype(float)
-        except (TypeError, ValueError, OverflowError) as error:
-            raise ValueError(
-                f"Column {name!r} of {str(self.path)!r} must hold numbers, got {kind}."
-            ) from error
+            # astype would use a real part, or ticks of some unit.
+            if kind.kind not in "cVmM":
+                return values.astype(float)
+        except (TypeError, ValueError, OverflowError):
+            pass
+        raise ValueError(
+            f"Column {name!r} of {str(self.path)!r} must hold numbers, got {kind}."
+        )
 
-    def rows(
-        self, names: list[str], time: str | None, groups: str | None
-    ) -> tuple[NDArray, NDArray | None]:
-        """Return columns as numbers (N, k), that of the time in seconds, and the groups."""
+    def values(self, names: list[str], time: str | None) -> NDArray:
+        """Return columns as numbers (N, k), that of the time in seconds."""
         columns = {name: self.numbers(name, name == time) for name in names}
-        labels = None
         if len(columns) < len(names):
             raise ValueError(
                 f"`q`, `x` and `time` must name a column once, got {names}."
             )
         sizes = {name: len(column) for name, column in columns.items()}
-        if groups is not None:
-            named = [str(value).strip() for value in self.column(groups)]
-            if (longest := max(map(len, named), default=0)) > _LONGEST:
-                raise ValueError(
-                    f"`groups` must name motions in at most {_LONGEST} characters, but column "
-                    f"{groups!r} of {str(self.path)!r} has {longest} in a cell; check the file."
-                )
-            labels = np.array(named)
-            sizes[groups] = len(labels)
         if len({*sizes.values()}) > 1:
             raise ValueError(
                 f"The columns of {str(self.path)!r} must be equally long, got {sizes}."
@@ -419,7 +402,19 @@ class _Table(NamedTuple):
         if not all(sizes.values()):
             header = "no" if self.lines is None else "a header but no"
             raise ValueError(f"{str(self.path)!r} has {header} rows.")
-        return np.column_stack([*columns.values()]), labels
+        return np.column_stack([*columns.values()])
+
+    def motions(self, name: str, n_rows: int) -> NDArray:
+        """Return the column of that name as names of motions."""
+        motions = [str(value).strip() for value in self.column(name)]
+        longest = max(map(len, motions), default=0)
+        if len(motions) != n_rows or longest > _LONGEST:
+            raise ValueError(
+                f"`groups` must name the motion of each of {n_rows} rows in at most {_LONGEST} "
+                f"characters, but column {name!r} of {str(self.path)!r} has {len(motions)} rows of "
+                f"up to {longest} characters; check the file."
+            )
+        return np.array(motions)
 
 
 def _checked_factor(n: int, q_unit: str, x_unit: str, q_sign: ArrayLike) -> NDArray:
@@ -458,10 +453,6 @@ def _read_text(path: Path, delimiter: str | None) -> _Table:
     if not rows:
         raise ValueError(f"{str(path)!r} is empty; a header line and rows are needed.")
     n = len(rows[0][1])
-    if n > _MOST_COLUMNS:
-        raise ValueError(
-            f"{str(path)!r} must have at most {_MOST_COLUMNS} columns, got {n}."
-        )
     for line, row in rows:
         if len(row) > n:
             raise ValueError(
@@ -476,9 +467,9 @@ def _read_text(path: Path, delimiter: str | None) -> _Table:
                 f'A quote (") in line {line - n_lines} of {str(path)!r} hides rows up to line '
                 f"{line}; close or remove it."
             )
-    lines, cells = zip(*rows, strict=True)
-    header = [name.strip() for name in cells[0]]
-    return _Table(path, header, _Cells(cells[1:]), np.array(lines[1:], dtype=int))
+    header = [name.strip() for name in rows[0][1]]
+    lines = np.array([line for line, _ in rows[1:]], dtype=int)
+    return _Table(path, header, _Cells([row for _, row in rows[1:]]), lines)
 
 
 def _read_npz(path: Path) -> _Table:

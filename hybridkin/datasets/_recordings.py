@@ -4,25 +4,21 @@ from __future__ import annotations
 
 import inspect
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.utils import Bunch
 
+from hybridkin._core.arrays import one_of
 from hybridkin.datasets._logs import load_log
 from hybridkin.datasets._npz import arrays_of
 
-DATA_HOME = "HYBRIDKIN_DATA"
+_FTDCR_SERVOS = tuple(f"servo_{i}_mm" for i in (4, 3, 9, 5, 2, 8, 6, 1, 7))
+_FTDCR_TIP = ("tip_x", "tip_y", "tip_z")
 
-FTDCR_SERVOS = tuple(f"servo_{i}_mm" for i in (4, 3, 9, 5, 2, 8, 6, 1, 7))
-FTDCR_TIP = ("tip_x", "tip_y", "tip_z")
-FTDCR_FORMAT: Any = {"time": "timestamp", "q_unit": "mm", "x_unit": "mm", "q_sign": -1}
-FTDCR_FILES = {"train": "train.csv", "tendon_pull": "tendon_pull.csv"}
-
-SOURCES = {
+_SOURCES = {
     "ftdcr_v4": (
         "github.com/ContinuumRoboticsLab/opencr-mujoco, commit 17fff8b1, data/sysid/ftdcr_v4, "
         "MIT, (c) 2026 Continuum Robotics Lab",
@@ -74,19 +70,29 @@ def load_ftdcr(
     FileNotFoundError
         If the files do not exist; the message names their source.
     """
-    if subset not in FTDCR_FILES:
-        raise ValueError(
-            f"`subset` must be one of {list(FTDCR_FILES)}, got {subset!r}."
-        )
-    path, origin = _locate(data_home, "ftdcr_v4", FTDCR_FILES[subset])
-    log = load_log(path, FTDCR_SERVOS, FTDCR_TIP, "pattern_label", **FTDCR_FORMAT)
+    one_of(subset, "subset", ("train", "tendon_pull"))
+    path = _path(data_home, "ftdcr_v4", f"{subset}.csv")
+    log = load_log(
+        path,
+        _FTDCR_SERVOS,
+        _FTDCR_TIP,
+        "pattern_label",
+        time="timestamp",
+        q_unit="mm",
+        x_unit="mm",
+        q_sign=-1,
+    )
     labels = np.asarray(log.groups)
-    return Bunch(
-        **{name: vars(log)[name] for name in ("q", "x", "time", "q_names", "units")},
+    return _recording(
+        load_ftdcr,
+        "ftdcr_v4",
+        q=log.q,
+        x=log.x,
         groups=np.array([label.removesuffix("_hold") for label in labels]),
         pattern_label=labels,
-        DESCR=inspect.getdoc(load_ftdcr),
-        **origin,
+        time=log.time,
+        q_names=log.q_names,
+        units=log.units,
     )
 
 
@@ -116,21 +122,18 @@ def load_armlab(data_home: str | os.PathLike[str] | None = None) -> Bunch:
     FileNotFoundError
         If the file does not exist; the message names its source.
     """
-    path, origin = _locate(data_home, "armlab_3cable", "armlab_3cable.npz")
+    path = _path(data_home, "armlab_3cable", "armlab_3cable.npz")
     file = _arrays(path, {"cable_shortening_mm": (3,), "tip_mm": (3,), "row": ()})
     # Commands are multiples of 0.1 mm, stored in single precision.
     tenths = np.rint(file["cable_shortening_mm"].astype(float) * 10).astype(int)
-    x = file["tip_mm"] * 1e-3
-    row = file["row"]
-    groups = np.where(tenths[:, 0] == 0, tenths[:, 1], 100 + tenths[:, 0])
-    return Bunch(
+    return _recording(
+        load_armlab,
+        "armlab_3cable",
         q=tenths * -1e-4 + 0.0,
-        x=x,
-        groups=groups,
-        row=row,
+        x=file["tip_mm"] * 1e-3,
+        groups=np.where(tenths[:, 0] == 0, tenths[:, 1], 100 + tenths[:, 0]),
+        row=file["row"],
         units={"q": "m", "x": "m"},
-        DESCR=inspect.getdoc(load_armlab),
-        **origin,
     )
 
 
@@ -157,57 +160,56 @@ def load_asl_trunk(data_home: str | os.PathLike[str] | None = None) -> Bunch:
     FileNotFoundError
         If the file does not exist; the message names its source.
     """
-    path, origin = _locate(data_home, "asl_trunk_static", "asl_trunk_static.npz")
+    path = _path(data_home, "asl_trunk_static", "asl_trunk_static.npz")
     shapes = {"u": (6,), "disk_pos_m": (3, 3), "run_id": (), "kind": ()}
-    file = _arrays(path, shapes, "run_names")
+    file = _arrays(path, shapes)
     disks = file["disk_pos_m"]
-    return Bunch(
+    return _recording(
+        load_asl_trunk,
+        "asl_trunk_static",
         q=file["u"].astype(float),
         x=disks[:, -1].copy(),
         disks=disks,
         groups=file["run_id"].astype(int),
-        run_names=file["run_names"],
+        run_names=file.get("run_names"),
         kind=file["kind"],
         units={"q": "1", "x": "m"},
-        DESCR=inspect.getdoc(load_asl_trunk),
-        **origin,
     )
 
 
-def _arrays(
-    path: Path, shapes: Mapping[str, tuple[int, ...]], *names: str
-) -> dict[str, NDArray]:
-    """Return the arrays of a recording; raise if their rows do not have these shapes."""
+def _arrays(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, NDArray]:
+    """Return the arrays of a recording; raise if the rows of some do not have these shapes."""
     file = arrays_of(path)
-    n = {len(array) for name, array in file.items() if name in shapes and array.ndim}
-    for name in (*shapes, *names):
-        array = file.get(name, np.array(None))
-        right = array.ndim == 1 if name in names else array.shape[1:] == shapes[name]
-        kind = "U" if name in names else "biuf"
-        right &= array.ndim > 0 and len(n) == 1 and array.dtype.kind in kind
-        if not right or (kind != "U" and not np.isfinite(array).all()):
-            got = f"of shape {array.shape} and type {array.dtype!s:.40}"
+    n_rows = len(next(iter(file.values()), ()))
+    for name, shape in shapes.items():
+        array = file.get(name, np.array("no array"))
+        numbers = array.dtype.kind in "biuf" and np.isfinite(array).all()
+        if not numbers or array.shape != (n_rows, *shape):
             raise ValueError(
-                f"{path} is damaged: {name!r} is {got}; copy the file again."
+                f"{path} is damaged: {name!r} has shape {array.shape} and type "
+                f"{array.dtype!s:.40}; copy the file again."
             )
     return file
 
 
-def _locate(
-    data_home: str | os.PathLike[str] | None, folder: str, name: str
-) -> tuple[Path, dict[str, str]]:
-    """Return the path of a recording, and its source and citation."""
-    source, citation = SOURCES[folder]
-    home = os.environ.get(DATA_HOME) if data_home is None else data_home
-    path = None if not home else Path(home) / folder / name
-    if path is None or not path.is_file():
-        if path is None:
-            looked = "no data_home was given"
-        else:
-            looked = f"there is no {str(path)!r}"
-        raise FileNotFoundError(
-            f"{folder}/{name} is not part of hybridkin, and {looked}. Its source: {source}. Put "
-            f"the file into a folder {folder!r} and give its parent folder as `data_home` or as "
-            f"the environment variable {DATA_HOME}."
-        )
-    return path, {"source": source, "citation": citation}
+def _path(data_home: str | os.PathLike[str] | None, folder: str, name: str) -> Path:
+    """Return the path of a recording."""
+    home = data_home or os.environ.get("HYBRIDKIN_DATA")
+    looked = "no data_home was given"
+    if home:
+        path = Path(home) / folder / name
+        if path.is_file():
+            return path
+        looked = f"there is no {str(path)!r}"
+    raise FileNotFoundError(
+        f"{folder}/{name} is not part of hybridkin, and {looked}. Its source: "
+        f"{_SOURCES[folder][0]}. Put the file into a folder {folder!r} and give its parent folder "
+        "as `data_home` or as the environment variable HYBRIDKIN_DATA."
+    )
+
+
+def _recording(load: Callable[..., Bunch], folder: str, **columns: object) -> Bunch:
+    """Return the columns of a recording, with its description, source and citation."""
+    source, citation = _SOURCES[folder]
+    description = inspect.getdoc(load)
+    return Bunch(**columns, DESCR=description, source=source, citation=citation)

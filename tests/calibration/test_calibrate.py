@@ -8,7 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch.testing import assert_close
 
-from hybridkin import ConstantCurvatureChain, RigidChain, calibrate, datasets
+from hybridkin import ConstantCurvatureChain, RigidChain, calibrate
 from hybridkin._core.rotations import rotation
 from hybridkin.calibration._least_squares import LOSSES
 from hybridkin.calibration.calibrate import fit_geometry
@@ -149,32 +149,6 @@ def test_planted_geometry_is_recovered_from_exact_data(case, rng):
         assert_close(value, before[name], rtol=0, atol=0)
 
 
-@pytest.mark.slow
-def test_a_common_turn_of_all_rings_is_a_turn_of_the_base(rng):
-    q = tendons(rng)
-    geometry = {"routing": "base", "offsets": [0.0, 0.0, 0.02], "base": planted_base()}
-    truth = tendon_robot(angles=rings([0.0, 0.3, 0.8]), **geometry)
-    start = nominal_tendon_robot(routing="base")
-    result = calibrate(start, q, truth(q), ("radii", "lengths", "turns", "base", "tool"))
-    assert_close(result.chain(q), truth(q), rtol=0, atol=1e-9)
-    for name in ("radii", "lengths", "offsets"):
-        assert_close(result.chain.geometry()[name], truth.geometry()[name], rtol=0, atol=1e-9)
-    turns = result.values["turns"]
-    known = difference(turns - turns[0], torch.tensor([0.0, 0.3, 0.8], dtype=torch.float64))
-    assert_close(known, torch.zeros(3).double(), rtol=0, atol=1e-9)
-    # The base has turned about its own axis to make up for it.
-    turned = result.chain.base @ rotation_about_z(turns[0]) @ torch.linalg.inv(truth.base)
-    assert_close(turned, torch.eye(4).double(), rtol=0, atol=1e-9)
-    assert not result.identifiable["turns"].any()
-    assert result.identifiable["radii"].all()
-
-
-def rotation_about_z(angle):
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = torch.from_numpy(Rotation.from_rotvec([0.0, 0.0, float(angle)]).as_matrix())
-    return pose
-
-
 @pytest.mark.parametrize("lengths", [None, [0.06, 0.05]])
 def test_of_four_zeros_what_no_arc_sees_stays_with_the_prior(lengths, rng):
     radii = [0.1, 0.08] if lengths is None else [0.005, 0.004]
@@ -193,17 +167,10 @@ def test_of_four_zeros_what_no_arc_sees_stays_with_the_prior(lengths, rng):
         assert "does not move the tips" in sentence
 
 
-KINDS = [
-    (lengths, routing, n, tip)
-    for lengths in (None, [0.06, 0.05])
-    for routing in ("segment", "base")
-    for n in (3, 4)
-    for tip in (2.0, 1.5, 1.0)
-]
-
-
-def any_robot(lengths, routing, n, tip, rng):
-    """A robot whose geometry is nowhere zero, and 7 configurations."""
+@pytest.mark.parametrize("lengths", [None, [0.06, 0.05]])
+@pytest.mark.parametrize(("routing", "n", "tip"), [("segment", 4, 2.0), ("base", 3, 1.5)])
+def test_derivatives_by_the_geometry(lengths, routing, n, tip, rng):
+    """On a robot whose geometry is nowhere zero."""
     scale = 1.0 if lengths is None else 0.05
     chain = ConstantCurvatureChain(
         scale * torch.tensor([0.1, 0.08]),
@@ -216,14 +183,7 @@ def any_robot(lengths, routing, n, tip, rng):
         actuator_zeros=0.01 * scale * uniform(rng, 2 * n),
         base=planted_base(),
     ).with_tip(tip)
-    draw = chambers if lengths is None else tendons
-    return chain, draw(rng, 7, 2 * n)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
-def test_derivatives_by_the_geometry(kind, rng):
-    chain, q = any_robot(*kind, rng)
+    q = (chambers if lengths is None else tendons)(rng, 7, 2 * n)
     for name, value in chain.geometry().items():
         tangents = {name: torch.eye(value.numel()).double().reshape(-1, *value.shape)}
         expected = torch.func.jacfwd(lambda v, n=name: chain.with_geometry(**{n: v})(q))(value)
@@ -231,49 +191,24 @@ def test_derivatives_by_the_geometry(kind, rng):
         assert_close(J, expected.flatten(2), rtol=1e-9, atol=1e-11, msg=name)
 
 
-CLOCKWISE = [(0,), (1,), (0, 1), (2,), (0, 2), (0, 1, 2)]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("clockwise", CLOCKWISE)
-@pytest.mark.parametrize("kind", ["chambers", "tendons"])
-def test_rings_that_run_the_other_way_round_are_found(kind, clockwise, rng):
-    S = 3 if 2 in clockwise else 2
-    if kind == "chambers":
-        q, lengths, radii, routing = chambers(rng, 100, 3 * S), None, RADII[:S], "segment"
-    else:
-        q, lengths, routing = tendons(rng, 100, 3 * S), [0.06, 0.07, 0.05][:S], "base"
-        radii = [0.005, 0.0045, 0.004][:S]
-    geometry = {"lengths": lengths, "routing": routing}
-    angles = rings([0.0] * S, clockwise)
-    truth = trunk(radii, angles=angles, base=planted_base(), **geometry)
-    start = trunk([1.1 * radius for radius in radii], **geometry)
-    result = calibrate(start, q, truth(q), ("radii", "turns", "base"))
-    assert_close(result.chain(q), truth(q), rtol=0, atol=1e-9)
-    assert_close(result.chain.radii, truth.radii, rtol=0, atol=1e-9)
-    found = result.chain.angles.unflatten(0, (S, 3))
-    steps = difference(found[:, 1], found[:, 0])
-    expected = [-THIRD if k in clockwise else THIRD for k in range(S)]
-    assert_close(steps, torch.tensor(expected, dtype=torch.float64), rtol=0, atol=1e-9)
-
-
-TURNS = [(90.0, 0.0), (180.0, 90.0), (120.0, -150.0), (0.0, 180.0)]
-TURNS += [(90.0, 180.0, -90.0), (0.0, 135.0, -100.0), (180.0, 0.0, 180.0), (100.0, 100.0, -170.0)]
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("noise", [0.0, 0.002])
-@pytest.mark.parametrize("turns", TURNS)
-def test_turns_of_the_rings_are_found_from_none(turns, noise, rng):
+@pytest.mark.parametrize(
+    ("turns", "clockwise"),
+    [((180, 90), ()), ((120, -150), (0,)), ((0, 180), (0, 1)), ((100, 100, -170), (1,))],
+)
+def test_turned_and_mirrored_rings_are_found_from_none(turns, clockwise, noise, rng):
     S, turns = len(turns), np.radians(turns)
     q = chambers(rng, 100, 3 * S)
-    truth = trunk(RADII[:S], angles=rings(turns), base=planted_base())
+    truth = trunk(RADII[:S], angles=rings(turns, clockwise), base=planted_base())
     x = truth(q) + noise * gauss(rng, 100, 3)
     result = calibrate(trunk([0.09] * S), q, x, ("radii", "turns", "base"))
-    tolerance = max(1e-9, 3 * noise)
-    assert_close(result.chain(q), truth(q), rtol=0, atol=tolerance)
+    assert_close(result.chain(q), truth(q), rtol=0, atol=max(1e-9, 3 * noise))
     between = difference(result.values["turns"].diff(), torch.from_numpy(np.diff(turns)))
     assert between.abs().max() < (1e-9 if noise == 0 else 0.02)
+    steps = difference(result.chain.angles[1::3], result.chain.angles[::3])
+    expected = [-THIRD if k in clockwise else THIRD for k in range(S)]
+    assert_close(steps, torch.tensor(expected).double(), rtol=0, atol=1e-9)
 
 
 @pytest.mark.slow
@@ -281,7 +216,7 @@ def test_a_mirror_image_is_found_where_only_the_base_is_free_and_it_warns(rng):
     q = chambers(rng)
     truth = trunk(angles=rings([0.0] * 3, (0, 1, 2)), base=planted_base())
     start = trunk([0.09] * 3)
-    with pytest.warns(UserWarning, match=r"run in the opposite direction.*or list 'turns'"):
+    with pytest.warns(UserWarning, match="opposite direction"):
         result = calibrate(start, q, truth(q), ("radii", "base"))
     assert_close(result.chain(q), truth(q), rtol=0, atol=1e-9)
     assert_close(result.chain.angles, -start.angles, rtol=0, atol=0)
@@ -290,8 +225,7 @@ def test_a_mirror_image_is_found_where_only_the_base_is_free_and_it_warns(rng):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the calibrated model has a median")  # the noise
-@pytest.mark.parametrize("bend", [1.0, 0.1, 0.01])
-@pytest.mark.parametrize("noise", [0.0, 0.001, 0.02])
+@pytest.mark.parametrize(("bend", "noise"), [(1.0, 0.02), (0.01, 0.0), (0.01, 0.02)])
 @pytest.mark.parametrize("names", [("radii", "base"), ("radii", "turns", "base")])
 def test_a_right_handed_robot_stays_so(bend, noise, names, rng):
     """Even where the robot hardly bends or the noise hides all; no warning of a mirror image."""
@@ -385,23 +319,14 @@ def test_turning_the_frame_leaves_the_fit_as_it_is(loss, rng):
     assert_close(other.std_errors["radii"], plain.std_errors["radii"], rtol=1e-6, atol=0)
 
 
-def test_bounds_hold(rng):
-    q = chambers(rng)
-    x = ConstantCurvatureChain(RADII)(q)
-    nominal = ConstantCurvatureChain([0.09, 0.09, 0.09])
-    with pytest.warns(UserWarning, match=r"radii\[2\] is at its lower bound"):
-        result = calibrate(nominal, q, x, ("radii",), bounds={"radii": (0.08, 0.095)})
-    assert result.chain.radii.max() <= 0.095 * (1 + 1e-12)
-
-
 def test_leaving_what_is_physical_warns(rng):
     q = chambers(rng)
     x = trunk(offsets=[0.0, 0.0, -0.08])(q)
-    with pytest.warns(UserWarning, match=r"gave unphysical values: tool is -80 mm\. Check"):
+    with pytest.warns(UserWarning, match="tool is -80 mm"):
         calibrate(trunk(), q, x, ("tool",))
     with pytest.warns(UserWarning, match=r"offsets\[2\] is -80 mm"):
         calibrate(trunk(), q, x, ("offsets",))
-    with pytest.warns(UserWarning, match=r"radii\[0\] is 2 times its start.*the units"):
+    with pytest.warns(UserWarning, match=r"radii\[0\] is 2 times"):
         calibrate(trunk([0.05, 0.093, 0.079]), q, trunk()(q), ("radii",))
     # The start is never wrong: a tool that was behind the end may stay there.
     calibrate(trunk([0.09] * 3, offsets=[0.0, 0.0, -0.08]), q, x, ("radii", "tool"))
@@ -479,7 +404,7 @@ def test_tips_in_millimetres_are_noticed(rng):
     chain, q = nominal_tendon_robot(), tendons(rng)
     with torch.no_grad():
         x = chain(q)
-    with pytest.warns(UserWarning, match=r"`x` spans .* but the robot is only 0\.18 m long"):
+    with pytest.warns(UserWarning, match="`x` spans"):
         calibrate(chain, q, 1000 * x, ("base",))
     far = x + torch.tensor([40.0, 0.0, 0.0], dtype=torch.float64)  # a far frame is none
     assert calibrate(chain, q, far, ("base",), prior=math.inf).rmse < 1e-6
@@ -488,50 +413,25 @@ def test_tips_in_millimetres_are_noticed(rng):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"parameters": ("radius",)}, "`parameters` must name different .* mean 'radii'"),
-        ({"parameters": ("lengths",)}, "`parameters` must name different entries of"),
-        ({"parameters": ("radii", "radii")}, "`parameters` must name different entries of"),
-        ({"parameters": ()}, "`parameters` must name different entries of"),
+        ({"parameters": ("radius",)}, "mean 'radii'"),
+        ({"parameters": ("lengths",)}, "`parameters`"),
+        ({"parameters": ("radii", "radii")}, "`parameters`"),
+        ({"parameters": ()}, "`parameters`"),
         ({"parameters": ("offsets", "tool")}, "leave 'tool' out"),
-        ({"parameters": ("turns", "radii", "angles")}, "leave 'turns' out"),
-        ({"loss": "l1"}, "`loss` must be one of"),
-        ({"prior": 0.0}, "`prior` must be positive"),
-        ({"prior": {"tool": 1.0}}, "`prior` must name only"),
-        ({"bounds": {"radii": (0.2, 0.1)}}, "low < high"),
-        ({"bounds": {"radii": (-0.2, 0.1)}}, "must not be negative"),
-        ({"bounds": {"tool": (0.0, 0.1)}}, "`bounds` must name only"),
-        ({"bounds": {"base": (0.0, 0.1)}}, "`bounds` cannot hold 'base'"),
-        ({"q": np.full((5, 9), 0.25)}, r"`x` must have shape \(5, 3\)"),
-        ({"q": np.full((10, 8), 0.25)}, r"`q` must have shape \(..., 9\)"),
-        ({"q": np.full((10, 9), np.nan)}, "`q` must be finite"),
-        ({"x": np.full((10, 3), np.inf)}, "`x` must be finite"),
+        ({"loss": "l1"}, "`loss`"),
+        ({"prior": 0.0}, "`prior`"),
+        ({"q": np.full((5, 9), 0.25)}, "`x` must have shape"),
+        ({"q": np.full((10, 8), 0.25)}, "`q` must have shape"),
         ({"q": np.zeros((0, 9)), "x": np.zeros((0, 3))}, "at least one row"),
-        ({"groups": [1, 2]}, r"`groups` must have shape \(10,\)"),
+        ({"groups": [1, 2]}, "`groups`"),
         ({"groups": [1] * 10}, "at least two motions"),
-        ({"sample_weight": [0] * 10}, "`sample_weight` must hold 10 non-negative"),
-        ({"loss": "squared"}, r"`loss` must be one of \['linear', .* got 'squared'"),
+        ({"sample_weight": [0] * 10}, "`sample_weight`"),
     ],
 )
 def test_bad_input_says_what_is_needed(change, message):
     arguments = {"q": np.full((10, 9), 0.25), "x": np.zeros((10, 3)), **change}
     with pytest.raises(ValueError, match=message):
         calibrate(ConstantCurvatureChain(RADII), **arguments)
-
-
-def distances(chain, data):
-    with torch.no_grad():
-        return np.linalg.norm(chain(torch.from_numpy(data.q)).numpy() - data.x, axis=1)
-
-
-NAIVE = ("radii", "lengths", "angles", "base", "tool")
-
-
-@pytest.mark.slow
-def test_real_nine_tendon_robot_from_a_naive_start(data_home):
-    data = datasets.load_ftdcr(data_home)
-    start = ConstantCurvatureChain([0.0045] * 3, lengths=[0.06, 0.0625, 0.064], routing="base")
-    result = calibrate(start, data.q[::3], data.x[::3], NAIVE, loss="soft_l1")
-    assert distances(result.chain, data).mean() <= 0.009
 
 
 def test_tendons_that_contradict_each_other_warn_once(rng):
@@ -544,8 +444,7 @@ def test_tendons_that_contradict_each_other_warn_once(rng):
         calibrate(truth, balanced, truth(balanced), ("radii",))
     balanced[7, 3:6] -= 0.003
     balanced[9, :3] += 0.002
-    message = r"2 of 100 rows of `q` pull .* row 7, segment 2, 3 mm rms\. ElasticTendonChain"
-    with pytest.warns(UserWarning, match=message) as caught:
+    with pytest.warns(UserWarning, match="row 7, segment 2, 3 mm") as caught:
         calibrate(truth, balanced, truth(balanced), ("radii",))
     assert len(caught) == 1
     assert caught[0].filename == __file__
@@ -556,20 +455,13 @@ def test_tendons_that_contradict_each_other_warn_once(rng):
     assert_close(result.values["radii"], truth.radii, rtol=1e-9, atol=0)
 
 
-def test_only_chains_can_be_calibrated(rng):
-    q = chambers(rng, 5)
-    with pytest.raises(TypeError, match="another Chain, got Linear"):
-        calibrate(torch.nn.Linear(9, 3), q, torch.zeros(5, 3))
-
-
 def test_columns_in_a_wrong_order_are_noticed_but_not_outliers(rng):
     chain, q = nominal_tendon_robot(), tendons(rng)
     with torch.no_grad():
         x = chain(q)
     shuffled = q[:, torch.randperm(q.shape[1], generator=rng)]
-    with pytest.warns(UserWarning, match=r"Order or sign.* datasets\.check_log") as issued:
+    with pytest.warns(UserWarning, match="Order or sign"):
         calibrate(chain, shuffled, x, ("base",))
-    assert issued
     spoiled = x.clone()
     spoiled[: len(x) // 5] += 0.1
     calibrate(chain, q, spoiled, ("base",), loss="cauchy")

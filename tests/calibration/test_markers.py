@@ -64,17 +64,3 @@ def test_equal_markers_give_what_one_gives():
     np.testing.assert_allclose(same.values["radii"], one.values["radii"], rtol=1e-7)
     ratio = one.std_errors["radii"] / same.std_errors["radii"]
     np.testing.assert_allclose(ratio, 3**0.5, rtol=0.01)
-
-
-@pytest.mark.parametrize(
-    ("change", "match"),
-    [
-        (lambda x: x[:, :3], r"`x` must have shape \(30, 9\)"),
-        (lambda x: np.where(np.arange(30)[:, None] == 4, np.nan, x), "first: row 4"),
-        (lambda x: np.where(np.arange(30)[:, None] == 4, np.inf, x), "first: row 4"),
-    ],
-)
-def test_rows_without_any_marker_raise(change, match):
-    q, x = log(30)
-    with pytest.raises(ValueError, match=match):
-        calibrate(NOMINAL, q, change(x), ("radii",))

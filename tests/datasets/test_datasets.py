@@ -26,15 +26,11 @@ def test_shipped_data_say_what_they_are():
     data = load_trunk()
     assert data.q.shape == data.q_target.shape == (2000, 9)
     assert np.bincount(data.part).tolist() == [500, 500, 500, 500]
-    assert data.failed == []
     noise = data.q - data.q_target
     assert_allclose(noise.std(axis=0), 1e-3, rtol=0.1)
     assert_allclose(noise.mean(axis=0), 0, atol=1e-4)
     assert np.isfinite(data.x).all()
-    assert data.groups is None
-    assert data.units == {"q": "m", "x": "m"}
     assert "simulated" in data.DESCR
-    assert "Reinhart" in data.citation
 
 
 def test_shipped_data_break_constant_curvature_as_the_papers_trunk_does():
@@ -52,10 +48,9 @@ def test_shipped_data_break_constant_curvature_as_the_papers_trunk_does():
 def test_paper_split():
     data = load_trunk()
     train, test = paper_split(data, random_state=0)
-    assert (len(train), len(test)) == (1900, 100)
     assert_array_equal(np.sort(np.concatenate([train, test])), np.arange(2000))
     assert (data.part[test] == 3).all()
-    assert np.bincount(data.part[train]).tolist() == [500, 500, 500, 400]
+    assert len(test) == 100
     assert_array_equal(paper_split(data.part, 0)[1], test)
     assert (paper_split(data, random_state=1)[1] != test).any()
 
@@ -78,38 +73,23 @@ COLUMNS = {"q": ["a", "b", "c"], "x": ["X", "Y", "Z"]}
 
 
 def test_csv_reads_units_signs_groups_and_time(log):
-    path = log(HEADER + "0.5,one,1,2,3,10,20,30\n1.5,two,4,5,6,40,50,60\n")
-    data = load_log(
-        path,
-        **COLUMNS,
-        groups="run",
-        time="time",
-        q_unit="cm",
-        x_unit="mm",
-        q_sign=[-1, 1, 1],
-    )
+    """Also with a byte order mark, blanks and an empty line."""
+    text = HEADER + " 0.5,one,1,2,3,10,20,30\n\n1.5,two,4,5,6,40,50,60\n"
+    path = log(text, encoding="utf-8-sig")
+    options = {"groups": "run", "time": "time", "x_unit": "mm"}
+    data = load_log(path, **COLUMNS, **options, q_unit="cm", q_sign=[-1, 1, 1])
     assert_allclose(data.q, [[-0.01, 0.02, 0.03], [-0.04, 0.05, 0.06]])
     assert_allclose(data.x, [[0.01, 0.02, 0.03], [0.04, 0.05, 0.06]])
     assert data.groups.tolist() == ["one", "two"]
     assert data.time.tolist() == [0.5, 1.5]
-    assert data.line.tolist() == [2, 3]
+    assert data.line.tolist() == [2, 4]
     assert data.units == {"q": "m", "x": "m"}
-
-
-def test_csv_angles_and_unitless(log):
-    path = log(HEADER + "0,r,90,180,-90,1,2,3\n")
-    assert_allclose(load_log(path, **COLUMNS, q_unit="deg").q, [[np.pi / 2, np.pi, -np.pi / 2]])
-    data = load_log(path, **COLUMNS, q_unit="1")
-    assert_allclose(data.q, [[90, 180, -90]])
-    assert data.units["q"] == "1"
-
-
-def test_csv_with_byte_order_mark_semicolons_blanks_and_empty_lines(log):
-    text = "a; b;c;X;Y;Z\n1;2;3; 1;2;3\n\n4;5;6;1;2;3\n"
-    path = log(text, encoding="utf-8-sig")
-    data = load_log(path, **COLUMNS, q_unit="1", delimiter=";")
-    assert_allclose(data.q, [[1, 2, 3], [4, 5, 6]])
-    assert_allclose(data.x, [[1, 2, 3], [1, 2, 3]])
+    assert_allclose(
+        load_log(path, **COLUMNS, q_unit="deg", x_unit="mm").q[0], np.radians([1, 2, 3])
+    )
+    counts = load_log(path, **COLUMNS, q_unit="1", x_unit="mm")
+    assert_allclose(counts.q[0], [1, 2, 3])
+    assert counts.units["q"] == "1"
 
 
 def test_csv_invalid_rows_are_counted_or_dropped(log):
@@ -130,20 +110,18 @@ def test_csv_invalid_rows_are_counted_or_dropped(log):
     ("text", "arguments", "message"),
     [
         (HEADER + "0,r,1,x1,1,1,1,1\n", {}, r"Line 2 .* column 'b': .* got 'x1'"),
-        (HEADER + "0,r,1,1,1,1,1,1,9\n", {}, r"Line 2 .* 9 cells, the header 8"),
-        (HEADER, {}, "a header but no rows"),
+        (HEADER + "0,r,1,1,1,1,1,1,9\n", {}, "9 cells, the header 8"),
+        (HEADER, {}, "no rows"),
         ("", {}, "is empty"),
-        (HEADER, {"x": ["x", "Y", "Z"]}, r"no column 'x' .* did you mean 'X'\?"),
-        (HEADER, {"groups": "runs"}, r"no column 'runs' .* did you mean 'run'\?"),
+        (HEADER, {"x": ["x", "Y", "Z"]}, "did you mean 'X'"),
+        (HEADER + "0,r,1,1,1,1,1,1\n", {"groups": "runs"}, "did you mean 'run'"),
         (HEADER.replace(",", ";"), {"delimiter": ","}, "check `delimiter`"),
-        ("a,a,b,c,X,Y,Z\n", {}, "Column 'a' occurs 2 times"),
-        (HEADER, {"x": ["X", "Y"]}, "`x` must name 3 columns, or 3 for each .* got 2"),
-        (HEADER, {"q": []}, "`q` must be column names"),
-        (HEADER, {"q": ["a", "a"]}, "`q` names a column twice"),
-        (HEADER, {"q_unit": "inch"}, "`q_unit` must be one of"),
+        ("a,a,b,c,X,Y,Z\n", {}, "'a' occurs 2 times"),
+        (HEADER, {"x": ["X", "Y"]}, "3 columns"),
+        (HEADER, {"q": []}, "column names"),
+        (HEADER, {"q": ["a", "a"]}, "twice"),
+        (HEADER, {"q_unit": "kPa"}, "give '1', and `gains`"),
         (HEADER, {"x_unit": "deg"}, "`x_unit` must be one of"),
-        (HEADER, {"q_unit": "kPa"}, "for other units give '1', and `gains`"),
-        (HEADER, {"q_sign": 2}, "`q_sign` must be 1 or -1"),
         (HEADER, {"q_sign": [1, -1]}, "`q_sign` must be 1 or -1"),
     ],
 )
@@ -185,12 +163,12 @@ def test_logs_of_every_format_hold_the_same(tmp_path):
 @pytest.mark.parametrize(
     ("arrays", "message"),
     [
-        ({"q": np.ones((3, 3)), "x": np.ones((2, 3))}, "must be equally long"),
-        ({"q": np.ones((3, 3)), "x": np.ones((3, 2))}, "`x` must name 3 columns"),
-        ({"q": np.ones((3, 3)), "tip": np.ones((3, 3))}, "There is no column 'x'"),
+        ({"q": np.ones((3, 3)), "x": np.ones((2, 3))}, "equally long"),
+        ({"q": np.ones((3, 3)), "tip": np.ones((3, 3))}, "no column 'x'"),
         ({"q": np.full((3, 3), "a"), "x": np.ones((3, 3))}, "must hold numbers"),
         ({"q": np.ones((0, 3)), "x": np.ones((0, 3))}, "has no rows"),
-        ({"q": np.full((3, 3), None), "x": np.ones((3, 3))}, "not an npz file of plain arrays"),
+        ({"q": np.full((3, 3), None), "x": np.ones((3, 3))}, "not an npz file"),
+        ({"q": np.ones((3, 20_000)), "x": np.ones((3, 3))}, "transpose"),
     ],
 )
 def test_npz_errors(tmp_path, arrays, message):
@@ -199,18 +177,15 @@ def test_npz_errors(tmp_path, arrays, message):
         load_log(tmp_path / "log.npz", ["q"], ["x"])
 
 
-def test_files_that_are_none_are_told(tmp_path, monkeypatch):
+def test_files_that_are_no_logs_raise(tmp_path, monkeypatch):
     for name in ("log.npz", "log.csv", "log.parquet"):
         (tmp_path / name).write_bytes(b"\xff\x00PAR1 no log")
-    with pytest.raises(ValueError, match="not an npz file"):
-        load_log(tmp_path / "log.npz", ["q"], ["x"])
-    with pytest.raises(ValueError, match="not a text file in UTF-8"):
-        load_log(tmp_path / "log.csv", ["q"], ["x", "y", "z"])
-    with pytest.raises(FileNotFoundError, match="there is none at"):
+        monkeypatch.setitem(sys.modules, "pandas", None)  # not installed
+        expected = ImportError if name == "log.parquet" else ValueError
+        with pytest.raises(expected, match=name):
+            load_log(tmp_path / name, ["q"], ["x", "y", "z"])
+    with pytest.raises(FileNotFoundError):
         load_log(tmp_path / "absent.npz", ["q"], ["x"])
-    monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(ImportError, match="pip install pandas pyarrow"):
-        load_log(tmp_path / "log.parquet", ["q"], ["x"])
 
 
 # what is wrong with a log
@@ -249,30 +224,27 @@ def test_a_clean_log_passes():
     assert "no errors and no warnings" in str(report)
 
 
-def test_frozen_tip():
+@pytest.mark.parametrize(
+    ("column", "severity", "what"),
+    [("x", "error", "the tip"), ("x[1]", "warning", "'x[1]'"), ("q[4]", "warning", "'q[4]'")],
+)
+def test_frozen_sensors(column, severity, what):
     log = tendon_log()
-    log["x"][70:85] = log["x"][70]
-    finding = found(log)["frozen tip", "error"]
+    values = log[column[0]]
+    if len(column) > 1:
+        values = values[:, int(column[2])]
+    values[70:85] = values[70]
+    kind = "frozen tip" if column[0] == "x" else "frozen actuator"
+    finding = found(log)[kind, severity]
     assert finding.rows.tolist() == [*range(70, 85)]
+    assert what in finding.message
     assert "rows 70-84" in finding.message
-    assert "--drop-frozen" in finding.advice
-    # At rest the tip may well be still.
+
+
+def test_a_tip_at_rest_is_not_frozen():
     log = tendon_log()
     log["q"][70:85], log["x"][70:85] = log["q"][70], log["x"][70]
     assert not any(kind == "frozen tip" for kind, _ in found(log))
-
-
-def test_one_frozen_coordinate_and_a_frozen_actuator():
-    log = tendon_log()
-    log["x"][70:85, 1] = log["x"][70, 1]
-    finding = found(log)["frozen tip", "warning"]
-    assert "'x[1]'" in finding.message
-    assert finding.rows.tolist() == [*range(70, 85)]
-    log = tendon_log()
-    log["q"][70:85, 4] = log["q"][70, 4]
-    finding = found(log)["frozen actuator", "warning"]
-    assert "'q[4]'" in finding.message
-    assert finding.rows.tolist() == [*range(70, 85)]
 
 
 def test_invalid_rows():
@@ -401,13 +373,6 @@ def test_clockwise_numbering_is_told(base_is_free):
     assert check_log(Log(**tendon_log()), chain=CHAIN, base_is_free=base_is_free).ok
 
 
-def test_check_says_what_it_needs():
-    with pytest.raises(ValueError, match=r"q of shape \(N, n\)"):
-        Log(np.ones((3, 3)), np.ones((2, 3)))
-    with pytest.raises(ValueError, match="must have 6 actuators"):
-        check_log(Log(np.ones((3, 3)), np.ones((3, 3))), chain=CHAIN)
-
-
 def test_a_report_is_json(log):
     data = load_log(
         log(HEADER + "0,r,1,2,3,1,2,3\n1,r,1,nan,3,1,2,3\n"), **COLUMNS, drop_invalid=True
@@ -423,10 +388,8 @@ def test_a_report_is_json(log):
 @pytest.mark.parametrize("load", [load_ftdcr, load_armlab, load_asl_trunk])
 def test_absent_recordings_name_their_source(load, tmp_path, monkeypatch):
     monkeypatch.delenv("HYBRIDKIN_DATA", raising=False)
-    with pytest.raises(FileNotFoundError, match=r"github.com/.* commit .* MIT.*`data_home`"):
+    with pytest.raises(FileNotFoundError, match="github"):
         load()
-    with pytest.raises(FileNotFoundError, match=r"there is no .*HYBRIDKIN_DATA"):
-        load(tmp_path)
     monkeypatch.setenv("HYBRIDKIN_DATA", str(tmp_path))
     with pytest.raises(FileNotFoundError, match="there is no"):
         load()
@@ -435,58 +398,37 @@ def test_absent_recordings_name_their_source(load, tmp_path, monkeypatch):
 def test_ftdcr(data_home):
     data = load_ftdcr(data_home)
     assert data.q.shape == (1620, 9)
-    assert data.x.shape == (1620, 3)
     assert not any(label.endswith("_hold") for label in data.groups)
-    assert any(label.endswith("_hold") for label in data.pattern_label)
     # Pulled is shortened; the first motion pulls the first tendon.
     first = data.groups == "rep1_tendon0_id4_pull"
     assert data.q[first].min() == data.q[first, 0].min() < -0.003
     assert 0.15 < np.median(np.linalg.norm(data.x, axis=1)) < 0.25
     assert (np.diff(data.time) > 0).all()
-    assert "MIT" in data.source
     pulls = load_ftdcr(data_home, subset="tendon_pull")
     assert_array_equal(pulls.q, data.q[: len(pulls.q)])
-    assert data.units == {"q": "m", "x": "m"}
-    with pytest.raises(ValueError, match="`subset` must be one of"):
-        load_ftdcr(data_home, subset="test")
 
 
-def test_armlab(data_home):
+def test_armlab_and_asl_trunk(data_home):
     data = load_armlab(data_home)
     assert data.q.shape == (24019, 3)
-    assert data.q.max() == 0
-    assert data.q.min() == -0.01
-    assert (data.q.max(axis=1) == 0).all()
-    assert 0.2 < np.linalg.norm(data.x, axis=1).mean() < 0.4
+    assert (data.q.max(), data.q.min()) == (0.0, -0.01)
     # A line holds one coordinate of the raster.
     for group in (0, 50, 101, 150):
-        rows = data.q[data.groups == group]
         column = 1 if group <= 100 else 0
-        assert len(np.unique(rows[:, column])) == 1
-    assert data.groups.max() <= 200
-
-
-def test_asl_trunk(data_home):
-    data = load_asl_trunk(data_home)
-    assert data.q.shape == (2170, 6)
-    assert data.disks.shape == (2170, 3, 3)
-    assert_array_equal(data.x, data.disks[:, 2])
-    assert set(data.groups) <= set(range(len(data.run_names)))
-    assert data.units["q"] == "1"
+        assert len(np.unique(data.q[data.groups == group, column])) == 1
+    trunk = load_asl_trunk(data_home)
+    assert trunk.q.shape == (2170, 6)
+    assert_array_equal(trunk.x, trunk.disks[:, 2])
+    assert set(trunk.groups) <= set(range(len(trunk.run_names)))
 
 
 def test_a_log_shows_a_summary():
-    q = np.array([[0.1, 0.2], [0.15, 0.3]])
     x = np.array([[0.0, 0.0, 1.0], [0.03, np.nan, 1.2]])
-    log = Log(q, x, ["a", "b"], np.array([2.0, 4.5]), q_names=("left", "right"), source="log.csv")
+    names = {"q_names": ("left", "right"), "source": "log.csv"}
+    log = Log(np.array([[0.1, 0.2], [0.15, 0.3]]), x, ["a", "b"], np.array([2.0, 4.5]), **names)
     assert str(log).splitlines() == [
         "Log of log.csv: 2 rows, 2 motions",
         "  2 actuators: left, right; 0.1 to 0.3 m",
         "  tips within 0.03 x 0 x 0.2 m",
         "  time from 2 to 4.5 s",
     ]
-    plain = Log(q, x)
-    assert repr(plain) == (
-        "Log of in memory: 2 rows\n  2 actuators: q[0], q[1]; 0.1 to 0.3 m\n"
-        "  tips within 0.03 x 0 x 0.2 m"
-    )

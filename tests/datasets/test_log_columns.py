@@ -41,21 +41,14 @@ def text(folder, *parts):
 # dates and durations
 
 
-@pytest.mark.parametrize("unit", ["ns", "us", "ms", "s", "m", "h", "D"])
-def test_dates_and_durations_of_any_unit_are_seconds(tmp_path, unit):
+@pytest.mark.parametrize("unit", ["ns", "ms", "s", "D"])
+def test_dates_and_durations_are_seconds(tmp_path, unit):
     days = np.arange(N).astype("m8[D]").astype(f"m8[{unit}]")
     dates = (np.datetime64("2024-01-01") + days).astype(f"M8[{unit}]")
-    assert_array_equal(load_log(npz(tmp_path, t=days), **NAMES, time="t").time, SECONDS)
-    assert_array_equal(load_log(npz(tmp_path, t=dates), **NAMES, time="t").time, FIRST + SECONDS)
-
-
-@pytest.mark.parametrize("unit", ["ns", "us", "ms", "s"])
-def test_dates_and_durations_of_data_frames_are_seconds(tmp_path, unit):
-    days = np.arange(N).astype("m8[D]").astype(f"m8[{unit}]")
-    dates = np.datetime64("2024-01-01") + days
-    assert_allclose(load_log(parquet(tmp_path, t=days), **NAMES, time="t").time, SECONDS)
-    log = load_log(parquet(tmp_path, t=dates), **NAMES, time="t")
-    assert_allclose(log.time, FIRST + SECONDS, rtol=1e-15)
+    for write in (npz, parquet) if unit != "D" else (npz,):
+        assert_allclose(load_log(write(tmp_path, t=days), **NAMES, time="t").time, SECONDS)
+        log = load_log(write(tmp_path, t=dates), **NAMES, time="t")
+        assert_allclose(log.time, FIRST + SECONDS, rtol=1e-15)
 
 
 def test_a_time_zone_does_not_change_the_time(tmp_path):
@@ -101,13 +94,6 @@ def test_a_column_is_used_once(tmp_path, use):
             load_log(path, **{**NAMES, **use})
 
 
-def test_a_motion_may_be_named_by_an_actuator(tmp_path):
-    log = load_log(text(tmp_path, HEADER, *ROWS), **NAMES, groups="a", time="t")
-    assert_allclose(log.q[:, 0], 1e-3 * np.arange(8))
-    assert_allclose(log.x[:, 0], 1e-2 * np.arange(8))
-    assert log.groups.tolist() == [f"{i}e-3" for i in range(8)]
-
-
 # the motion of every row
 
 
@@ -125,9 +111,7 @@ def test_rows_without_a_motion_are_named(tmp_path, missing):
 # quotes
 
 
-@pytest.mark.parametrize("at", [1, 2, 5, 6])
-@pytest.mark.parametrize("end", [None, 6, 7])
-@pytest.mark.parametrize("cell", [0, 3, 7])
+@pytest.mark.parametrize(("at", "end", "cell"), [(1, None, 0), (2, 6, 3), (5, 7, 7), (6, 7, 0)])
 def test_a_quote_that_hides_rows_is_noticed(tmp_path, at, end, cell):
     rows = [row.strip().split(",") for row in ROWS]
     rows[at][cell] = f'"{rows[at][cell]}'

@@ -51,7 +51,6 @@ def only(log, chain=CHAIN, **options):
     "order",
     [
         [0, 1, 2, 4, 3, 5, 6, 7, 8],  # two columns of a segment
-        [0, 1, 6, 3, 4, 5, 2, 7, 8],  # of two segments
         [6, 7, 8, 3, 4, 5, 0, 1, 2],  # tip first
         [4, 0, 8, 3, 7, 1, 6, 2, 5],
     ],
