@@ -11,7 +11,12 @@ from sklearn.utils import Bunch
 from hybridkin import calibrate, robots
 from hybridkin.calibration.measured import distance
 from hybridkin.datasets import paper_split
-from hybridkin.workflow.report import IDENTIFIED, Report, geometry_entries
+from hybridkin.workflow.calibrated import (
+    IDENTIFIED,
+    calibrated_parameters,
+    write_parameters,
+)
+from hybridkin.workflow.report import Report
 
 ASKED = ("radii", "turns", "rest_bends", "actuator_zeros", "tool", "base")
 """All parameters that `identifiability` calibrates at once."""
@@ -35,7 +40,7 @@ def identifiability(data: Bunch, split: int = 0) -> dict[str, Any]:
     dict
         "n_train", "n_single" (rows in which one segment moves) and "n_random". For "asked",
         "identifiable" and "default" (radii and base) a dict of "parameters", "entries" (one for
-        each free parameter, see `geometry_entries`), "unidentified" (a sentence for each direction
+        each free parameter, a `CalibratedParameter`), "unidentified" (a sentence for each direction
         that is not identified), and tip errors [m]: "rmse" on the training rows, "test" and
         "test_max" on the test rows.
     """
@@ -54,7 +59,7 @@ def identifiability(data: Bunch, split: int = 0) -> dict[str, Any]:
         with torch.no_grad():
             tips = result.chain(torch.from_numpy(data.q[test])).numpy()
         errors = distance(tips, data.x[test])
-        entries = geometry_entries(chain, result)
+        entries = calibrated_parameters(chain, result)
         found[label] = {"parameters": names, "entries": entries, "rmse": result.rmse}
         found[label] |= {"test": errors.mean(), "test_max": errors.max()}
         found[label]["unidentified"] = result.unidentified
@@ -67,7 +72,7 @@ def write_identifiability(report: Report, data: Bunch, found: dict[str, Any]) ->
     asked, fewer, default = (
         found[label] for label in ("asked", "identifiable", "default")
     )
-    n = sum(entry["identified"] for entry in asked["entries"])
+    n = sum(entry.identified for entry in asked["entries"])
     report.text(
         "## Geometry that the data identify",
         f"Parameters {', '.join(ASKED)} are calibrated at once to the {found['n_train']} training "
@@ -77,17 +82,17 @@ def write_identifiability(report: Report, data: Bunch, found: dict[str, Any]) ->
         f"{len(asked['entries'])} parameters; the others stay near the published geometry. The "
         "base is given by its rotation from the start and its position.",
     )
-    report.geometry(asked["entries"])
+    write_parameters(report, asked["entries"])
     report.text(
         "Not identified by the data, and the measurement that would identify it:"
     )
     report.text("\n".join(f"- {sentence}" for sentence in asked["unidentified"]))
-    n = sum(entry["identified"] for entry in fewer["entries"])
+    n = sum(entry.identified for entry in fewer["entries"])
     report.text(
         f"Without turns and actuator zeros {n} of {len(fewer['entries'])} are identified:"
     )
-    report.geometry(fewer["entries"])
-    base = {entry["name"]: entry for entry in fewer["entries"]}
+    write_parameters(report, fewer["entries"])
+    base = {entry.name: entry for entry in fewer["entries"]}
     true = dict(
         zip(
             "xyz",
@@ -95,8 +100,8 @@ def write_identifiability(report: Report, data: Bunch, found: dict[str, Any]) ->
             strict=True,
         )
     )
-    away = {axis: base[f"base[{axis}]"]["value"] - true[axis] for axis in true}
-    far = max(abs(away[axis]) / base[f"base[{axis}]"]["std_error"] for axis in away)
+    away = {axis: base[f"base[{axis}]"].value - true[axis] for axis in true}
+    far = max(abs(away[axis]) / base[f"base[{axis}]"].std_error for axis in away)
     found["base_position_error"] = list(away.values())
     report.text(
         f"The tip error on the 100 test rows hardly changes: {100 * asked['test']:.2f} cm with "

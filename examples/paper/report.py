@@ -59,7 +59,7 @@ def run_paper(
         )
         for feedback in ("model", "measured")
     )
-    report = Report("The paper's result on a simulated trunk")
+    report = Report("The paper's result on a simulated trunk", {})
     report.record.update(n_splits=n_splits, n_seeds=n_seeds, n_points=n_points)
     report.text(
         "Reinhart & Steil (2016) learn the error of a constant-curvature model of Festo's Bionic "

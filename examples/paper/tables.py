@@ -16,7 +16,8 @@ from hybridkin.calibration.measured import distance
 from hybridkin.chains.chain import Chain
 from hybridkin.datasets import paper_split
 from hybridkin.plots import model_color, new_figure
-from hybridkin.workflow.report import Progress, Report, quadratic, quiet
+from hybridkin.workflow.compare import quadratic
+from hybridkin.workflow.report import Progress, Report, quiet
 
 PAPER_TABLE_1 = {
     ("mechanical, nominal", "-"): ("", "2.5 (9.3)"),

@@ -387,7 +387,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     given = parser.parse_args(arguments)
     torch.set_num_threads(1)
-    report = Report("The compiled core against torch")
+    report = Report("The compiled core against torch", {})
 
     def run(
         part: str, names: Sequence[str], study: Callable[[str], Any]

@@ -169,7 +169,7 @@ def examined(seed: int, models: Sequence[str] = (*MODELS,)) -> list[dict[str, An
 
 def write(entries: list[dict[str, Any]], seconds: float) -> Report:
     """Return the report of the entries of all logs."""
-    report = Report("Logs of few lines through actuator space (simulated robots)")
+    report = Report("Logs of few lines through actuator space (simulated robots)", {})
     report.record |= {"entries": entries, "seconds": seconds}
     seeds = sorted({entry["seed"] for entry in entries})
     report.text(

@@ -83,7 +83,7 @@ def examined(fold: Fold) -> dict[str, float]:
 
 def gains_report(data_home: Any, thin: int = 1) -> Report:
     """Return the table: means over the folds, and the change by the gains with its spread."""
-    report = Report("Calibrated gains on held-out motions")
+    report = Report("Calibrated gains on held-out motions", {})
     entries: dict[str, list[dict[str, float]]] = {}
     for fold in folds_of(data_home, thin):
         entries.setdefault(fold.name, []).append(examined(fold))

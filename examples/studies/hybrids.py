@@ -215,7 +215,7 @@ def hybrids_report(
     Report
         Tables in mm and two figures; ``report.write(folder)`` writes them with ``report.json``.
     """
-    report = Report("Hybrid models compared")
+    report = Report("Hybrid models compared", {})
     report.record.update(curves=curves, outside=outside, motions=motions)
     report.text("## Few rows", "Tip error in mm, mean ± standard deviation over draws.")
     for case, test in _tests(curves):
@@ -449,7 +449,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     given = parser.parse_args(arguments)
     if given.draw is not None:
         entries = stored_entries(given.draw)
-        report = Report("Hybrid models compared")
+        report = Report("Hybrid models compared", {})
         report.figure("hybrid_curves", _curves_figure(entries["few rows"]), "")
         report.figure(
             "hybrid_outside", _outside_figure(entries["outside the training range"]), ""

@@ -455,7 +455,7 @@ def branches(
 
 def peers_report(entries: list[dict[str, Any]], found: list[dict[str, Any]]) -> Report:
     """Return the report of what `compared` and `branches` returned."""
-    report = Report("Poses of rigid arms")
+    report = Report("Poses of rigid arms", {})
     report.record.update(entries=entries, branches=found, tol=TOL)
     report.text(
         "Share of targets solved within tolerance and limits, CPU time per target."

@@ -126,7 +126,7 @@ def c_loop(ik: InverseKinematics, n_ticks: int, dtype: str = "float64") -> Laten
 
 def latency_report(found: dict[str, Latencies]) -> Report:
     """Return a table and a figure of loops by name."""
-    report, rows = Report("Latency at 1 kHz"), []
+    report, rows = Report("Latency at 1 kHz", {}), []
     for name, one in found.items():
         medians = [_quantile(counts, 0.5) for counts in one[:2]]
         late = [_quantile(counts, 0.999) for counts in one[:2]]

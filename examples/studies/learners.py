@@ -256,7 +256,7 @@ def learners_report(table: list[dict[str, Any]], curve: list[dict[str, Any]]) ->
     Report
         Tables of errors and CPU times, and a figure; ``report.write(folder)`` writes them.
     """
-    report = Report("Learners compared")
+    report = Report("Learners compared", {})
     report.record.update(table=table, curve=curve)
     header = ["set", *dict.fromkeys(entry["learner"] for entry in table)]
     errors, seconds = [], []

@@ -588,7 +588,7 @@ def study(
 def write(found: dict[str, Any], seconds: float) -> Report:
     """Return the report of a study."""
     n, alarms = found["n"], found["clean_alarms"]
-    report = Report("Mistakes in logs (simulated robots)")
+    report = Report("Mistakes in logs (simulated robots)", {})
     report.record |= found | {"seconds": seconds}
     report.text(
         f"{n} simulated robots, seeds {found['seeds'][0]} to {found['seeds'][1]}; {seconds:.0f} s. "

@@ -161,7 +161,7 @@ def study(
 
 def write(entries: list[dict[str, Any]]) -> Report:
     """Return the report of the entries: mean errors of the tip, and their spread over draws."""
-    report, lines = Report("Several markers"), []
+    report, lines = Report("Several markers", {}), []
     report.record["entries"] = entries
     for robot in dict.fromkeys(e["robot"] for e in entries):
         own = [e for e in entries if e["robot"] == robot]

@@ -54,7 +54,7 @@ from hybridkin import (
 )
 from hybridkin.hybrid.log_distance import held_out_distances
 from hybridkin.workflow import open_model
-from hybridkin.workflow._promise import Promise
+from hybridkin.workflow.errors import Promise
 from hybridkin.workflow.report import Report
 
 FIT = "fit"  # models that begin so are made by the command line
@@ -482,7 +482,9 @@ def tracks_report(entries: list[dict[str, Any]]) -> Report:
     Report
         ``report.write(folder)`` writes it, with the figures in ``motor_tracks.csv``.
     """
-    report = Report("Promised and true errors of commands on simulated motor robots")
+    report = Report(
+        "Promised and true errors of commands on simulated motor robots", {}
+    )
     report.record.update(entries=entries)
     done = [entry for entry in entries if "error" not in entry]
     keys = ("robot", "model", "commands", "path")

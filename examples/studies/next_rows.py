@@ -337,7 +337,7 @@ def next_report(
         figures in ``next_rows.csv``.
     """
     lines = []
-    report = Report("Which configurations to measure next")
+    report = Report("Which configurations to measure next", {})
     report.record.update(box=everywhere, path=path, motions=moved)
     for title, entries in (("Range", everywhere), ("Path", path), ("Motions", moved)):
         for case, model in dict.fromkeys((e["case"], e["model"]) for e in entries):

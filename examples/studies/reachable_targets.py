@@ -261,7 +261,7 @@ def reachable_report(entries: list[dict[str, Any]]) -> Report:
     Report
         A table by robot and one by kind; ``report.write(folder)`` writes them.
     """
-    report = Report("Reachable targets")
+    report = Report("Reachable targets", {})
     report.record.update(table=entries, tol=TOL)
     for key in ("robot", "kind", "start"):
         report.text(

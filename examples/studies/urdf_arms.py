@@ -170,7 +170,7 @@ def study(
 
 def urdf_report(entries: list[dict[str, Any]]) -> Report:
     """Return the report of what `study` returned."""
-    report = Report("Leaf links of URDFs")
+    report = Report("Leaf links of URDFs", {})
     report.record["files"] = entries
     total = {key: sum(entry[key] for entry in entries) for key in ("leaves", "read")}
     largest = {

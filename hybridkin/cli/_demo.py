@@ -11,7 +11,7 @@ import numpy as np
 import hybridkin
 
 if TYPE_CHECKING:
-    from hybridkin.workflow import Report
+    from hybridkin.workflow import FitRecord, Report, TrackRecord
 
 _ROWS = 240
 _BLOCK = 12
@@ -45,15 +45,15 @@ def steps(out: Path) -> dict[str, str]:
     }
 
 
-def summary(out: Path, records: dict[str, dict[str, Any]]) -> Report:
+def summary(out: Path, records: dict[str, Any]) -> Report[dict[str, Any]]:
     """Return what the steps have shown, from their records by the name of the command."""
-    fit = records["fit"]
-    track = records["track"]
-    held_out = fit["held_out"]
-    saved = fit["saved"]
-    means = {name: 1e3 * entry["mean"] for name, entry in held_out.items()}
-    report = hybridkin.workflow.Report("From a log to a film, on SIMULATED data")
-    report.record.update(records)
+    fit: FitRecord = records["fit"]
+    track: TrackRecord = records["track"]
+    calibrated = fit.held_out[_SHOWN[1]].mean
+    saved = fit.held_out[fit.saved].mean
+    report = hybridkin.workflow.Report(
+        "From a log to a film, on SIMULATED data", records
+    )
     report.text(
         f"The log comes from a physics simulator, not from a robot: {_ROWS} postures of a "
         "pneumatic trunk, three segments of three chambers, with sensor noise. A row has nine "
@@ -62,14 +62,15 @@ def summary(out: Path, records: dict[str, dict[str, Any]]) -> Report:
         "Errors on held-out rows, which the fit of a model has not seen:",
     )
     report.errors(
-        {name: held_out[name] for name in (*_SHOWN, saved)}, ("mean", "p95", "max")
+        {name: fit.held_out[name] for name in (*_SHOWN, fit.saved)},
+        ("mean", "p95", "max"),
     )
     report.text(
         "Nominal: geometry as described, pose of the base fitted. Calibrated: geometry fitted. "
         "Quadratic: a polynomial of the data, no mechanics. Hybrid: the calibrated model and a "
-        f"learned correction, with {means[_SHOWN[1]] / means[saved]:.1f} times less mean error.",
-        f"Track: by the model the tip reaches {track['reached']} of {track['n']} points. A robot "
-        f"misses them by about the held-out error, {means[saved]:.1f} mm on average.",
+        f"learned correction, with {calibrated / saved:.1f} times less mean error.",
+        f"Track: by the model the tip reaches {track.reached} of {track.n} points. A robot "
+        f"misses them by about the held-out error, {1e3 * saved:.1f} mm on average.",
         f"Look at {out}/track.gif, {out}/model/report.md and {out}/robot.toml.",
         "Take the tip and pull, in the browser:\n"
         f"$ hybridkin view {shlex.quote((out / 'model').as_posix())} "

@@ -107,7 +107,7 @@ def _in_words(seconds: float) -> str:
     return f"{seconds:.1f} s" if seconds < 60.0 else f"{seconds / 60.0:.1f} min"
 
 
-def shown(report: Report) -> str:
+def shown(report: Report[Any]) -> str:
     """Return a report as text, with ruled tables on a terminal and plain ones elsewhere."""
     console = Console()
     if console.is_terminal:

@@ -13,11 +13,11 @@ import threading
 import warnings
 import webbrowser
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from hybridkin.chains.chain import Chain
     from hybridkin.chains.robots import Limits, LogFormat
     from hybridkin.datasets import LogReport
-    from hybridkin.workflow import LoadedModel, MeasuredLog, PathLimits
+    from hybridkin.workflow import LoadedModel, MeasuredLog, PathLimits, Report
 
 _DT = 0.02
 _INSIDE = 0.8  # least share of a path in the domain, else the exit code is 1
@@ -42,11 +42,23 @@ _INSIDE = 0.8  # least share of a path in the domain, else the exit code is 1
 _OF_INPUT = (ValueError, TypeError, OSError, ImportError, MemoryError)
 
 
-class _Outcome(NamedTuple):
-    record: dict[str, Any]
-    text: str
-    paths: Sequence[Path] = ()
-    code: int = 0
+_Result = tuple["Report[Any]", int]
+"""The report of a command, and its exit code."""
+
+
+@dataclass(frozen=True)
+class View:
+    """The address of a live view."""
+
+    address: str
+
+
+@dataclass(frozen=True, eq=False)
+class NewRobot:
+    """The columns of a new robot description, and the check of the log it was given."""
+
+    columns: LogFormat
+    log_check: LogReport | None
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -56,7 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         stages = Stages(arguments.quiet)
         # Several threads cost many times the CPU time: the matrices are small.
-        _ = hybridkin.workflow  # loads the libraries whose threads are limited
+        _ = hybridkin.robots  # loads the libraries whose threads are limited
         with (
             contextlib.closing(stages),
             warnings.catch_warnings(),
@@ -65,35 +77,28 @@ def main(argv: Sequence[str] | None = None) -> int:
         ):
             warnings.filterwarnings("default", category=UserWarning)
             warnings.showwarning = stages.warn
-            outcome = _RUN[arguments.command](arguments, stages)
+            report, code = _RUN[arguments.command](arguments, stages)
     except (KeyboardInterrupt, EOFError) as stop:  # EOFError: no answer to a question
         if _stamps(arguments) == before:
             fate = "nothing was written"
         else:
             fate = "files were written"
-        code = 143 if isinstance(stop, _Terminated) else 130
-        return failed(f"interrupted; {fate}", code, arguments.json)
+        signal_code = 143 if isinstance(stop, _Terminated) else 130
+        return failed(f"interrupted; {fate}", signal_code, arguments.json)
     except _OF_INPUT as error:
         return failed(f"error: {error}", 2, arguments.json)
-    text = outcome.text
-    paths = [*map(str, outcome.paths)]
-    if arguments.json:
-        written = {"written": paths} if paths else {}
-        text = hybridkin.workflow.json_text({**outcome.record, **written})
-    elif paths:
-        text = "\n  ".join([f"{text}\n\nWrote", *paths])
+    text = report.json() if arguments.json else shown(report)
+    if report.paths and not arguments.json:
+        text = "\n  ".join([f"{text}\n\nWrote", *map(str, report.paths)])
     try:
         print(text, flush=True)
     except OSError as error:
         # For the flush at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        if not isinstance(
-            error, BrokenPipeError
-        ):  # `head`, for example, has what it wants
-            return failed(
-                f"error: the result cannot be printed: {error}", 2, as_json=False
-            )
-    return outcome.code
+        if not isinstance(error, BrokenPipeError):  # `head` has what it wants
+            message = f"error: the result cannot be printed: {error}"
+            return failed(message, 2, as_json=False)
+    return code
 
 
 class _Terminated(KeyboardInterrupt):
@@ -144,19 +149,18 @@ def _stamps(arguments: argparse.Namespace) -> dict[Path, tuple[int, int]]:
     return stamps
 
 
-def _next(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
+def _next(arguments: argparse.Namespace, stages: Stages) -> _Result:
     workflow = hybridkin.workflow
     loaded = workflow.open_model(arguments.model, arguments.robot)
-    measured = path = None
+    measured = None
     if arguments.log is not None:
-        robot_format = None if loaded.description is None else loaded.description.log
-        log_format = _log_format(arguments, robot_format, arguments.model)
-        measured = _read(arguments, log_format, loaded.chain, False, stages)
+        measured = _log_of(loaded, arguments, stages, chain=loaded.chain)
         measured.check(arguments.force)
+    path = None
     if arguments.path is not None:
         unit = arguments.unit or loaded.log_format().x_unit
         path = workflow.read_path(arguments.path, unit=unit, dt=arguments.dt)
-    report, paths = workflow.next_rows(
+    report = workflow.next_rows(
         loaded,
         arguments.out,
         n=arguments.n,
@@ -166,25 +170,27 @@ def _next(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
         force=arguments.force,
         progress=stages,
     )
-    return _Outcome(report.record, shown(report), paths)
+    return report, 0
 
 
-def _fit(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
+def _fit(arguments: argparse.Namespace, stages: Stages) -> _Result:
     robot = hybridkin.robots.read_description(arguments.robot)
     log_format = _log_format(arguments, robot.log, arguments.robot)
     play = arguments.play
-    names = ("loss", "coverage", "n_folds", "auto")
+    if isinstance(play, float):
+        play = abs(log_format.q_factor * play).tolist()
     settings = hybridkin.workflow.FitSettings(
-        **{name: vars(arguments)[name] for name in names},
-        play=abs(log_format.q_factor * play).tolist()
-        if isinstance(play, float)
-        else play,
+        loss=arguments.loss,
+        coverage=arguments.coverage,
+        n_folds=arguments.n_folds,
+        auto=arguments.auto,
+        play=play,
         max_rows=arguments.max_rows or None,
     )
-    before = _model_before(arguments)
-    log = _read(arguments, log_format, robot.chain, robot.base_is_free, stages)
+    replaced = _replaced_model(arguments)
+    log = _read(arguments, log_format, stages, robot.chain, robot.base_is_free)
     _note(log.report, stages)
-    report, paths = hybridkin.workflow.fit_log(
+    report = hybridkin.workflow.fit_log(
         log,
         robot,
         arguments.out,
@@ -193,12 +199,12 @@ def _fit(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
         n_jobs=arguments.jobs,
         progress=stages,
     )
-    if before:
-        stages.note(f"Replaced {before}.", important=True)
-    return _Outcome(report.record, shown(report), paths)
+    if replaced:
+        stages.note(f"Replaced {replaced}.", important=True)
+    return report, 0
 
 
-def _model_before(arguments: argparse.Namespace) -> str:
+def _replaced_model(arguments: argparse.Namespace) -> str:
     """Return the model that a fit replaces, in words; raise if the user refuses on a terminal."""
     model = arguments.out / "model.safetensors"
     if not model.is_file():
@@ -220,47 +226,39 @@ def _model_before(arguments: argparse.Namespace) -> str:
     return words
 
 
-def _evaluate(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
+def _evaluate(arguments: argparse.Namespace, stages: Stages) -> _Result:
     loaded = hybridkin.workflow.open_model(arguments.model, arguments.robot)
-    robot_format = None if loaded.description is None else loaded.description.log
     nominal = loaded.chain if loaded.header is None else None
-    log_format = _log_format(arguments, robot_format, arguments.model)
-    log = _read(arguments, log_format, nominal, False, stages)
+    log = _log_of(loaded, arguments, stages, chain=nominal)
     _note(log.report, stages)
-    report, paths = hybridkin.workflow.evaluate_log(
+    report = hybridkin.workflow.evaluate_log(
         loaded, log, arguments.out, force=arguments.force
     )
-    # Of rows that were fitted the errors on held-out motions count.
-    judged = next(filter(None, map(report.record.get, ("new", "held_out", "all"))))
+    mean = 1000.0 * report.record.judged.mean
     limit = arguments.fail_above
-    code = 1 if limit is not None and 1000 * judged["mean"] > limit else 0
-    return _Outcome(report.record, shown(report), paths, code)
+    return report, int(limit is not None and mean > limit)
 
 
-def _view(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
+def _view(arguments: argparse.Namespace, stages: Stages) -> _Result:
     loaded = hybridkin.workflow.open_model(arguments.model, arguments.robot)
     log = None
     if arguments.log is not None:
-        robot_format = None if loaded.description is None else loaded.description.log
-        log_format = _log_format(arguments, robot_format, arguments.model)
-        log = _read(arguments, log_format, None, True, stages)
-    path = None
-    if arguments.path is not None:
-        unit = arguments.unit or loaded.log_format().x_unit
-        path = hybridkin.workflow.read_path(arguments.path, unit=unit, dt=arguments.dt)
+        log = _log_of(loaded, arguments, stages, base_is_free=True)
     limits = _scaled_limits(arguments, loaded)
     place = {"host": arguments.host, "port": arguments.port}
-    with hybridkin.view(loaded, log, path=path, **vars(limits), **place) as shown_robot:
+    with hybridkin.view(loaded, log, **vars(limits), **place) as shown_robot:
         address = shown_robot.address
         stages.note(f"{loaded.name} is at {address}. Ctrl-C ends it.", important=True)
         if not arguments.no_browser and "SSH_CONNECTION" not in os.environ:
             webbrowser.open(address)
         with contextlib.suppress(KeyboardInterrupt):
             shown_robot.wait()
-    return _Outcome({"address": address}, "The view is closed.")
+    report = hybridkin.workflow.Report(f"View of {loaded.name}", View(address))
+    report.text("The view is closed.")
+    return report, 0
 
 
-def _track(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
+def _track(arguments: argparse.Namespace, stages: Stages) -> _Result:
     workflow = hybridkin.workflow
     loaded = workflow.open_model(arguments.model, arguments.robot)
     log_format = loaded.log_format()
@@ -286,7 +284,7 @@ def _track(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
             dt=arguments.dt or _DT,
         )
     start = arguments.start
-    report, paths = workflow.track_path(
+    report = workflow.track_path(
         loaded,
         workflow.scaled_path(path, arguments.scale),
         arguments.out,
@@ -296,27 +294,24 @@ def _track(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
         force=arguments.force,
         progress=stages,
     )
-    record = report.record
-    inside = (
-        arguments.force or record["in_domain"] is None or record["in_domain"] > _INSIDE
-    )
-    code = 0 if inside and record["reached"] == record["n"] else 1
-    return _Outcome(record, shown(report), paths, code)
+    track = report.record
+    inside = track.in_domain is None or track.in_domain > _INSIDE
+    done = (arguments.force or inside) and track.reached == track.n
+    return report, int(not done)
 
 
-def _verify(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
+def _verify(arguments: argparse.Namespace, stages: Stages) -> _Result:
     loaded = hybridkin.workflow.open_model(arguments.model, arguments.robot)
     log_format = _log_format(arguments, loaded.log_format(), arguments.model)
-    log = _read(arguments, replace(log_format, groups=None), None, False, stages)
-    report, paths = hybridkin.workflow.verify_track(
+    log = _read(arguments, replace(log_format, groups=None), stages)
+    report = hybridkin.workflow.verify_track(
         loaded, arguments.track, log, arguments.out, force=arguments.force
     )
-    code = 1 if report.record["kept"] is False else 0
-    return _Outcome(report.record, shown(report), paths, code)
+    return report, int(report.record.kept is False)
 
 
-def _animate(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
-    record = hybridkin.workflow.animate_track(
+def _animate(arguments: argparse.Namespace, stages: Stages) -> _Result:
+    report = hybridkin.workflow.animate_track(
         hybridkin.workflow.open_model(arguments.model, arguments.robot),
         arguments.track,
         arguments.out,
@@ -325,16 +320,12 @@ def _animate(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
         n_frames=arguments.frames,
         progress=stages,
     )
-    speed = f"{record['fps']:.3g} a second"
-    size = f"{record['bytes'] / 1e6:.2f} MB"
-    return _Outcome(
-        record, f"{record['frames']} frames, {speed}, {size}", [arguments.out]
-    )
+    return report, 0
 
 
-def _export(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
+def _export(arguments: argparse.Namespace, stages: Stages) -> _Result:
     loaded = hybridkin.workflow.open_model(arguments.model, arguments.robot)
-    report, paths = hybridkin.workflow.export_model(
+    report = hybridkin.workflow.export_model(
         loaded,
         arguments.out,
         name=arguments.name,
@@ -342,78 +333,87 @@ def _export(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
         dt=arguments.dt,
         limits=None if arguments.dt is None else _limits(arguments, loaded),
     )
-    return _Outcome(report.record, shown(report), paths)
+    return report, 0
 
 
-def _describe(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
-    if arguments.log.suffix.lower() not in hybridkin.workflow.LOG_SUFFIXES:
-        loaded = hybridkin.workflow.open_model(arguments.log, arguments.robot)
-        report = hybridkin.workflow.describe(loaded)
-        return _Outcome(report.record, shown(report))
+def _describe(arguments: argparse.Namespace, stages: Stages) -> _Result:
+    workflow = hybridkin.workflow
+    if arguments.log.suffix.lower() not in workflow.LOG_SUFFIXES:
+        loaded = workflow.open_model(arguments.log, arguments.robot)
+        return workflow.describe(loaded), 0
     if arguments.robot is None:
         raise ValueError(
             f"{arguments.log} is a log; name its robot: --robot ROBOT.toml."
         )
     robot = hybridkin.robots.read_description(arguments.robot)
     log_format = _log_format(arguments, robot.log, arguments.robot)
-    check = _read(arguments, log_format, robot.chain, robot.base_is_free, stages).report
-    return _Outcome(check.to_dict(), str(check), code=0 if check.ok else 1)
+    log = _read(arguments, log_format, stages, robot.chain, robot.base_is_free)
+    report = workflow.Report(f"Check of {arguments.log.name}", log.report)
+    report.verbatim(str(log.report))
+    return report, int(not log.report.ok)
 
 
-def _init(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
+def _init(arguments: argparse.Namespace, stages: Stages) -> _Result:
+    workflow = hybridkin.workflow
     out = arguments.out
-    given = vars(arguments)
     if out.exists() and not arguments.force:
         raise FileExistsError(
             f"{out} exists; name another file, or replace it with --force."
         )
-    answers, missing = answered(given, ask=False)
+    options = vars(arguments)
+    answers, missing = answered(options, ask=False)
     if missing and sys.stdin.isatty() and not arguments.json:
-        answers, missing = answered(given, ask=True)
+        answers, missing = answered(options, ask=True)
     if missing:
-        need = f"`init` needs {', '.join(missing)} where it cannot ask on a terminal"
-        raise ValueError(f"{need}; see `hybridkin init --help`.")
+        raise ValueError(
+            f"`init` needs {', '.join(missing)} where it cannot ask on a terminal; see "
+            "`hybridkin init --help`."
+        )
     text = description(answers, out.stem)
+    robot = _robot_of(text)
+    log_format: LogFormat = robot.log
+    check = None
     log = answers["log"]
-    code = 0
-    with tempfile.TemporaryDirectory() as folder:  # errors leave no file
+    if log is not None:
+        check = workflow.read_log(
+            log,
+            log_format,
+            chain=robot.chain,
+            base_is_free=robot.base_is_free,
+            delimiter=arguments.delimiter,
+        ).report
+        _note(check, stages)
+    record = NewRobot(log_format, check)
+    report = workflow.Report(f"{robot.name}: {robot.n_actuators} actuators", record)
+    look = ["hybridkin", "view", str(out)]
+    if log is not None:
+        look.append(str(log))
+    fit = ["hybridkin", "fit", str(log or "log.csv"), "--robot", str(out)]
+    report.text(
+        f"Columns: actuators {', '.join(log_format.q)}; tip {', '.join(log_format.x)}; motion "
+        f"{log_format.groups or '(none)'}.",
+        f"Read through {out}, and look whether every actuator bends the robot the "
+        f"right way:\n$ {shlex.join(look)}",
+        f"Then fit a model:\n$ {shlex.join(fit)} --out model",
+    )
+    write_file(out, partial(Path.write_text, data=text, encoding="utf-8"))
+    report.paths = [out]
+    return report, int(check is not None and not check.ok)
+
+
+def _robot_of(text: str) -> Any:
+    """Return the robot of a description that is not written yet: errors leave no file."""
+    with tempfile.TemporaryDirectory() as folder:
         draft = Path(folder) / "robot.toml"
         draft.write_text(text, encoding="utf-8")
         try:
-            robot = hybridkin.robots.read_description(draft)
+            return hybridkin.robots.read_description(draft)
         except ValueError as error:
             raise ValueError(str(error).removeprefix(f"{draft}: ")) from error
-    log_format: Any = robot.log
-    report = hybridkin.workflow.Report(f"{robot.name}: {robot.n_actuators} actuators")
-    report.record.update(columns=vars(log_format), log_check=None)
-    q = ", ".join(log_format.q)
-    x = ", ".join(log_format.x)
-    report.text(
-        f"Columns: actuators {q}; tip {x}; motion {log_format.groups or '(none)'}."
-    )
-    if log is not None:
-        options = {"base_is_free": robot.base_is_free, "delimiter": arguments.delimiter}
-        read = hybridkin.workflow.read_log(
-            log, log_format, chain=robot.chain, **options
-        )
-        _note(read.report, stages)
-        report.record["log_check"] = read.report.to_dict()
-        code = 0 if read.report.ok else 1
-    log_name, robot_name = (shlex.quote(str(path)) for path in (log or "log.csv", out))
-    fit = f"hybridkin fit {log_name} --robot {robot_name} --out model"
-    look = shlex.join(["hybridkin", "view", str(out), *map(str, filter(None, [log]))])
-    report.text(
-        f"Read through {out}, and look whether every actuator bends the robot the "
-        f"right way:\n$ {look}",
-        f"Then fit a model:\n$ {fit}",
-    )
-    write_file(out, partial(Path.write_text, data=text, encoding="utf-8"))
-    return _Outcome(report.record, shown(report), [out], code)
 
 
-def _demo(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
+def _demo(arguments: argparse.Namespace, stages: Stages) -> _Result:
     out = arguments.out
-    done = {}
     if out.exists() and not (out.is_dir() and not [*out.iterdir()]):
         raise FileExistsError(
             f"{out} is not an empty folder; name another one by --out."
@@ -421,14 +421,19 @@ def _demo(arguments: argparse.Namespace, stages: Stages) -> _Outcome:
     out.mkdir(parents=True, exist_ok=True)
     stages.note("The data of this demo are simulated; no robot was measured.")
     demo.write_log(out / "log.csv")
+    paths = [out / "log.csv"]
+    worst = 0
+    records = {}
     for command, what in demo.steps(out).items():
         stages.note(f"\n{what}\n$ hybridkin {command}")
         parsed = parser().parse_args(shlex.split(command))
-        done[parsed.command] = _RUN[parsed.command](parsed, stages)
-    report = demo.summary(out, {name: outcome.record for name, outcome in done.items()})
-    paths = [path for outcome in done.values() for path in outcome.paths]
-    code = max(outcome.code for outcome in done.values())
-    return _Outcome(report.record, shown(report), [out / "log.csv", *paths], code)
+        step, code = _RUN[parsed.command](parsed, stages)
+        records[parsed.command] = step.record
+        paths += step.paths
+        worst = max(worst, code)
+    report = demo.summary(out, records)
+    report.paths = paths
+    return report, worst
 
 
 _COMMANDS = (
@@ -468,34 +473,51 @@ def _note(found: LogReport, stages: Stages) -> None:
     stages.note(f"{found}\n", important=bool(found.errors or found.warnings))
 
 
+def _log_of(
+    loaded: LoadedModel,
+    arguments: argparse.Namespace,
+    stages: Stages,
+    chain: Chain | None = None,
+    base_is_free: bool = False,
+) -> MeasuredLog:
+    """Return the log of the arguments in the format of a model's robot."""
+    described = None if loaded.description is None else loaded.description.log
+    log_format = _log_format(arguments, described, arguments.model)
+    return _read(arguments, log_format, stages, chain, base_is_free)
+
+
 def _read(
     arguments: argparse.Namespace,
     log_format: LogFormat,
-    chain: Chain | None,
-    base_is_free: bool,
     stages: Stages,
+    chain: Chain | None = None,
+    base_is_free: bool = False,
 ) -> MeasuredLog:
     """Return the log of the arguments, read and checked."""
     stages("reading and checking the log", 0, 1)
-    names = ("exclude", "drop_invalid", "drop_frozen", "delimiter")
-    options = {name: vars(arguments)[name] for name in names}
     return hybridkin.workflow.read_log(
-        arguments.log, log_format, chain=chain, base_is_free=base_is_free, **options
+        arguments.log,
+        log_format,
+        chain=chain,
+        base_is_free=base_is_free,
+        exclude=arguments.exclude,
+        drop_invalid=arguments.drop_invalid,
+        drop_frozen=arguments.drop_frozen,
+        delimiter=arguments.delimiter,
     )
 
 
 def _log_format(
-    arguments: argparse.Namespace, known: LogFormat | None, source: Path
+    arguments: argparse.Namespace, described: LogFormat | None, source: Path
 ) -> LogFormat:
-    """Return how the log is written: what is known, with what the options say instead."""
-    names = ("q", "x", "q_unit", "x_unit", "q_sign", "groups", "time")
-    entries = {name: vars(arguments)[name] for name in names}
-    entries = {name: value for name, value in entries.items() if value is not None}
-    entries |= {
-        name: None for name in ("groups", "time") if entries.get(name) == "none"
-    }
-    if known is not None:
-        return replace(known, **entries)
+    """Return how the log is written: as described, with what the options say instead."""
+    entries = {}
+    for name in ("q", "x", "q_unit", "x_unit", "q_sign", "groups", "time"):
+        value = vars(arguments)[name]
+        if value is not None:
+            entries[name] = None if value == "none" else value
+    if described is not None:
+        return replace(described, **entries)
     if "q" not in entries or "x" not in entries:
         raise ValueError(
             f"{source} does not say how logs are written: it has no [log] table, as in "

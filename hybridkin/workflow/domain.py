@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -15,6 +15,7 @@ from hybridkin._core.arrays import as_array, real_array
 from hybridkin.chains import robots
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
+from hybridkin.ik.solver import InverseKinematics
 from hybridkin.workflow.model import LoadedModel
 
 _WALKERS = 256
@@ -22,9 +23,12 @@ _STEPS = 60
 _STEP = 0.12  # length of a step, as a share of the range
 _PLANAR = 1e-9  # relative cut-off of singular values, for tendons in one plane
 _NAMES = ("q_min", "q_max", "dq_max", "ddq_max")
-_EASE = (
-    0.5  # domain distance from which the posture returns; 1 is the edge of the domain
-)
+# Domain distance from which the posture returns; 1 is the edge of the domain.
+_EASE = 0.5
+
+
+Posture = Callable[[Tensor], Tensor] | NDArray
+"""A preferred configuration, or a function of q that returns one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +50,11 @@ class PathLimits:
     dq_max: NDArray | None
     ddq_max: NDArray | None
     source: str
+
+    @property
+    def span(self) -> NDArray:
+        """The width of the range of every actuator (n,)."""
+        return self.q_max - self.q_min
 
 
 def path_limits(
@@ -81,24 +90,24 @@ def path_limits(
         If the range of the actuators is not known.
     """
     n = loaded.n_actuators
-    bounds: dict[str, NDArray] = {}
+    overrides: dict[str, NDArray] = {}
     for name, value in zip(_NAMES, (q_min, q_max, dq_max, ddq_max), strict=True):
         if value is not None:
-            bounds[name] = real_array(value, name).astype(float)
-            if bounds[name].shape not in ((), (1,), (n,)):
+            limit = real_array(value, name).astype(float)
+            if limit.shape not in ((), (1,), (n,)):
                 raise ValueError(
-                    f"`{name}` must be one number or {n}, got {bounds[name].size}."
+                    f"`{name}` must be one number or {n}, got {limit.size}."
                 )
+            overrides[name] = limit
     described = robots.Limits()
     if loaded.description is not None:
         described = loaded.description.limits
     trained = robots.Limits()
     if within_fit or described.q_min is None or described.q_max is None:
         trained = loaded.trained_range or trained
-    half_play = 0.0 if loaded.play is None else 0.5 * loaded.play.width
-    limits = described.narrowed(half_play).intersect(trained)
-    overrides = robots.Limits(**bounds).narrowed(half_play)
-    limits = replace(limits, **{name: getattr(overrides, name) for name in bounds})
+    limits = described.narrowed(loaded.half_play).intersect(trained)
+    given = robots.Limits(**overrides).narrowed(loaded.half_play)
+    limits = replace(limits, **{name: vars(given)[name] for name in overrides})
     if limits.q_min is None or limits.q_max is None:
         raise ValueError(
             "`q_min` and `q_max` must be given (--q-min, --q-max), or written as [limits] in the "
@@ -111,31 +120,24 @@ def path_limits(
             "`q_min` must not exceed `q_max`, including half the backlash and the training range, "
             f"got {low.tolist()} and {high.tolist()} m; check their unit and sign."
         )
-    speed = None if limits.dq_max is None else _of_actuators(limits.dq_max, n)
-    acceleration = None if limits.ddq_max is None else _of_actuators(limits.ddq_max, n)
-    return PathLimits(
-        low, high, speed, acceleration, _source(bounds, described, trained)
-    )
-
-
-def _of_actuators(value: ArrayLike, n: int) -> NDArray:
-    """Return one value for each of n actuators (n,)."""
-    return np.broadcast_to(np.asarray(value, dtype=float), n).copy()
-
-
-def _source(
-    given: Iterable[str], described: robots.Limits, trained: robots.Limits
-) -> str:
-    """Return in words where the range of the actuators comes from."""
     sources = []
     if described.q_min is not None:
         sources.append("robot description")
     if trained.q_min is not None:
         sources.append("training range")
-    n_given = len({"q_min", "q_max"}.intersection(given))
-    if n_given == 2:
-        return "given"
-    return "given and " * n_given + ", within the ".join(sources)
+    source = ", within the ".join(sources)
+    if "q_min" in overrides and "q_max" in overrides:
+        source = "given"
+    elif "q_min" in overrides or "q_max" in overrides:
+        source = f"given and {source}"
+    speed = None if limits.dq_max is None else _of_actuators(limits.dq_max, n)
+    acceleration = None if limits.ddq_max is None else _of_actuators(limits.ddq_max, n)
+    return PathLimits(low, high, speed, acceleration, source)
+
+
+def _of_actuators(value: ArrayLike, n: int) -> NDArray:
+    """Return one value for each of n actuators (n,)."""
+    return np.broadcast_to(np.asarray(value, dtype=float), n).copy()
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,12 +164,11 @@ class Domain:
         if self.tendons is not None:
             candidates = [self.rest, middle] if trained is None else [middle, self.rest]
         hybrid = self.loaded.hybrid
-        tested = None if hybrid is None else hybrid.fitted_module_.tested
+        tested = None if hybrid is None else hybrid.module_.tested
         if hybrid is not None and tested is not None:
-            rows = as_array(tested.rows) - hybrid.change_.shift
-            candidates.append(
-                rows[np.linalg.norm(rows - candidates[0], axis=1).argmin()]
-            )
+            rows = as_array(tested.rows - hybrid.module_.shift_of_zeros)
+            far = np.linalg.norm(rows - candidates[0], axis=1)
+            candidates.append(rows[far.argmin()])
         q = np.clip(candidates, limits.q_min, limits.q_max)
         distance = self.loaded.domain_distance(q)
         return q[np.maximum(distance, 1.0).argmin()]  # the first of those in the domain
@@ -201,23 +202,43 @@ class Domain:
         rng = np.random.default_rng(0)
         low = self.limits.q_min
         high = self.limits.q_max
+        span = self.limits.span
         q = rng.uniform(low, high, (_WALKERS, len(low)))
         if self.loaded.hybrid is not None:
             q[:] = self.preferred
             for _ in range(_STEPS):
-                ahead = (
-                    q
-                    + _STEP * (high - low) * rng.standard_normal(q.shape) @ self.bending
-                )
+                step = _STEP * span * rng.standard_normal(q.shape)
+                ahead = q + step @ self.bending
                 inside = self.loaded.domain_distance(ahead) <= 1.0
                 inside &= ((ahead >= low) & (ahead <= high)).all(axis=1)
                 q[inside] = ahead[inside]
             # Near the preferred one, because that may be exactly straight.
-            near = 0.01 * (high - low) * rng.standard_normal(len(low)) @ self.bending
-            q[0] = self.preferred + near
+            near = 0.01 * span * rng.standard_normal(len(low))
+            q[0] = self.preferred + near @ self.bending
         tips = self.loaded.tips(q)
         finite = np.isfinite(tips).all(axis=1)
         return q[finite], tips[finite]
+
+    def nearest(self, x: NDArray) -> NDArray:
+        """Return the commands (..., n) of the `sample` whose tips are nearest to x (..., 3)."""
+        commands, tips = self.sample
+        far = np.linalg.norm(tips - x[..., None, :], axis=-1)
+        return commands[far.argmin(axis=-1)]
+
+    def solver(
+        self, q_pref: Posture | None = None, dt: float = 0.01
+    ) -> InverseKinematics:
+        """Return inverse kinematics within the limits; default of `q_pref`: `preferred`."""
+        limits = self.limits
+        return InverseKinematics(
+            self.loaded.module,
+            q_min=limits.q_min,
+            q_max=limits.q_max,
+            dq_max=limits.dq_max,
+            ddq_max=limits.ddq_max,
+            q_pref=self.preferred if q_pref is None else q_pref,
+            dt=dt,
+        )
 
     def postures(self, n: int) -> NDArray:
         """Return at most n commands from the whole range of the limits; tendons are balanced.
@@ -234,16 +255,18 @@ class Domain:
         rest = self.rest
         gains = as_array(chain.gains.detach())  # balanced in metres
         low, high = np.sort([gains * (low - rest), gains * (high - rest)], axis=0)
-        q = gains * (q - rest)
+        pulled = gains * (q - rest)
         angles = as_array(chain.angles.detach())
-        ends = np.cumsum(chain.actuators_per_segment)
-        for planar in np.split(np.arange(len(low)), ends[:-1]):
-            axes = np.stack([np.cos(angles[planar]), np.sin(angles[planar])], axis=1)
-            q[:, planar] = q[:, planar] @ axes @ np.linalg.pinv(axes, rcond=_PLANAR)
-            q[:, planar] -= (
-                (q[:, planar] - high[planar]).max(axis=1, keepdims=True).clip(min=0.0)
-            )
-        return rest + q[((q >= low) & (q <= high)).all(axis=1)] / gains
+        first = 0
+        for count in chain.actuators_per_segment:
+            ring = slice(first, first + count)
+            first += count
+            axes = np.stack([np.cos(angles[ring]), np.sin(angles[ring])], axis=1)
+            balanced = pulled[:, ring] @ axes @ np.linalg.pinv(axes, rcond=_PLANAR)
+            excess = (balanced - high[ring]).max(axis=1, keepdims=True)
+            pulled[:, ring] = balanced - excess.clip(min=0.0)
+        within = ((pulled >= low) & (pulled <= high)).all(axis=1)
+        return rest + pulled[within] / gains
 
     @cached_property
     def bending(self) -> NDArray:
@@ -259,7 +282,7 @@ class Domain:
         slopes = torch.func.jacrev(lambda row: chain.arcs(row)[1].ravel())(zero)
         return (torch.linalg.pinv(slopes, rtol=_PLANAR) @ slopes).numpy()
 
-    def posture(self, pull: float) -> Callable[[Tensor], Tensor] | NDArray:
+    def posture(self, pull: float) -> Posture:
         """Return the posture for ``InverseKinematics(q_pref=...)`` that keeps q in the domain.
 
         From half way to the edge of the domain it moves back, along the gradient of the domain
@@ -272,7 +295,7 @@ class Domain:
         module = self.loaded.module
         home = torch.from_numpy(self.preferred)
         bending = torch.from_numpy(self.bending)
-        squares = torch.from_numpy((self.limits.q_max - self.limits.q_min) ** 2)
+        squares = torch.from_numpy(self.limits.span**2)
 
         def posture(q: Tensor) -> Tensor:
             rows = q.detach().reshape(-1, q.shape[-1])

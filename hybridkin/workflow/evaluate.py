@@ -2,27 +2,141 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridkin.calibration.measured import distance, distances
-from hybridkin.datasets import Log
-from hybridkin.plots import (
-    BackboneDisplay,
-    ErrorHistogramDisplay,
-    WorkspaceDisplay,
-    new_figure,
-)
-from hybridkin.workflow._fit_report import radius_entry, write_check, write_markers
-from hybridkin.workflow.log import MeasuredLog, checked
-from hybridkin.workflow.model import LoadedModel, check_columns
-from hybridkin.workflow.report import Report, check_out, statistics
+import hybridkin
+from hybridkin.calibration.measured import distances
+from hybridkin.datasets import Log, LogReport
+from hybridkin.workflow.choices import RadiusEntry
+from hybridkin.workflow.errors import Errors
+from hybridkin.workflow.fit_record import errors_of_markers, write_markers
+from hybridkin.workflow.log import MeasuredLog, checked, write_check
+from hybridkin.workflow.model import LoadedModel
+from hybridkin.workflow.report import Report, check_out
 
-_PARTS = {"new rows": "new", "fitted rows": "fitted", "held out in the fit": "held_out"}
-_SHARES = ("share_in_domain", "share_in_radius")
+_FIGURES = ("error_histogram.png", "workspace.png")
+
+
+@dataclass(frozen=True, kw_only=True)
+class LogErrors(Errors):
+    """Errors of rows of a log [m], and the shares of them in the domain and in the radius."""
+
+    share_in_domain: float | None = None
+    share_in_radius: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluation:
+    """What `evaluate_log` found.
+
+    Attributes
+    ----------
+    command, model, log : str
+        "evaluate", and the sources.
+    split : str
+        The kind of the motions, in words.
+    log_check : LogReport
+        Findings of the check of the log.
+    all : LogErrors
+        Errors of all rows [m].
+    motions : dict of str to LogErrors
+        Errors by motion.
+    fitted_rows : int or None
+        Number of rows that the model was fitted to, None if not known. If half of a motion was
+        fitted, all of its rows count as fitted.
+    fitted, new : LogErrors or None
+        Errors of fitted rows and of other rows.
+    held_out : Errors or None
+        Errors of the fit on held-out motions, if rows were fitted.
+    markers : list of Errors or None
+        Errors of every marker, base to tip; None for a single one.
+    radius : RadiusEntry or None
+        The estimated error radius of the model.
+    """
+
+    command: str = "evaluate"
+    model: str
+    log: str
+    split: str
+    log_check: LogReport
+    all: LogErrors
+    motions: Mapping[str, LogErrors]
+    fitted_rows: int | None
+    fitted: LogErrors | None
+    new: LogErrors | None
+    held_out: Errors | None
+    markers: Sequence[Errors] | None
+    radius: RadiusEntry | None
+
+    @property
+    def judged(self) -> Errors:
+        """The errors that count: of new rows; if all were fitted, those on held-out motions."""
+        return self.new or self.held_out or self.all
+
+    def _write(self, report: Report[Any]) -> None:
+        """Add the record to a report."""
+        write_check(report, self.log_check)
+        report.text("## Errors by motion, largest first")
+        if self.fitted_rows is None:
+            report.text(
+                "The model does not say which rows it was fitted to; they have smaller errors."
+            )
+        if self.fitted_rows:
+            report.text(
+                f"**{self.fitted_rows} of {self.all.rows} rows were fitted: their errors are "
+                "training errors.** To test the model, evaluate a log of other motions."
+            )
+        entries: dict[str, Errors] = {"all rows": self.all}
+        if self.fitted is not None:
+            parts = {
+                "new rows": self.new,
+                "fitted rows": self.fitted,
+                "held out in the fit": self.held_out,
+            }
+            entries |= {name: part for name, part in parts.items() if part is not None}
+        largest_first = sorted(self.motions.items(), key=lambda item: -item[1].mean)
+        columns = ["rows", "mean", "median", "p95", "max"]
+        if self.all.share_in_domain is not None:
+            columns.append("share_in_domain")
+        if self.radius is not None:
+            columns.append("share_in_radius")
+        report.errors(entries | dict(largest_first), columns)
+        if self.radius is not None:
+            report.text(f"{self.radius.words} Rows without a radius do not count.")
+        write_markers(report, self.markers, "all rows")
+
+
+@dataclass(frozen=True, eq=False)
+class _RowErrors:
+    """The tip error of every row (N,) [m], and whether it is in the domain and in the radius.
+
+    What the model does not know is None; of rows without a radius `in_radius` is NaN.
+    """
+
+    error: NDArray
+    in_domain: NDArray | None = None
+    in_radius: NDArray | None = None
+
+    def of(self, rows: NDArray) -> LogErrors:
+        """Return the errors of some rows."""
+        return LogErrors.of(
+            self.error[rows],
+            share_in_domain=_share(self.in_domain, rows),
+            share_in_radius=_share(self.in_radius, rows),
+        )
+
+
+def _share(values: NDArray | None, rows: NDArray) -> float | None:
+    if values is None:
+        return None
+    known = values[rows][~np.isnan(values[rows])]
+    return float(known.mean()) if known.size else np.nan
 
 
 def evaluate_log(
@@ -31,7 +145,7 @@ def evaluate_log(
     out: str | Path | None = None,
     *,
     force: bool = False,
-) -> tuple[Report, list[Path]]:
+) -> Report[Evaluation]:
     """Return the errors of a model on a log, and write them with figures if `out` is given.
 
     Parameters
@@ -48,14 +162,8 @@ def evaluate_log(
 
     Returns
     -------
-    report : Report
-        Its ``record`` holds "all" and "motions" with mean, median, p95 and max [m], and if the
-        model has them "share_in_domain" and "share_in_radius". "fitted_rows" is the number of rows
-        that the model was fitted to, None if not known. "fitted" and "new" hold the errors of
-        fitted rows and other rows, "held_out" those of the fit on held-out motions. If half of a
-        motion was fitted, all of its rows count as fitted.
-    paths : list of Path
-        The written files.
+    Report of Evaluation
+        The errors of all rows, of every motion, and of fitted and new rows.
 
     Raises
     ------
@@ -63,10 +171,8 @@ def evaluate_log(
         If the log does not pass its check.
     """
     if out is not None:
-        check_out(
-            out, "evaluate", ["error_histogram.png", "workspace.png"], force=force
-        )
-    check_columns(log.q, loaded)
+        check_out(out, "evaluate", _FIGURES, force=force)
+    loaded.check_columns(log.q)
     measured = checked(log, None, base_is_free=False)
     measured.check(force)
     if loaded.play is not None:
@@ -75,103 +181,75 @@ def evaluate_log(
     motion = measured.motions if measured.named else np.zeros(len(log.q))
     predicted = loaded.predict(log.q, motion)
     markers = distances(predicted, log.x)
-    columns = {"error": np.nanmean(markers, axis=1)}
-    report = Report(f"{loaded.name}: errors on {Path(log.source).name}")
-    if loaded.hybrid is not None:
-        columns["share_in_domain"] = loaded.hybrid.in_domain(log.q, groups=motion)
-        if loaded.hybrid.radius_ is not None:
-            _, radius = loaded.hybrid.predict(log.q, return_radius=True, groups=motion)
-            columns["share_in_radius"] = np.where(
-                np.isinf(radius), np.nan, np.nanmax(markers, axis=1) <= radius
-            )
-            report.record["radius"] = radius_entry(loaded.hybrid)
+    errors = _row_errors(loaded, log.q, motion, markers)
     motions = {}
     for name in dict.fromkeys(measured.motions):
-        motions[str(name)] = _entry(columns, measured.motions == name)
+        motions[str(name)] = errors.of(measured.motions == name)
     fitted = loaded.was_fitted(log.q, log.x, measured.motions)
-    new_errors = fitted_errors = None
-    if fitted is not None and not fitted.all():
-        new_errors = _entry(columns, ~fitted)
+    fitted_errors = None
+    new_errors = None
     if fitted is not None and fitted.any():
-        fitted_errors = _entry(columns, fitted)
-    report.record.update(
-        command="evaluate",
+        fitted_errors = errors.of(fitted)
+    if fitted is not None and not fitted.all():
+        new_errors = errors.of(~fitted)
+    record = Evaluation(
         model=str(loaded.path),
         log=log.source,
-        all=_entry(columns, slice(None)),
+        split=measured.split,
+        log_check=measured.report,
+        all=errors.of(np.ones(len(log.q), dtype=bool)),
         motions=motions,
         fitted_rows=None if fitted is None else int(fitted.sum()),
-        new=new_errors,
         fitted=fitted_errors,
+        new=new_errors,
         held_out=None if fitted_errors is None else loaded.held_out,
-        split=measured.split,
+        markers=errors_of_markers(markers),
+        radius=RadiusEntry.of(loaded.hybrid),
     )
-    write_check(report, measured)
-    _write_errors(report)
-    write_markers(report, markers, "all rows")
-    if out is None:
-        return report, []
-    _add_figures(report, loaded, measured, predicted, motion)
-    return report, report.write(out)
+    report = Report(f"{loaded.name}: errors on {Path(log.source).name}", record)
+    record._write(report)
+    if out is not None:
+        _add_figures(report, loaded, measured, predicted, motion)
+        report.write(out)
+    return report
 
 
-def _entry(columns: dict[str, NDArray], rows: NDArray | slice) -> dict[str, Any]:
-    error = columns["error"][rows]
-    entry = {"rows": len(error), **statistics(error)}
-    for name in _SHARES:
-        if name in columns:
-            values = np.ma.masked_invalid(columns[name][rows])
-            entry[name] = float(np.ma.filled(values.mean(), np.nan))
-    return entry
-
-
-def _write_errors(report: Report) -> None:
-    record = report.record
-    everything = record["all"]
-    motions = sorted(record["motions"].items(), key=lambda item: -item[1]["mean"])
-    report.text("## Errors by motion, largest first")
-    if record["fitted_rows"] is None:
-        report.text(
-            "The model does not say which rows it was fitted to; they have smaller errors."
-        )
-    if record["fitted_rows"]:
-        report.text(
-            f"**{record['fitted_rows']} of {everything['rows']} rows were fitted: their errors are "
-            "training errors.** To test the model, evaluate a log of other motions."
-        )
-    entries = {"all rows": everything}
-    if record["fitted"] is not None:
-        for title, name in _PARTS.items():
-            if record[name] is not None:
-                entries[title] = record[name]
-    columns = ["rows", "mean", "median", "p95", "max"]
-    columns += [share for share in _SHARES if share in everything]
-    report.errors({**entries, **dict(motions)}, columns)
-    if "radius" in report.record:
-        report.text(
-            f"{report.record['radius']['words']} Rows without a radius do not count."
-        )
+def _row_errors(
+    loaded: LoadedModel, q: NDArray, motion: NDArray, markers: NDArray
+) -> _RowErrors:
+    error = np.nanmean(markers, axis=1)
+    hybrid = loaded.hybrid
+    if hybrid is None:
+        return _RowErrors(error)
+    in_domain = hybrid.in_domain(q, groups=motion)
+    if hybrid.radius_ is None:
+        return _RowErrors(error, in_domain)
+    _, radius = hybrid.predict(q, return_radius=True, groups=motion)
+    inside = np.nanmax(markers, axis=1) <= radius
+    return _RowErrors(error, in_domain, np.where(np.isinf(radius), np.nan, inside))
 
 
 def _add_figures(
-    report: Report,
+    report: Report[Evaluation],
     loaded: LoadedModel,
     log: MeasuredLog,
     predicted: NDArray,
     motion: NDArray,
 ) -> None:
-    errors = distance(predicted, log.x)
-    figure, ax = new_figure(6.0, 3.6)
-    ErrorHistogramDisplay({loaded.kind: errors}).plot(ax, unit="mm")
+    plots = hybridkin.plots
+    errors = np.nanmean(distances(predicted, log.x), axis=1)
+    figure, ax = plots.new_figure(6.0, 3.6)
+    plots.ErrorHistogramDisplay({loaded.kind: errors}).plot(ax, unit="mm")
     ax.set(ylabel="rows")
     report.figure("error_histogram", figure, "Tip errors of all rows.")
-    figure, ax = new_figure(6.4, 5.2, subplot_kw={"projection": "3d"})
+    figure, ax = plots.new_figure(6.4, 5.2, subplot_kw={"projection": "3d"})
     row = int(np.argsort(errors)[int(0.95 * len(errors))])
     body = None
     if loaded.chain is not None:
         q = loaded.effective(log.q, motion)[row]
-        body = BackboneDisplay.from_estimator(loaded.chain, q).points[0]
-    WorkspaceDisplay(log.x[:, -3:], predicted[:, -3:], body, row).plot(ax, unit="mm")
+        body = plots.BackboneDisplay.from_estimator(loaded.chain, q).points[0]
+    tips = plots.WorkspaceDisplay(log.x[:, -3:], predicted[:, -3:], body, row)
+    tips.plot(ax, unit="mm")
     report.figure(
         "workspace", figure, "Measured tips, coloured by the tip error of the model."
     )

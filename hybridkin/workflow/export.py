@@ -2,16 +2,37 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from hybridkin.ik.solver import InverseKinematics
 from hybridkin.native.export import export_c
 from hybridkin.workflow.domain import Domain, PathLimits, path_limits
 from hybridkin.workflow.model import LoadedModel
 from hybridkin.workflow.report import Report
+
+
+@dataclass(frozen=True, eq=False)
+class Export:
+    """What `export_model` wrote.
+
+    Attributes
+    ----------
+    n_actuators : int
+        Size of q.
+    dtype : str
+        Number type of the code.
+    dt : float or None
+        Control period [s] of the step, None without.
+    limits : PathLimits or None
+        Limits of the step, None without.
+    """
+
+    n_actuators: int
+    dtype: str
+    dt: float | None
+    limits: PathLimits | None
 
 
 def export_model(
@@ -22,7 +43,7 @@ def export_model(
     dtype: str = "float64",
     dt: float | None = None,
     limits: PathLimits | None = None,
-) -> tuple[Report, list[Path]]:
+) -> Report[Export]:
     """Write a model as C code, see `native.export_c`.
 
     Parameters
@@ -43,40 +64,34 @@ def export_model(
 
     Returns
     -------
-    report : Report
-        Its ``record`` holds "n_actuators", "dtype", "dt", and with a step "limits".
-    paths : list of Path
-        The written files.
+    Report of Export
+        What was written.
     """
-    report = Report("C code")
     model = loaded.module
-    report.record.update(n_actuators=loaded.n_actuators, dtype=dtype, dt=dt)
+    if dt is None:
+        limits = None
+    else:
+        limits = limits or path_limits(loaded)
+        model = Domain(loaded, limits).solver(dt=dt)
+    report = Report("C code", Export(loaded.n_actuators, dtype, dt, limits))
     report.text(f"{name}: {loaded.n_actuators} actuators, {dtype}.")
-    if dt is not None:
-        if limits is None:
-            limits = path_limits(loaded)
-        settings: dict[str, Any] = {
-            k: v for k, v in vars(limits).items() if k != "source"
-        }
-        settings |= {"q_pref": Domain(loaded, limits).preferred}
-        model = InverseKinematics(loaded.module, dt=dt, **settings)
-        report.record["limits"] = vars(limits)
+    if limits is not None:
         report.text(f"Steps of {dt:g} s within limits: {limits.source}.")
     about_q = _about_q(loaded)
     report.text(about_q)
-    return report, export_c(model, out, name=name, dtype=dtype, about_q=about_q)
+    report.paths = export_c(model, out, name=name, dtype=dtype, about_q=about_q)
+    return report
 
 
 def _about_q(loaded: LoadedModel) -> str:
     """Return unit, sign and backlash of q in sentences, as a controller must know them."""
     log = loaded.log_format()
     factors = np.broadcast_to(log.q_factor, len(log.q))
-    rows = zip(factors, log.q, strict=True)
-    terms = ", ".join(
-        f"q[{i}] = {factor:g} * {name}" for i, (factor, name) in enumerate(rows)
-    )
+    terms = []
+    for i, name in enumerate(log.q):
+        terms.append(f"q[{i}] = {factors[i]:g} * {name}")
     unit = "" if log.q_unit == "1" else f" in {log.q_unit}"
-    about_q = f"q from the columns of the log{unit}: {terms}."
+    about_q = f"q from the columns of the log{unit}: {', '.join(terms)}."
     if loaded.play is None:
         return about_q
     return (

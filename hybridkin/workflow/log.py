@@ -6,6 +6,7 @@ import fnmatch
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from hybridkin.chains import robots
 from hybridkin.chains.chain import Chain
 from hybridkin.datasets import Log, LogReport, check_log, load_log
+from hybridkin.workflow.report import Report
 
 _BLOCKS = 10
 
@@ -173,6 +175,13 @@ def read_log(
         rows = np.setdiff1d(np.arange(len(log.q)), np.concatenate([[], *frozen]))
         measured = replace(measured.rows(rows), report=report.accepting("frozen tip"))
     return measured
+
+
+def write_check(report: Report[Any], check: LogReport) -> None:
+    """Add the findings of the check of a log to a report."""
+    report.text(f"## The log\n\nThe check of the log found {check.summary()}.")
+    for f in check.findings:
+        report.text(f"- **{f.severity}**, {f.kind}: {f.message} Advice: {f.advice}")
 
 
 def checked(log: Log, chain: Chain | None, base_is_free: bool) -> MeasuredLog:

@@ -22,7 +22,7 @@ from hybridkin.hybrid.log_distance import distances
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.native.library import evaluate
 from hybridkin.saving.saved_model import load_model, model_header
-from hybridkin.workflow._promise import Promise
+from hybridkin.workflow.errors import ExpectedErrors, HeldOutErrors, Promise
 
 LOG_SUFFIXES = (".csv", ".tsv", ".txt", ".npz", ".parquet", ".pq")
 """Endings of files that are treated as logs."""
@@ -63,9 +63,8 @@ class LoadedModel:
     @property
     def chain(self) -> Chain | None:
         """The mechanical model if it is a chain, else None."""
-        if self.hybrid is None:
-            mechanical = self.model
-        else:
+        mechanical = self.model
+        if self.hybrid is not None:
             mechanical = self.hybrid.mechanical_model_
         return mechanical if isinstance(mechanical, Chain) else None
 
@@ -97,17 +96,21 @@ class LoadedModel:
         return None if self.hybrid is None else self.hybrid.play_
 
     @property
-    def play_width(self) -> list[float] | None:
-        """The backlash of every actuator [m], None without."""
-        return None if self.hybrid is None else play_widths(self.hybrid)
+    def half_play(self) -> NDArray | float:
+        """Half the width of the backlash, in the unit of q; 0 without."""
+        return 0.0 if self.play is None else 0.5 * self.play.width
 
     def effective(self, q: NDArray, groups: NDArray | None = None) -> NDArray:
         """Return the motion of the actuators (N, n) for commands q of one motion, or of groups."""
         if self.play is None:
             return q
-        return self.play.apply_by_group(
-            q, np.zeros(len(q)) if groups is None else groups
-        )
+        if groups is None:
+            groups = np.zeros(len(q))
+        return self.play.apply_by_group(q, groups)
+
+    def commands(self, q: NDArray) -> NDArray:
+        """Return the commands (N, n) that move the actuators along q (N, n), row after row."""
+        return q if self.play is None else self.play.command(q)[0]
 
     def predict(self, q: NDArray, groups: NDArray | None = None) -> NDArray:
         """Return tips (N, 3) [m], or all markers; `groups`, the motions, matter with backlash."""
@@ -121,9 +124,16 @@ class LoadedModel:
 
     def domain_distance(self, q: NDArray) -> NDArray:
         """Return the distance of rows q (N, n) from the training rows, at most 1 in the domain."""
-        return evaluate(
-            self.module, np.array(q, dtype=float), value=False, distance=True
-        )[0]
+        q = np.array(q, dtype=float)
+        return evaluate(self.module, q, value=False, distance=True)[0]
+
+    def check_columns(self, q: NDArray) -> None:
+        """Raise if the rows q (N, n) of a log do not have one column for each actuator."""
+        if q.shape[1] != self.n_actuators:
+            raise ValueError(
+                f"`q` must name {self.n_actuators} columns, one for each actuator of the model, "
+                f"got {q.shape[1]}."
+            )
 
     def was_fitted(
         self, q: NDArray, x: NDArray, motions: NDArray
@@ -137,54 +147,55 @@ class LoadedModel:
             return None if self.header else np.zeros(len(q), dtype=bool)
         fitted = np.isin(row_digests(q, x), self.hybrid._fitted_rows)
         _, motion = np.unique(motions, return_inverse=True)
-        return (
-            fitted | (np.bincount(motion, fitted) >= 0.5 * np.bincount(motion))[motion]
-        )
+        half_fitted = np.bincount(motion, fitted) >= 0.5 * np.bincount(motion)
+        return fitted | half_fitted[motion]
 
     @property
-    def _training(self) -> dict[str, Any]:
+    def training(self) -> dict[str, Any]:
+        """The notes of the fit in the file; empty without."""
         return (self.header or {}).get("training") or {}
 
     @property
-    def held_out(self) -> dict[str, float] | None:
-        """Errors [m] of the fit on held-out motions, where the file has them."""
-        return self._training.get("held_out", {}).get(self._training.get("saved"))
+    def held_out(self) -> HeldOutErrors | None:
+        """Errors of the fit on held-out motions, where the file has them."""
+        entry = self.training.get("held_out", {}).get(self.training.get("saved"))
+        return None if entry is None else HeldOutErrors.read(entry)
 
     @property
     def kind(self) -> str:
         """What the model is, as the fit calls it: "hybrid, ELM", "mechanical, nominal", ..."""
-        nominal = "data-driven" if self.chain is None else "mechanical, nominal"
-        return self._training.get("saved") or (
-            nominal if self.hybrid is None else "hybrid"
-        )
+        kind = "hybrid"
+        if self.hybrid is None:
+            kind = "data-driven" if self.chain is None else "mechanical, nominal"
+        return self.training.get("saved", kind)
 
-    def promised_errors(self, q: NDArray) -> dict[str, NDArray]:
-        """Return the "mean" errors and their "p95" (N,) [m] to expect where the actuators do q.
+    def promised_errors(self, q: NDArray) -> ExpectedErrors | None:
+        """Return the errors (N,) to expect where the actuators do q (N, n).
 
-        They are those of held-out motions at the same distance from the log. Empty if the file
-        does not have them.
+        They are those of held-out motions at the same distance from the log. None if the file does
+        not have them.
         """
         held_out = self.held_out
         if held_out is None:
-            return {}
-        constant = {
-            "at_rows": held_out["mean"],
-            "per_distance": 0.0,
-            "p95": held_out["p95"] / held_out["mean"],
-        }
-        promise = Promise(**self._training.get("promise", constant))
-        far = np.zeros(len(q))
-        tested = None if self.hybrid is None else self.hybrid.fitted_module_.tested
-        if self.hybrid is not None and tested is not None:
-            far = distances(tested, q + self.hybrid.change_.shift)
-        mean = promise.mean(far)
-        return {"mean": mean, "p95": promise.p95 * mean}
+            return None
+        promise = Promise(held_out.mean, 0.0, held_out.p95 / held_out.mean)
+        if "promise" in self.training:
+            promise = Promise(**self.training["promise"])
+        tested = None if self.hybrid is None else self.hybrid.module_.tested
+        if self.hybrid is None or tested is None:
+            return promise.at(np.zeros(len(q)))
+        shift = as_array(self.hybrid.module_.shift_of_zeros)
+        return promise.at(distances(tested, q + shift))
 
     def expected_errors(self, q: NDArray) -> dict[str, NDArray]:
         """Return by name the errors (N,) [m] to expect of the robot where the actuators do q."""
-        words = {"mean": "held-out motions, mean", "p95": "held-out motions, 95 %"}
-        expected = {words[k]: errors for k, errors in self.promised_errors(q).items()}
-        if self.hybrid is not None and (radius := self.hybrid.radius_) is not None:
+        expected = {}
+        promised = self.promised_errors(q)
+        if promised is not None:
+            expected["held-out motions, mean"] = promised.mean
+            expected["held-out motions, 95 %"] = promised.p95
+        if self.hybrid is not None and self.hybrid.radius_ is not None:
+            radius = self.hybrid.radius_
             name = f"estimated error radius, {100 * radius.coverage:g} %"
             expected[name] = radius.at(self.domain_distance(q) <= 1.0)
         return expected
@@ -206,22 +217,13 @@ class LoadedModel:
         if self.description is not None and self.description.log is not None:
             return self.description.log
         names = tuple(f"q{i + 1}" for i in range(self.n_actuators))
-        plain = not isinstance(self.chain, ArcChain) or self.chain.in_metres
-        return robots.LogFormat(names, ("x", "y", "z"), "m" if plain else "1")
+        in_metres = not isinstance(self.chain, ArcChain) or self.chain.in_metres
+        return robots.LogFormat(names, ("x", "y", "z"), "m" if in_metres else "1")
 
 
-def check_columns(q: NDArray, loaded: LoadedModel) -> None:
-    """Raise if the rows q (N, n) of a log do not have one column for each actuator."""
-    if q.shape[1] != loaded.n_actuators:
-        raise ValueError(
-            f"`q` must name {loaded.n_actuators} columns, one for each actuator of the model, got "
-            f"{q.shape[1]}."
-        )
-
-
-def play_widths(model: HybridForwardModel) -> list[float] | None:
+def play_widths(model: HybridForwardModel | None) -> list[float] | None:
     """Return the backlash of every actuator [m], None without."""
-    if model.play_ is None:
+    if model is None or model.play_ is None:
         return None
     chain = model.mechanical_model_
     width = model.play_.width
@@ -268,23 +270,16 @@ def open_model(path: str | Path, robot: str | Path | None = None) -> LoadedModel
             f"`model` must be a model or a robot description, got the log {path}."
         )
     if path.is_dir():
-        if not (path / _MODEL).is_file():
-            raise FileNotFoundError(
-                f"`model` {path} is a folder without {_MODEL}; name the file."
-            )
         path = path / _MODEL
-    file = path
+    model = load_model(path)
     beside = path.with_name(_ROBOT)
-    model = load_model(file)
     if robot is None and path.name == _MODEL and beside.is_file():
         robot = beside
-    description = None if robot is None else robots.read_description(robot)
-    name = path.stem if description is None else description.name
-    loaded = LoadedModel(name, path, model, description, model_header(file))
-    if description is not None and description.n_actuators not in (
-        0,
-        loaded.n_actuators,
-    ):
+    if robot is None:
+        return LoadedModel(path.stem, path, model, header=model_header(path))
+    description = robots.read_description(robot)
+    loaded = LoadedModel(description.name, path, model, description, model_header(path))
+    if description.n_actuators not in (0, loaded.n_actuators):
         raise ValueError(
             f"`robot` {description.name!r} has {description.n_actuators} actuators, but the model "
             f"{path} has {loaded.n_actuators}; give the description that it was fitted with."

@@ -5,21 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from hybridkin._core.arrays import as_array, as_path, number, one_of, real_array
 from hybridkin.ik import trajectories
 from hybridkin.ik.trajectories import Trajectory
-from hybridkin.workflow._places import placed
 from hybridkin.workflow.domain import Domain, PathLimits
 from hybridkin.workflow.model import LoadedModel
+from hybridkin.workflow.reach import center_of, placed
 
 _TOL = 1e-4  # of a point that lies in the domain [m]
 _EXAMPLE = ("40", "20", "0")  # sizes
-# shapes, with the meaning of their sizes
+# Shapes, with the meaning of their sizes.
 _SHAPES = {
     "figure-eight": ("width", "height"),
     "spiral": ("first radius", "last radius"),
@@ -76,12 +75,15 @@ def read_path(
     timed = trajectories.from_csv(file, unit=unit)
     if dt is None:
         return timed
-    t = timed.t[0] + dt * np.arange(
-        int(trajectories.periods(timed.duration, dt) + 1e-9) + 1
-    )
-    return Trajectory(
-        t, np.stack([np.interp(t, timed.t, c) for c in timed.x.T], axis=1)
-    )
+    n_steps = int(trajectories.periods(timed.duration, dt) + 1e-9)
+    t = timed.t[0] + dt * np.arange(n_steps + 1)
+    return interpolated(timed, t)
+
+
+def interpolated(path: Trajectory, t: NDArray) -> Trajectory:
+    """Return the points of a path at other times (N,) [s], linear between its points."""
+    columns = [np.interp(t, path.t, column) for column in path.x.T]
+    return Trajectory(t, np.stack(columns, axis=1))
 
 
 def scaled_path(path: Trajectory, scale: float) -> Trajectory:
@@ -101,7 +103,7 @@ def scaled_path(path: Trajectory, scale: float) -> Trajectory:
     """
     if not math.isfinite(number(scale, "scale")):
         raise ValueError(f"`scale` must be finite, got {scale!r}.")
-    center = 0.5 * (path.x.min(axis=0) + path.x.max(axis=0))
+    center = center_of(path)
     return Trajectory(path.t, center + scale * (path.x - center))
 
 
@@ -164,20 +166,29 @@ def shape_path(
     domain = Domain(loaded, limits)
     tips = domain.sample[1]
     middle = tips.mean(axis=0) if center is None else real_array(center, "center")
-    across: Any = normal
-    if normal is None:
-        across = np.linalg.svd(tips - tips.mean(axis=0), full_matrices=False)[2][2]
-        ahead = across if loaded.chain is None else as_array(loaded.chain.base)[:3, 2]
-        if not (across @ ahead > 0.0):
-            across = -across
-    timing: Any = {"duration": duration, "dt": dt}
-    half = 0.5 * np.array(extent)
+    plane: ArrayLike = _normal_of(tips, loaded) if normal is None else normal
     if shape == "figure-eight":
-        path = trajectories.figure_eight(middle, extent, normal=across, **timing)
+        path = trajectories.figure_eight(
+            middle, extent, normal=plane, duration=duration, dt=dt
+        )
     elif shape == "spiral":
         path = trajectories.spiral(
-            middle, extent, normal=across, turns=turns, rise=rise, **timing
+            middle,
+            extent,
+            normal=plane,
+            turns=turns,
+            rise=rise,
+            duration=duration,
+            dt=dt,
         )
     else:
-        path = trajectories.line(middle - half, middle + half, **timing)
+        half = 0.5 * np.array(extent)
+        path = trajectories.line(middle - half, middle + half, duration=duration, dt=dt)
     return placed(domain, path, _TOL)[0] if center is None else path
+
+
+def _normal_of(tips: NDArray, loaded: LoadedModel) -> NDArray:
+    """Return the normal (3,) of the plane nearest to tips (N, 3), along the base's z-axis."""
+    normal = np.linalg.svd(tips - tips.mean(axis=0), full_matrices=False)[2][2]
+    ahead = normal if loaded.chain is None else as_array(loaded.chain.base)[:3, 2]
+    return normal if normal @ ahead > 0.0 else -normal

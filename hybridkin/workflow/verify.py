@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +17,9 @@ from hybridkin._core.rotations import rigid_motion
 from hybridkin.chains.play import PlayOperator
 from hybridkin.datasets import Log
 from hybridkin.native.library import evaluate
-from hybridkin.workflow.model import LoadedModel, check_columns
-from hybridkin.workflow.report import Report, check_out, statistics
+from hybridkin.workflow.errors import Errors, ExpectedErrors
+from hybridkin.workflow.model import LoadedModel
+from hybridkin.workflow.report import Report, check_out, millimetres, percent
 from hybridkin.workflow.track import LEAD_IN, read_track
 
 _KEPT = 1.5  # largest mean error of a kept promise, relative to the promised one
@@ -36,6 +39,76 @@ _REMEDIES = {
 }
 
 
+@dataclass(frozen=True, kw_only=True)
+class PartErrors(Errors):
+    """Errors of a part of a path, and the mean of those that the model promised [m]."""
+
+    promised: float = np.nan
+    promised_p95: float = np.nan
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verification:
+    """What `verify_track` found.
+
+    Attributes
+    ----------
+    command, model, track, log : str
+        "verify", and the sources.
+    parts : dict of str to PartErrors
+        Parts of the path; the first is the whole.
+    kept : bool or None
+        Whether the mean error is at most 1.5 times the promised one; None without a promise.
+    causes : dict of str to float
+        Share of the mean squared error that each cause explains.
+    cause : str or None
+        The cause with the largest share above 0.5, if the promise is not kept.
+    range : float or None
+        Largest range of an actuator relative to the log; None without a log.
+    """
+
+    command: str = "verify"
+    model: str
+    track: str
+    log: str
+    parts: Mapping[str, PartErrors]
+    kept: bool | None
+    causes: Mapping[str, float]
+    cause: str | None
+    range: float | None
+
+    def _write(self, report: Report[Any]) -> None:
+        """Add the record to a report, in words."""
+        path = self.parts["path"]
+        promise = "The model promised no error"
+        if self.kept is not None:
+            promise = (
+                f"Promised: mean {millimetres(path.promised)}, 95 % below "
+                f"{millimetres(path.promised_p95)}"
+            )
+        report.text(
+            f"{promise}. Robot: mean {millimetres(path.mean)}, 95 % below "
+            f"{millimetres(path.p95)}, max {millimetres(path.max)}."
+        )
+        report.errors(self.parts, _COLUMNS)
+        shares = [[cause, f"{100 * v:.0f}"] for cause, v in self.causes.items()]
+        report.table(["cause", "explains [%]"], shares)
+        if self.kept:
+            report.text("The promise is kept.")
+        elif self.cause is None:
+            report.text(
+                "None of these explains the error; check load, friction and delay."
+            )
+        else:
+            report.text(f"Likely cause: {self.cause}. To do: {_REMEDIES[self.cause]}.")
+        if self.cause == "moved base" and self.range and self.range < _SHORT:
+            report.text(
+                f"The path covers {percent(self.range)} of the range of the log; on so short a "
+                "path an error of the model looks the same. Repeat a motion of the log to tell "
+                "them apart."
+            )
+
+
 def verify_track(
     loaded: LoadedModel,
     track: str | Path,
@@ -43,7 +116,7 @@ def verify_track(
     out: str | Path | None = None,
     *,
     force: bool = False,
-) -> tuple[Report, list[Path]]:
+) -> Report[Verification]:
     """Compare the error that a track promised with the error of the robot, and find the cause.
 
     The error is the distance of the measured tip from the tip of the model. Four causes are tried,
@@ -67,14 +140,8 @@ def verify_track(
 
     Returns
     -------
-    report : Report
-        Its ``record`` holds "parts" of the path, the first of which is the whole, with "promised"
-        and "promised_p95", mean, p95 and max [m]; "kept", whether the mean is at most 1.5 times the
-        promised one (None without a promise); "causes", the share of the mean squared error that
-        each cause explains; "cause", the largest above 0.5 if the promise is not kept, or None; and
-        "range", the largest range of an actuator relative to the log (None without a log).
-    paths : list of Path
-        The written files.
+    Report of Verification
+        The errors by part of the path, and what explains them.
 
     Raises
     ------
@@ -83,7 +150,7 @@ def verify_track(
     """
     if out is not None:
         check_out(out, "verify", force=force)
-    check_columns(log.q, loaded)
+    loaded.check_columns(log.q)
     sent = read_track(track, loaded.log_format())
     motion = loaded.effective(sent.q)
     rows = _rows_of(log, sent)
@@ -99,26 +166,32 @@ def verify_track(
         )
     q = motion[rows]
     errors = np.linalg.norm(x - loaded.tips(q), axis=1)
-    causes = _explained(loaded, motion, rows, x)
     promised = loaded.promised_errors(q)
-    parts = {
-        name: _entry(errors, promised, part) for name, part in _parts(loaded, q).items()
-    }
-    is_kept = None
-    if promised:
-        is_kept = bool(parts["path"]["mean"] <= _KEPT * parts["path"]["promised"])
+    parts = {}
+    for name, part in _parts(loaded, q).items():
+        if part.any():
+            parts[name] = _errors_of(part, errors, promised)
+    kept = None
+    if promised is not None:
+        kept = bool(parts["path"].mean <= _KEPT * parts["path"].promised)
+    causes = _explained(loaded, motion, rows, x)
     likely = max(causes, key=causes.__getitem__)
-    cause = likely if not is_kept and causes[likely] > _LIKELY else None
-    report = Report(
-        f"{loaded.name}: {Path(track).name} against {Path(log.source).name}"
+    record = Verification(
+        model=str(loaded.path),
+        track=str(track),
+        log=log.source,
+        parts=parts,
+        kept=kept,
+        causes=causes,
+        cause=likely if not kept and causes[likely] > _LIKELY else None,
+        range=_share_of_range(loaded, q),
     )
-    report.record.update(
-        command="verify", model=str(loaded.path), track=str(track), log=log.source
-    )
-    report.record.update(parts=parts, kept=is_kept, causes=causes, cause=cause)
-    report.record.update(range=_share_of_range(loaded, q))
-    _write(report)
-    return report, [] if out is None else report.write(out)
+    title = f"{loaded.name}: {Path(track).name} against {Path(log.source).name}"
+    report = Report(title, record)
+    record._write(report)
+    if out is not None:
+        report.write(out)
+    return report
 
 
 def _rows_of(log: Log, sent: Log) -> NDArray:
@@ -146,13 +219,27 @@ def _rows_of(log: Log, sent: Log) -> NDArray:
 def _parts(loaded: LoadedModel, q: NDArray) -> dict[str, NDArray]:
     """Return the rows of the parts of the path: the whole, in and out of the log, quarters."""
     inside = loaded.domain_distance(q) <= 1.0
-    parts = {"path": np.ones(len(q), dtype=bool)}
-    parts["inside the log"] = inside
-    parts["outside the log"] = ~inside
+    parts = {
+        "path": np.ones(len(q), dtype=bool),
+        "inside the log": inside,
+        "outside the log": ~inside,
+    }
     quarter = 4 * np.arange(len(q)) // len(q)
     for k in range(4):
         parts[f"quarter {k + 1}"] = quarter == k
-    return {name: rows for name, rows in parts.items() if rows.any()}
+    return parts
+
+
+def _errors_of(
+    rows: NDArray, errors: NDArray, promised: ExpectedErrors | None
+) -> PartErrors:
+    if promised is None:
+        return PartErrors.of(errors[rows])
+    return PartErrors.of(
+        errors[rows],
+        promised=promised.mean[rows].mean(),
+        promised_p95=promised.p95[rows].mean(),
+    )
 
 
 def _share_of_range(loaded: LoadedModel, q: NDArray) -> float | None:
@@ -165,16 +252,6 @@ def _share_of_range(loaded: LoadedModel, q: NDArray) -> float | None:
     return float((np.ptp(q, axis=0)[moved] / widths[moved]).max(initial=0.0))
 
 
-def _entry(
-    errors: NDArray, promised: dict[str, NDArray], rows: NDArray
-) -> dict[str, Any]:
-    entry = {"rows": rows.sum()}
-    if promised:
-        entry["promised"] = promised["mean"][rows].mean()
-        entry["promised_p95"] = promised["p95"][rows].mean()
-    return {**entry, **statistics(errors[rows])}
-
-
 def _explained(
     loaded: LoadedModel, motion: NDArray, rows: NDArray, x: NDArray
 ) -> dict[str, float]:
@@ -184,7 +261,7 @@ def _explained(
     residual = x - tips
     off = _off_plane(loaded, q)
     linear = off @ np.linalg.lstsq(off, residual)[0]
-    left = {
+    remaining = {
         "backlash": _without_backlash(motion, rows, J, residual),
         "moved base": np.square(x - _moved(tips, x)).sum(),
         "outside the log": _as_inside(loaded, q - off, residual),
@@ -192,7 +269,8 @@ def _explained(
     }
     whole = max(np.square(residual).sum(), np.finfo(float).tiny)
     return {
-        cause: max(0.0, 1.0 - float(squares / whole)) for cause, squares in left.items()
+        cause: max(0.0, 1.0 - float(squares / whole))
+        for cause, squares in remaining.items()
     }
 
 
@@ -237,37 +315,4 @@ def _as_inside(loaded: LoadedModel, q: NDArray, residual: NDArray) -> float:
     if inside.any():
         return len(q) * squares[inside].mean()
     held_out = loaded.held_out
-    return squares.sum() if held_out is None else len(q) * held_out["mean"] ** 2
-
-
-def _write(report: Report) -> None:
-    parts = report.record["parts"]
-    is_kept = report.record["kept"]
-    cause = report.record["cause"]
-    path = {key: f"{1e3 * value:.3g} mm" for key, value in parts["path"].items()}
-    promise = "The model promised no error"
-    if is_kept is not None:
-        promise = "Promised: mean {promised}, 95 % below {promised_p95}".format(**path)
-    report.text(
-        f"{promise}. Robot: mean {{mean}}, 95 % below {{p95}}, max {{max}}.".format(
-            **path
-        )
-    )
-    report.errors(parts, _COLUMNS)
-    causes = report.record["causes"].items()
-    report.table(
-        ["cause", "explains [%]"], [[name, f"{100 * v:.0f}"] for name, v in causes]
-    )
-    if is_kept:
-        report.text("The promise is kept.")
-    elif cause is None:
-        report.text("None of these explains the error; check load, friction and delay.")
-    else:
-        report.text(f"Likely cause: {cause}. To do: {_REMEDIES[cause]}.")
-        share_of_range = report.record["range"]
-        if cause == "moved base" and share_of_range and share_of_range < _SHORT:
-            report.text(
-                f"The path covers {100 * share_of_range:.0f} % of the range of the log; on so "
-                "short a path an error of the model looks the same. Repeat a motion of the log "
-                "to tell them apart."
-            )
+    return squares.sum() if held_out is None else len(q) * held_out.mean**2

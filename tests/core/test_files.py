@@ -61,13 +61,13 @@ def film(path):
 
 
 def report(out):
-    written = Report("model")
+    written = Report("model", {})
     written.text("text " * 300)
     written.write(out)
 
 
 def table(out):
-    written = Report("next")
+    written = Report("next", {})
     written.file("next.csv", partial(np.savetxt, X=np.eye(20)))
     written.write(out)
 

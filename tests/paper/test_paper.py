@@ -28,7 +28,7 @@ def test_the_figure_of_table1_shows_the_values_of_the_paper():
     models = [("mechanical, nominal", "-"), ("data-driven", "ELM"), ("hybrid on nominal", "ELM")]
     models += [("mechanical, calibrated", "-"), ("hybrid on calibrated", "ELM")]
     table = [{"model": m, "learner": k, "train": known, "test": known} for m, k in models]
-    report = Report("table")
+    report = Report("table", {})
     report.record.update(n_splits=1, n_seeds=1)
     figures = {}
     report.figure = lambda name, figure, caption: figures.update({name: figure})
@@ -85,7 +85,7 @@ def test_the_hybrids_of_the_paper_have_no_guard(monkeypatch):
 def test_which_geometry_the_protocol_identifies():
     found = identifiability(datasets.load_trunk())
     assert (found["n_train"], found["n_single"], found["n_random"]) == (1900, 1500, 400)
-    identified = {entry["name"]: entry["identified"] for entry in found["asked"]["entries"]}
+    identified = {entry.name: entry.identified for entry in found["asked"]["entries"]}
     assert all(identified[f"radii[{k}]"] for k in range(3))
     # A turn of all rings equals one of the base, a rest bend equals zeros of its sensors.
     assert not identified["base[rot z]"]
@@ -99,7 +99,7 @@ def test_which_geometry_the_protocol_identifies():
     assert set(IDENTIFIABLE) < set(ASKED)
     entries = found["identifiable"]["entries"]
     assert len(entries) == 16
-    assert all(entry["identified"] for entry in entries)
+    assert all(entry.identified for entry in entries)
     assert found["identifiable"]["unidentified"] == ()
     assert found["identifiable"]["test"] == pytest.approx(found["asked"]["test"], rel=0.01)
     assert found["identifiable"]["test"] < found["default"]["test"]

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hybridkin._core.arrays import whole
 from hybridkin._core.units import METRES
@@ -15,12 +17,45 @@ from hybridkin.ik.trajectories import Trajectory
 from hybridkin.workflow.domain import Domain, PathLimits, path_limits
 from hybridkin.workflow.log import MeasuredLog
 from hybridkin.workflow.model import LoadedModel
-from hybridkin.workflow.report import Progress, Report, check_out, quiet
+from hybridkin.workflow.report import (
+    Progress,
+    Report,
+    check_out,
+    millimetres,
+    quiet,
+)
 from hybridkin.workflow.track import best_track
 
 _POOL = 2000  # number of configurations to choose from
 _SHOWN = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)  # rows of the table
 _TOL = 1e-3  # tolerance of the inverse kinematics along a path [m]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class NextRows:
+    """What `next_rows` chose.
+
+    Attributes
+    ----------
+    command, model : str
+        "next", and the file of the model.
+    n, n_measured : int
+        Number of chosen configurations, and of rows that are already measured.
+    where : str
+        Where the error must be small, in words.
+    limits : PathLimits
+        The limits of the commands.
+    expected_errors : ndarray of shape (n,)
+        The expected error after each configuration [m].
+    """
+
+    command: str = "next"
+    model: str
+    n: int
+    n_measured: int
+    where: str
+    limits: PathLimits
+    expected_errors: NDArray
 
 
 def next_rows(
@@ -33,7 +68,7 @@ def next_rows(
     path: Trajectory | None = None,
     force: bool = False,
     progress: Progress = quiet,
-) -> tuple[Report, list[Path]]:
+) -> Report[NextRows]:
     """Choose the configurations to measure next, see `choose_rows`, and write them.
 
     ``next.csv`` has one row per configuration, in the order of the choice: commands in the units,
@@ -63,11 +98,8 @@ def next_rows(
 
     Returns
     -------
-    report : Report
-        Its ``record`` holds "expected_errors" [m], after each configuration, "n_measured",
-        "limits", and in words "where" the error must be small.
-    paths : list of Path
-        The written files.
+    Report of NextRows
+        The expected errors, and under which limits.
 
     Raises
     ------
@@ -80,7 +112,6 @@ def next_rows(
     if limits is None:
         limits = path_limits(loaded, within_fit=False)
     domain = Domain(loaded, limits)
-    log = loaded.log_format()
     candidates = domain.postures(_POOL)
     target = None
     where = "within the limits"
@@ -88,37 +119,42 @@ def next_rows(
         target = best_track(domain, path, _TOL, progress).q
         candidates = np.concatenate([target, candidates])
         far = distance(loaded.tips(target), path.x).max()
-        where = f"along the path, which the model reaches to within {1e3 * far:.3g} mm"
-    if measured is None:
-        measured_q = None
-    else:
+        where = f"along the path, which the model reaches to within {millimetres(far)}"
+    measured_q = None
+    if measured is not None:
         measured_q = loaded.effective(measured.q, measured.motions)
     progress("choosing configurations", 0, 1)
     rows, errors = choose_rows(
         loaded.model, candidates, n, measured=measured_q, target=target
     )
-    if loaded.play is None:
-        sent = candidates[rows]
-    else:
-        sent = loaded.play.command(candidates[rows])[0]
-    report = Report(f"{loaded.name}: {n} configurations to measure next")
-    n_measured = 0 if measured_q is None else len(measured_q)
-    report.record.update(
-        model=str(loaded.path), n=n, n_measured=n_measured, where=where
+    record = NextRows(
+        model=str(loaded.path),
+        n=n,
+        n_measured=0 if measured_q is None else len(measured_q),
+        where=where,
+        limits=limits,
+        expected_errors=errors,
     )
-    report.record.update(
-        limits=dict(vars(limits)), expected_errors=errors, command="next"
-    )
+    report = Report(f"{loaded.name}: {n} configurations to measure next", record)
     shown = sorted({k for k in _SHOWN if k < n} | {n})
     table = [[str(k), f"{1e3 * errors[k - 1]:.2f}"] for k in shown]
     report.table(["rows", "expected error [mm]"], table)
     report.text(
         f"Expected error {where}, computed without measured tips. It shows when more rows bring "
-        f"little, not how large the error will be. {n_measured} rows are already measured. Limits: "
-        f"{limits.source}."
+        f"little, not how large the error will be. {record.n_measured} rows are already measured. "
+        f"Limits: {limits.source}."
     )
-    cells = np.column_stack([log.to_log(sent), errors / METRES[log.x_unit]])
-    head = ",".join([*log.q, "expected_error"])
-    written = {"fmt": "%.9g", "delimiter": ",", "header": head, "comments": ""}
-    report.file("next.csv", partial(np.savetxt, X=cells, encoding="utf-8", **written))
-    return report, report.write(out)
+    log = loaded.log_format()
+    sent = log.to_log(loaded.commands(candidates[rows]))
+    write_commands = partial(
+        np.savetxt,
+        X=np.column_stack([sent, errors / METRES[log.x_unit]]),
+        fmt="%.9g",
+        delimiter=",",
+        header=",".join([*log.q, "expected_error"]),
+        comments="",
+        encoding="utf-8",
+    )
+    report.file("next.csv", write_commands)
+    report.write(out)
+    return report

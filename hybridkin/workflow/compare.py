@@ -1,0 +1,390 @@
+"""The comparison of mechanical, data-driven and hybrid models on held-out motions of a log."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from joblib import Parallel, delayed, effective_n_jobs
+from numpy.typing import NDArray
+from sklearn.linear_model import LinearRegression
+from sklearn.pipeline import Pipeline, make_pipeline
+from sklearn.preprocessing import MinMaxScaler, PolynomialFeatures
+
+from hybridkin._core.arrays import whole
+from hybridkin._core.model import ForwardModel
+from hybridkin._core.turns import one_thread
+from hybridkin.calibration.calibrate import CalibrationResult, fit_geometry
+from hybridkin.calibration.choice import GeometryChoice, choose_geometry
+from hybridkin.calibration.measured import distances, folds
+from hybridkin.chains.chain import Chain
+from hybridkin.chains.robots import RobotDescription
+from hybridkin.datasets import Log
+from hybridkin.hybrid.estimator import HybridForwardModel, fit_quietly
+from hybridkin.hybrid.log_distance import held_out_distances
+from hybridkin.learning.elm_cv import ELMRegressorCV
+from hybridkin.learning.regressor_modules import error_module
+from hybridkin.native.library import evaluate
+from hybridkin.workflow.calibrated import CalibratedParameter, calibrated_parameters
+from hybridkin.workflow.choices import choice_in_words
+from hybridkin.workflow.log import MeasuredLog, checked
+from hybridkin.workflow.report import Progress, quiet
+
+NOMINAL = "mechanical, nominal"
+CALIBRATED = "mechanical, calibrated"
+BACKLASH = "mechanical, with backlash"
+DATA_LINEAR = "data-driven, linear"
+DATA_QUADRATIC = "data-driven, quadratic"
+DATA_ELM = "data-driven, ELM"
+HYBRID_ELM = "hybrid, ELM"
+AUTO = "hybrid, auto"
+_KINDS = ("mechanical", "data-driven", "hybrid")  # in the order of the table
+# With and without auto; fewer are not worth a start.
+_ROWS_PER_PROCESS = {True: 150, False: 1500}
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """Settings of a fit and of the comparison of models.
+
+    Attributes
+    ----------
+    loss : str
+        Loss of the calibration, see `calibrate`.
+    coverage : float or None
+        Share of tips that the estimated error radius of the saved model covers, see
+        `HybridForwardModel`. None: no radius.
+    n_folds : int
+        Number of folds of motions that are held out, one after the other.
+    auto : bool
+        Whether to compare and save ``error_model="auto"``; it takes most of the time. Without it,
+        the comparison has fewer hybrids, and the best of them or the calibrated model is saved.
+    play : float, "auto", "detect" or None
+        Backlash (also called play) of the actuators [m] in that hybrid, see `HybridForwardModel`.
+        It requires `auto`, and named motions in order of time. "detect": "auto" if the log allows
+        it and backlash lowers the held-out errors of a network, else None.
+    max_rows : int or None
+        Largest number of rows; of a longer log every k-th row is used. None: all rows.
+    """
+
+    loss: str = "linear"
+    coverage: float | None = None
+    n_folds: int = 5
+    auto: bool = True
+    play: float | str | None = "detect"
+    max_rows: int | None = 2000
+
+    def __post_init__(self) -> None:
+        """Check the counts."""
+        whole(self.n_folds, "n_folds", 2, 1000)
+        if self.max_rows is not None:
+            whole(self.max_rows, "max_rows", 2)
+        if not isinstance(self.auto, bool):
+            raise ValueError(f"`auto` must be True or False, got {self.auto!r:.80}.")
+
+
+DEFAULTS = FitSettings()
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Errors of models on held-out motions.
+
+    Attributes
+    ----------
+    markers : dict of str to ndarray of shape (N, K)
+        Error of every marker of each row when its motion was held out [m], NaN if it was not
+        measured.
+    fold : ndarray of shape (N,)
+        Fold in which a row was held out.
+    distance : ndarray of shape (N,)
+        Distance of each row from the rows of the other folds [half ranges of an actuator].
+    choices : list of dict
+        Settings that were chosen in each fold.
+    """
+
+    markers: dict[str, NDArray]
+    fold: NDArray
+    distance: NDArray
+    choices: list[dict[str, str]]
+
+    @cached_property
+    def errors(self) -> dict[str, NDArray]:
+        """Tip error of each row (N,) by model [m]; for several markers their mean."""
+        return {name: np.nanmean(e, axis=1) for name, e in self.markers.items()}
+
+
+class Rows(NamedTuple):
+    """Rows of a log: q (N, n), x (N, 3 K) [m], and the motion of every row (N,)."""
+
+    q: NDArray
+    x: NDArray
+    motions: NDArray
+
+    def take(self, rows: NDArray) -> Rows:
+        """Return some of the rows."""
+        return Rows(self.q[rows], self.x[rows], self.motions[rows])
+
+
+@dataclass(frozen=True, eq=False)
+class Mechanical:
+    """The mechanical model of a robot, calibrated to rows.
+
+    Attributes
+    ----------
+    model : ForwardModel
+        The calibrated chain; for a robot without segments a linear model of the rows.
+    start : Chain or None
+        The chain before its calibration.
+    result : CalibrationResult or None
+        None if nothing is calibrated.
+    geometry : GeometryChoice or None
+        How the parameters were chosen, if the robot says "auto".
+    messages : list of str
+        Warnings.
+    """
+
+    model: ForwardModel
+    start: Chain | None
+    result: CalibrationResult | None
+    geometry: GeometryChoice | None
+    messages: list[str]
+
+    @classmethod
+    def of(cls, robot: RobotDescription, rows: Rows, loss: str) -> Mechanical:
+        """Return the mechanical model of a robot."""
+        chain = robot.chain
+        if chain is None:
+            linear = LinearRegression().fit(rows.q, rows.x)
+            model = error_module(linear, torch.from_numpy(rows.q))
+            return cls(model, None, None, None, [])
+        names = robot.calibrate
+        geometry = None
+        start = None
+        messages = []
+        if names == "auto":
+            geometry = choose_geometry(
+                chain, rows.q, rows.x, groups=rows.motions, loss=loss
+            )
+            chain = geometry.chain
+            names = geometry.parameters
+            start = geometry.start
+            messages = [*geometry.messages]
+        if not names:
+            return cls(chain, chain, None, geometry, messages)
+        result, of_fit = fit_geometry(chain, rows.q, rows.x, names, loss, start=start)
+        return cls(result.chain, chain, result, geometry, messages + of_fit)
+
+    def rivals(self, rows: Rows, loss: str) -> Iterator[CalibratedParameter]:
+        """Yield the parameters of all other sets with nearly the same errors, calibrated."""
+        rivals = () if self.geometry is None else self.geometry.rivals
+        for rival in rivals:
+            result, _ = fit_geometry(
+                rival.chain, rows.q, rows.x, rival.parameters, loss, start=rival.start
+            )
+            yield from calibrated_parameters(rival.chain, result)
+
+
+def quadratic() -> Pipeline:
+    """Return a plain quadratic polynomial by least squares."""
+    return make_pipeline(
+        MinMaxScaler((-1, 1)), PolynomialFeatures(2), LinearRegression()
+    )
+
+
+def models_to_save(
+    robot: RobotDescription, mechanical: Mechanical, settings: FitSettings
+) -> dict[str, HybridForwardModel]:
+    """Return the unfitted models of the comparison by name."""
+    model = mechanical.model
+    without_error_model = DATA_LINEAR if robot.chain is None else CALIBRATED
+    models = {
+        without_error_model: HybridForwardModel(model, "drop"),
+        DATA_QUADRATIC: HybridForwardModel(None, quadratic()),
+    }
+    network = ELMRegressorCV(250, max_hidden=1000, random_state=0)  # as in auto
+    if settings.auto:
+        models[DATA_ELM] = HybridForwardModel(None, network)
+        models[AUTO] = _auto(robot, model, settings)
+        return models
+    if robot.chain is not None:
+        models["hybrid, linear"] = HybridForwardModel(model, "linear")
+    models["hybrid, quadratic"] = HybridForwardModel(model, "quadratic")
+    models[HYBRID_ELM] = HybridForwardModel(model, network)
+    return models
+
+
+def _auto(
+    robot: RobotDescription, calibrated: ForwardModel, settings: FitSettings
+) -> HybridForwardModel:
+    """Return the hybrid with error_model="auto".
+
+    It calibrates by least squares in each of its own folds. For another loss, which bounds
+    outliers, it gets the calibrated chain and does not calibrate.
+    """
+    model = HybridForwardModel(calibrated, "auto", play=settings.play, random_state=0)
+    if settings.loss == "linear" and robot.chain is not None:
+        model.set_params(mechanical_model=robot.chain, calibrate=robot.calibrate)
+    return model
+
+
+def with_play_detected(
+    settings: FitSettings,
+    log: MeasuredLog,
+    rows: Rows,
+    mechanical: Mechanical,
+) -> FitSettings:
+    """Return settings whose `play` is not "detect"."""
+    if settings.play != "detect":
+        return settings
+    play = None
+    if mechanical.start is not None and settings.auto and log.named and not log.n_late:
+        model = HybridForwardModel(mechanical.model, "drop", play="auto")
+        fit_quietly(model, rows.q, rows.x, rows.motions)
+        play = None if model.play_ is None else "auto"
+    return replace(settings, play=play)
+
+
+def compare_by_group(
+    log: Log,
+    robot: RobotDescription,
+    settings: FitSettings = DEFAULTS,
+    *,
+    n_jobs: int | None = -1,
+    progress: Progress = quiet,
+) -> Comparison:
+    """Return the errors of every model on held-out motions.
+
+    Whole motions are held out. In each fold, the geometry is chosen and calibrated on the training
+    motions, and every model is fitted to them. ``error_model="auto"`` is fitted once; the table has
+    each of its candidates, ``candidates_``, and itself. The prediction for a motion therefore never
+    uses data of this motion. With `play` "detect" one choice is made on all motions: whether the
+    folds look for backlash.
+
+    Parameters
+    ----------
+    log : Log
+        As from `read_log` or `datasets.load_log`; without groups it is cut into 10 parts.
+    robot : RobotDescription
+        Nominal kinematics, and the parameters to calibrate.
+    settings : FitSettings, optional
+        Loss, folds and models.
+    n_jobs : int, optional
+        Largest number of processes.
+    progress : callable, optional
+        Called with (what, done, total).
+
+    Returns
+    -------
+    Comparison
+        Errors [m] by model and row, the fold of each row, and the choices of each fold.
+    """
+    log = checked(log, robot.chain, robot.base_is_free)
+    rows = Rows(log.q, log.x, log.motions)
+    if settings.play == "detect":
+        mechanical = Mechanical.of(robot, rows, settings.loss)
+        settings = with_play_detected(settings, log, rows, mechanical)
+    parts = folds(log.q, log.motions, settings.n_folds)
+    jobs = []
+    for train, test in parts:
+        jobs.append(
+            delayed(_one_fold)(robot, settings, rows.take(train), rows.take(test))
+        )
+    most = max(1, len(log.q) // _ROWS_PER_PROCESS[settings.auto])
+    # Otherwise torch and BLAS start threads in every process, which wait for each other.
+    workers = Parallel(
+        n_jobs=min(effective_n_jobs(n_jobs or 1), len(parts), most),
+        backend="loky",
+        inner_max_num_threads=1,
+        return_as="generator",
+    )
+    stage = "cross-validation by motion"
+    progress(stage, 0, len(parts))
+    fold_results: list[_FoldResult] = []
+    results: Any = workers(jobs)
+    for result in results:
+        fold_results.append(result)
+        progress(stage, len(fold_results), len(parts))
+    fold = np.empty(len(log.q), dtype=int)
+    distance = np.empty(len(log.q))
+    markers = {}
+    for name in _in_all(fold_results):
+        markers[name] = np.empty((len(log.q), log.x.shape[1] // 3))
+    for k, ((_, test), result) in enumerate(zip(parts, fold_results, strict=True)):
+        fold[test] = k
+        distance[test] = result.distance
+        for name, errors in markers.items():
+            errors[test] = result.errors[name]
+    choices = [result.choices for result in fold_results]
+    return Comparison(markers, fold, distance, choices)
+
+
+class _FoldResult(NamedTuple):
+    """Errors (N, K) of every model on the held-out rows, their distances (N,), and choices."""
+
+    errors: dict[str, NDArray]
+    distance: NDArray
+    choices: dict[str, str]
+
+
+@one_thread()  # the processes share the cores already
+def _one_fold(
+    robot: RobotDescription, settings: FitSettings, train: Rows, test: Rows
+) -> _FoldResult:
+    """Return the errors of every model on test rows after a fit to training rows."""
+    mechanical = Mechanical.of(robot, train, settings.loss)
+    models = {}
+    if robot.chain is not None:
+        nominal = _nominal(robot, robot.chain, train, settings.loss)
+        models[NOMINAL] = HybridForwardModel(nominal, "drop")
+    models |= models_to_save(robot, mechanical, settings)
+    errors = {}
+    choices = {}
+    for name, model in models.items():
+        fit_quietly(
+            model,
+            train.q,
+            train.x,
+            train.motions,
+            geometry=mechanical.geometry,
+            held_out=False,
+        )
+        for candidate, module in (model.candidates_ or {}).items():
+            if candidate != "mechanical":
+                errors[f"hybrid, {candidate}"] = _held_out(model, module, test)
+            elif settings.play is not None:  # else it is the calibrated model
+                errors[BACKLASH] = _held_out(model, module, test)
+        errors[name] = _held_out(model, model.module_, test)
+        if name in (DATA_ELM, HYBRID_ELM, AUTO):
+            choices[name] = choice_in_words(model)
+    distance = held_out_distances(train.q, train.motions, test.q)
+    return _FoldResult(errors, distance, choices)
+
+
+def _nominal(robot: RobotDescription, chain: Chain, rows: Rows, loss: str) -> Chain:
+    """Return the described chain, with a fitted base if the base is calibrated."""
+    if not robot.base_is_free:
+        return chain
+    result, _ = fit_geometry(chain, rows.q, rows.x, ("base",), loss)
+    return result.chain
+
+
+def _held_out(model: HybridForwardModel, module: ForwardModel, test: Rows) -> NDArray:
+    """Return the errors (N, K) of the markers on test rows by a module of the fitted model."""
+    q = test.q
+    if model.play_ is not None:
+        q = model.play_.apply_by_group(q, test.motions)
+    return distances(evaluate(module, np.array(q, dtype=float))[0], test.x)
+
+
+def _in_all(fold_results: list[_FoldResult]) -> list[str]:
+    """Return the models that every fold has, kind by kind; kernel ridge has up to 2000 rows."""
+    names = []
+    for name in fold_results[0].errors:
+        if all(name in result.errors for result in fold_results):
+            names.append(name)
+    return sorted(names, key=lambda name: _KINDS.index(name.partition(",")[0]))

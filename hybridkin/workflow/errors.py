@@ -1,0 +1,131 @@
+"""Statistics of tip errors, and the error to expect of a robot at new commands."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+from typing_extensions import Self
+
+
+@dataclass(frozen=True, kw_only=True)
+class Errors:
+    """Statistics of tip errors [m], NaN if not known.
+
+    Attributes
+    ----------
+    rows : int
+        Number of rows.
+    mean, std, median, p95, max : float
+        Mean, standard deviation, median, 95 % quantile and maximum.
+    """
+
+    rows: float = math.nan
+    mean: float
+    std: float = math.nan
+    median: float = math.nan
+    p95: float
+    max: float = math.nan
+
+    @classmethod
+    def of(cls, errors: NDArray, **more: object) -> Self:
+        """Return the statistics of errors (N,); `more` are the fields of a subclass."""
+        return cls(
+            rows=len(errors),
+            mean=errors.mean(),
+            std=errors.std(),
+            median=np.median(errors),
+            p95=np.percentile(errors, 95),
+            max=errors.max(),
+            **more,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class HeldOutErrors(Errors):
+    """Statistics of tip errors on held-out motions [m].
+
+    Attributes
+    ----------
+    std_error : float
+        Standard error of the mean over motions, because rows of a motion have similar errors.
+    by_fold : ndarray of shape (n_folds,)
+        Mean of every fold.
+    std_folds : float
+        Its standard deviation.
+    """
+
+    std_error: float = math.nan
+    by_fold: NDArray | None = None
+    std_folds: float = math.nan
+
+    @classmethod
+    def of_motions(cls, errors: NDArray, motions: NDArray, fold: NDArray) -> Self:
+        """Return the statistics of errors (N,) from the motion and the fold of every row (N,).
+
+        References
+        ----------
+        Cochran, Sampling Techniques (1977), chapter 9A: clusters of unequal sizes.
+        """
+        _, motion = np.unique(motions, return_inverse=True)
+        sums = np.bincount(motion, errors - errors.mean())
+        deviation = np.sqrt(len(sums) * (sums @ sums) / (len(sums) - 1))
+        by_fold = np.bincount(fold, errors) / np.bincount(fold)
+        return cls.of(
+            errors,
+            std_error=deviation / len(errors),
+            by_fold=by_fold,
+            std_folds=by_fold.std(),
+        )
+
+    @classmethod
+    def read(cls, entry: Mapping[str, Any]) -> Self:
+        """Return the errors of an entry of a file; unknown ones are ignored."""
+        names = [field.name for field in fields(cls)]
+        return cls(**{name: entry[name] for name in names if name in entry})
+
+
+@dataclass(frozen=True)
+class ExpectedErrors:
+    """Mean errors (N,) to expect of a robot, and the errors that 95 % do not exceed [m]."""
+
+    mean: NDArray
+    p95: NDArray
+
+
+@dataclass(frozen=True)
+class Promise:
+    """Mean error to expect, which grows linearly with the distance from the log, and a quantile.
+
+    Attributes
+    ----------
+    at_rows : float
+        Mean error at rows of the log [m].
+    per_distance : float
+        Its growth with the distance, see `distances` [m].
+    p95 : float
+        95 % quantile of the errors, relative to the mean.
+    """
+
+    at_rows: float
+    per_distance: float
+    p95: float
+
+    @classmethod
+    def of(cls, errors: NDArray, distances: NDArray) -> Promise:
+        """Return the promise from errors (N,) of held-out rows and their distances (N,)."""
+        columns = np.column_stack([np.ones_like(errors), distances])
+        at_rows, per_distance = nnls(columns, errors)[0]
+        expected = columns @ (at_rows, per_distance)
+        ratios = errors / np.maximum(expected, np.finfo(float).tiny)
+        return cls(at_rows, per_distance, float(np.quantile(ratios, 0.95)))
+
+    def at(self, distances: NDArray) -> ExpectedErrors:
+        """Return the errors (N,) to expect at these distances [m]."""
+        mean = self.at_rows + self.per_distance * distances
+        return ExpectedErrors(mean, self.p95 * mean)

@@ -1,0 +1,118 @@
+"""A film or an interactive page of a robot that follows a file of commands."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+import hybridkin
+from hybridkin.chains.arc_chain import ArcChain
+from hybridkin.workflow.model import LoadedModel
+from hybridkin.workflow.report import Progress, Report, quiet
+from hybridkin.workflow.track import LEAD_IN, TARGET, read_track
+
+
+@dataclass(frozen=True)
+class Film:
+    """A written film.
+
+    Attributes
+    ----------
+    path : str
+        The file.
+    bytes : int
+        Its size.
+    frames : int
+        Number of frames.
+    fps : float
+        Frames per second.
+    duration_s : float or None
+        Duration of the motion [s], None if the commands have no times.
+    """
+
+    path: str
+    bytes: int
+    frames: int
+    fps: float
+    duration_s: float | None
+
+
+def animate_track(
+    loaded: LoadedModel,
+    path: str | Path,
+    out: str | Path,
+    *,
+    unit: str = "cm",
+    speed: float = 1.0,
+    n_frames: int = 150,
+    progress: Progress = quiet,
+) -> Report[Film]:
+    """Write a film or an interactive page of a robot that follows a file of commands.
+
+    Parameters
+    ----------
+    loaded : LoadedModel
+        A model with a chain as its mechanical model.
+    path : str or Path
+        ``track.csv`` of `track_path`, its folder, or any log of commands in the robot's format. The
+        film begins where the path begins, after the lead-in.
+    out : str or Path
+        File that ends in ".mp4", ".gif" or ".html".
+    unit : {"m", "cm", "mm"}, default="cm"
+        Unit of the axes.
+    speed : float, default=1.0
+        Speed of the film relative to the motion.
+    n_frames : int, default=150
+        Largest number of frames.
+    progress : callable, optional
+        Called with (what, done, total).
+
+    Returns
+    -------
+    Report of Film
+        What was written.
+    """
+    if loaded.chain is None:
+        raise ValueError(
+            f"`model` {loaded.path} has no body to draw; give a model with a chain as its "
+            "mechanical model."
+        )
+    log = read_track(path, loaded.log_format())
+    out = Path(out)
+    q = loaded.effective(log.q)
+    if log.groups is not None:  # the way to the path is no part of it
+        on_path = log.groups != LEAD_IN
+        log = log.rows(on_path)
+        q = q[on_path]
+    promised = loaded.promised_errors(q)
+    film = hybridkin.plots.TrackAnimation.from_estimator(
+        loaded.chain,
+        q,
+        target=log.x if tuple(log.x_names) == TARGET else None,
+        t=log.time,
+        tips=loaded.tips(q),
+        expected=None if promised is None else promised.mean,
+        names=loaded.log_format().q if isinstance(loaded.chain, ArcChain) else (),
+        n_frames=n_frames,
+    )
+    try:
+        film.save(
+            out, unit=unit, speed=speed, progress=partial(progress, "drawing frames")
+        )
+    except RuntimeError as error:  # no program to write films with
+        raise ValueError(str(error)) from error
+    record = Film(
+        path=str(out),
+        bytes=out.stat().st_size,
+        frames=len(film.rows),
+        fps=speed * film.fps,
+        duration_s=None if log.time is None else float(np.ptp(log.time)),
+    )
+    report = Report(f"{loaded.name}: film of {path}", record)
+    size = f"{record.bytes / 1e6:.2f} MB"
+    report.text(f"{record.frames} frames, {record.fps:.3g} a second, {size}")
+    report.paths = [out]
+    return report
