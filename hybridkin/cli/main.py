@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from hybridkin.chains.chain import Chain
     from hybridkin.chains.robots import Limits, LogFormat
     from hybridkin.datasets import LogReport
+    from hybridkin.ik.trajectories import Trajectory
     from hybridkin.workflow import LoadedModel, MeasuredLog, PathLimits, Report
 
 _DT = 0.02
@@ -156,17 +157,13 @@ def _next(arguments: argparse.Namespace, stages: Stages) -> _Result:
     if arguments.log is not None:
         measured = _log_of(loaded, arguments, stages, chain=loaded.chain)
         measured.check(arguments.force)
-    path = None
-    if arguments.path is not None:
-        unit = arguments.unit or loaded.log_format().x_unit
-        path = workflow.read_path(arguments.path, unit=unit, dt=arguments.dt)
     report = workflow.next_rows(
         loaded,
         arguments.out,
         n=arguments.n,
         limits=_limits(arguments, loaded, within_fit=False),
         measured=measured,
-        path=path,
+        path=_path_of(arguments, loaded),
         force=arguments.force,
         progress=stages,
     )
@@ -244,9 +241,10 @@ def _view(arguments: argparse.Namespace, stages: Stages) -> _Result:
     log = None
     if arguments.log is not None:
         log = _log_of(loaded, arguments, stages, base_is_free=True)
+    path = _path_of(arguments, loaded)
     limits = _scaled_limits(arguments, loaded)
     place = {"host": arguments.host, "port": arguments.port}
-    with hybridkin.view(loaded, log, **vars(limits), **place) as shown_robot:
+    with hybridkin.view(loaded, log, path=path, **vars(limits), **place) as shown_robot:
         address = shown_robot.address
         stages.note(f"{loaded.name} is at {address}. Ctrl-C ends it.", important=True)
         if not arguments.no_browser and "SSH_CONNECTION" not in os.environ:
@@ -261,16 +259,14 @@ def _view(arguments: argparse.Namespace, stages: Stages) -> _Result:
 def _track(arguments: argparse.Namespace, stages: Stages) -> _Result:
     workflow = hybridkin.workflow
     loaded = workflow.open_model(arguments.model, arguments.robot)
-    log_format = loaded.log_format()
     if (arguments.path is None) == (arguments.shape is None):
         raise ValueError("give either a file of points or --shape, one of the two.")
+    log_format = loaded.log_format()
     limits = _limits(arguments, loaded)
-    unit = arguments.unit or log_format.x_unit
-    if arguments.path is not None:
-        path = workflow.read_path(arguments.path, unit=unit, dt=arguments.dt)
-    else:
+    path = _path_of(arguments, loaded)
+    if path is None:
+        metre = METRES[arguments.unit or log_format.x_unit]
         center = arguments.center
-        metre = METRES[unit]
         path = workflow.shape_path(
             loaded,
             limits,
@@ -471,6 +467,14 @@ def _scaled_limits(arguments: argparse.Namespace, loaded: LoadedModel) -> Limits
 def _note(found: LogReport, stages: Stages) -> None:
     """Print what the check of a log found."""
     stages.note(f"{found}\n", important=bool(found.errors or found.warnings))
+
+
+def _path_of(arguments: argparse.Namespace, loaded: LoadedModel) -> Trajectory | None:
+    """Return the path of the tip that the arguments name; None without."""
+    if arguments.path is None:
+        return None
+    unit = arguments.unit or loaded.log_format().x_unit
+    return hybridkin.workflow.read_path(arguments.path, unit=unit, dt=arguments.dt)
 
 
 def _log_of(

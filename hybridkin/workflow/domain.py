@@ -164,9 +164,9 @@ class Domain:
         if self.tendons is not None:
             candidates = [self.rest, middle] if trained is None else [middle, self.rest]
         hybrid = self.loaded.hybrid
-        tested = None if hybrid is None else hybrid.module_.tested
+        tested = None if hybrid is None else hybrid.fitted_module_.tested
         if hybrid is not None and tested is not None:
-            rows = as_array(tested.rows - hybrid.module_.shift_of_zeros)
+            rows = as_array(tested.rows) - hybrid.change_.shift
             far = np.linalg.norm(rows - candidates[0], axis=1)
             candidates.append(rows[far.argmin()])
         q = np.clip(candidates, limits.q_min, limits.q_max)

@@ -121,8 +121,14 @@ class Promise:
         """Return the promise from errors (N,) of held-out rows and their distances (N,)."""
         columns = np.column_stack([np.ones_like(errors), distances])
         at_rows, per_distance = nnls(columns, errors)[0]
-        expected = columns @ (at_rows, per_distance)
-        ratios = errors / np.maximum(expected, np.finfo(float).tiny)
+        if (
+            at_rows == 0.0
+        ):  # a robot without error at the rows of its log is not credible
+            at_rows = errors.mean()
+            per_distance = 0.0
+        if at_rows == 0.0:  # no errors at all
+            return cls(0.0, 0.0, 1.0)
+        ratios = errors / (columns @ (at_rows, per_distance))
         return cls(at_rows, per_distance, float(np.quantile(ratios, 0.95)))
 
     def at(self, distances: NDArray) -> ExpectedErrors:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridkin.chains import robots
+from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
 from hybridkin.datasets import Log, LogReport, check_log, load_log
 from hybridkin.workflow.report import Report
@@ -95,7 +96,7 @@ class MeasuredLog(Log):
     def misread(self, calibrated: Chain) -> list[str]:
         """Return new findings on order and signs of q, from a check with the calibrated chain."""
         kinds = {f.kind for f in self.report.misread}
-        misread = check_log(self, chain=calibrated).misread
+        misread = _check(self, calibrated).misread
         return [f"{f.message} {f.advice}" for f in misread if f.kind not in kinds]
 
     def thinned(self, max_rows: int | None) -> MeasuredLog:
@@ -166,9 +167,7 @@ def read_log(
                 "use fewer patterns."
             )
         log = replace(log, groups=np.array(motions)).rows(included)
-    report = check_log(
-        log, chain=chain, base_is_free=base_is_free, drop_invalid=drop_invalid
-    )
+    report = _check(log, chain, base_is_free, drop_invalid)
     measured = _with_motions(log, report, tuple(exclude))
     if drop_frozen:
         frozen = [f.rows for f in report.findings if f.kind == "frozen tip"]
@@ -188,7 +187,16 @@ def checked(log: Log, chain: Chain | None, base_is_free: bool) -> MeasuredLog:
     """Return a log with its check and its motions; a `MeasuredLog` is returned unchanged."""
     if isinstance(log, MeasuredLog):
         return log
-    return _with_motions(log, check_log(log, chain=chain, base_is_free=base_is_free))
+    return _with_motions(log, _check(log, chain, base_is_free))
+
+
+def _check(
+    log: Log, chain: Chain | None, base_is_free: bool = True, drop_invalid: bool = True
+) -> LogReport:
+    arcs = chain if isinstance(chain, ArcChain) else None
+    return check_log(
+        log, chain=arcs, base_is_free=base_is_free, drop_invalid=drop_invalid
+    )
 
 
 def _with_motions(

@@ -181,11 +181,10 @@ class LoadedModel:
         promise = Promise(held_out.mean, 0.0, held_out.p95 / held_out.mean)
         if "promise" in self.training:
             promise = Promise(**self.training["promise"])
-        tested = None if self.hybrid is None else self.hybrid.module_.tested
+        tested = None if self.hybrid is None else self.hybrid.fitted_module_.tested
         if self.hybrid is None or tested is None:
             return promise.at(np.zeros(len(q)))
-        shift = as_array(self.hybrid.module_.shift_of_zeros)
-        return promise.at(distances(tested, q + shift))
+        return promise.at(distances(tested, q + self.hybrid.change_.shift))
 
     def expected_errors(self, q: NDArray) -> dict[str, NDArray]:
         """Return by name the errors (N,) [m] to expect of the robot where the actuators do q."""

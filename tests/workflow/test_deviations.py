@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from hybridkin import ConstantCurvatureChain, calibrate, datasets, robots, workflow
 from hybridkin.datasets import Log
-from hybridkin.workflow._deviations import deviations
+from hybridkin.workflow.calibrated import deviations
 
 RADII = np.array([0.008, 0.007])
 RING = 2 * np.pi / 3 * np.arange(3)

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from hybridkin import HybridForwardModel, robots, save_model
+from hybridkin import HybridForwardModel, plots, robots, save_model
 from hybridkin.workflow import open_model, path_limits, shape_path, track_path
-from hybridkin.workflow import track as track_module
 
 ROBOT = """name = "arm"
 routing = "base"
@@ -62,8 +61,8 @@ def test_figures_of_a_track_are_in_the_words_of_the_user(tmp_path, monkeypatch):
         figures.append(new_figure(*args, **options))
         return figures[-1]
 
-    new_figure = track_module.new_figure
-    monkeypatch.setattr(track_module, "new_figure", kept)
+    new_figure = plots.new_figure
+    monkeypatch.setattr(plots, "new_figure", kept)
     path = shape_path(loaded, path_limits(loaded), "figure-eight", (0.02, 0.01), dt=0.5)
     track_path(loaded, path, tmp_path / "out")
     (_, track), (_, commands) = figures

@@ -85,14 +85,14 @@ def test_a_fit_reports_every_marker_and_its_model_steers_the_tip(folder):
     log = read_log(folder / "log.csv", robot.log, chain=robot.chain)
     out = folder / "fit"
     settings = FitSettings(auto=False, n_folds=2, coverage=0.8)
-    report, _ = fit_log(log, robot, out, settings, n_jobs=1)
-    entries = report.record["markers"]
-    assert [entry["rows"] for entry in entries] == [48, 63]
-    assert all(entry["mean"] < 1e-3 for entry in entries)
+    report = fit_log(log, robot, out, settings, n_jobs=1)
+    entries = report.record.markers
+    assert [entry.rows for entry in entries] == [48, 63]
+    assert all(entry.mean < 1e-3 for entry in entries)
     assert "| marker 1 |" in report.markdown()
     loaded = open_model(out)
     assert loaded.predict(log.q).shape == (64, 6)
     np.testing.assert_allclose(loaded.tips(log.q), loaded.predict(log.q)[:, 3:], atol=1e-12)
-    judged, _ = evaluate_log(loaded, log, folder / "evaluation")
-    assert len(judged.record["markers"]) == 2
-    assert judged.record["all"]["share_in_radius"] > 0.7
+    judged = evaluate_log(loaded, log, folder / "evaluation")
+    assert len(judged.record.markers) == 2
+    assert judged.record.all.share_in_radius > 0.7

@@ -8,9 +8,9 @@ import torch
 
 from hybridkin import ConstantCurvatureChain, HybridForwardModel, IKStatus, workflow
 from hybridkin.ik import trajectories
-from hybridkin.workflow._places import better_place, placed, solver
-from hybridkin.workflow._promise import Promise
 from hybridkin.workflow.domain import Domain
+from hybridkin.workflow.errors import Promise
+from hybridkin.workflow.reach import better_place, placed
 
 rng = np.random.default_rng(0)
 
@@ -22,7 +22,16 @@ def test_errors_that_grow_with_the_distance_are_found():
     assert promise.at_rows == pytest.approx(2e-3, rel=0.1)
     assert promise.per_distance == pytest.approx(3e-3, rel=0.1)
     assert promise.p95 == pytest.approx(-np.log(0.05), rel=0.1)
-    assert np.mean(errors < promise.p95 * promise.mean(far)) == pytest.approx(0.95, abs=0.01)
+    assert np.mean(errors < promise.at(far).p95) == pytest.approx(0.95, abs=0.01)
+
+
+def test_no_promise_is_nothing_at_the_rows_of_the_log():
+    """Where a line through the errors starts at 0, the ratio of error and promise was infinite."""
+    far = np.repeat([0.0, 1.0, 2.0], 40)
+    errors = np.where(far > 0.0, 3e-3 * far - 1e-3, 1e-5)
+    promise = Promise.of(errors, far)
+    assert promise.at(far).mean == pytest.approx(np.full(120, errors.mean()))
+    assert promise.p95 == pytest.approx(5e-3 / errors.mean())
 
 
 @pytest.fixture(scope="module")
@@ -74,10 +83,10 @@ def test_a_path_is_placed_where_its_promise_is_least(domain):
     assert share == 1.0
 
     def promise(shift):
-        solution = solver(promising).solve(path.x + shift, restarts=0)
+        solution = promising.solver().solve(path.x + shift, restarts=0)
         if not (solution.status == IKStatus.CONVERGED).all():
             return np.inf
-        return loaded.promised_errors(solution.q)["mean"].mean()
+        return loaded.promised_errors(solution.q).mean.mean()
 
     least = promise(moved.x[0] - path.x[0])
     elsewhere = np.array([promise(tip - tips.mean(axis=0)) for tip in tips[::25]])

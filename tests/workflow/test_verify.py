@@ -65,7 +65,7 @@ def verified(loaded, tmp_path):
     def verify(q, tips):
         track = written(tmp_path / "track.csv", q, truth(q))
         x = tips + NOISE * np.random.default_rng(1).standard_normal(tips.shape)
-        report, _ = workflow.verify_track(loaded, track, Log(q, x))
+        report = workflow.verify_track(loaded, track, Log(q, x))
         return report
 
     return verify
@@ -75,11 +75,11 @@ def test_a_robot_as_in_the_log_keeps_the_promise(verified):
     q = loops(0.6 * SIZE)
     report = verified(q, truth(q))
     record = report.record
-    assert (record["kept"], record["cause"]) == (True, None)
-    assert record["parts"]["path"]["rows"] == len(q) - 10  # without the lead-in
-    assert record["parts"]["path"]["mean"] == pytest.approx(1.6 * NOISE, rel=0.15)
-    assert record["parts"]["path"]["promised"] == pytest.approx(1.6 * NOISE)
-    assert max(record["causes"].values()) < 0.2
+    assert (record.kept, record.cause) == (True, None)
+    assert record.parts["path"].rows == len(q) - 10  # without the lead-in
+    assert record.parts["path"].mean == pytest.approx(1.6 * NOISE, rel=0.15)
+    assert record.parts["path"].promised == pytest.approx(1.6 * NOISE)
+    assert max(record.causes.values()) < 0.2
     assert "Promised: mean 0.32 mm, 95 % below 0.56 mm. Robot: mean 0." in report.plain()
     assert "The promise is kept." in report.plain()
 
@@ -118,10 +118,10 @@ def test_the_cause_of_a_fault_is_found(verified, fault, cause, remedy):
     q, tips = fault(loops(0.6 * SIZE))
     report = verified(q, tips)
     record = report.record
-    assert record["kept"] is False
-    assert record["cause"] == cause
-    assert record["causes"][cause] > 0.8
-    assert max(v for name, v in record["causes"].items() if name != cause) < 0.5
+    assert record.kept is False
+    assert record.cause == cause
+    assert record.causes[cause] > 0.8
+    assert max(v for name, v in record.causes.items() if name != cause) < 0.5
     assert f"Likely cause: {cause}." in report.plain()
     assert remedy in report.plain()
 
@@ -129,11 +129,11 @@ def test_the_cause_of_a_fault_is_found(verified, fault, cause, remedy):
 def test_a_moved_base_on_a_short_path_is_said_to_be_uncertain(verified):
     q = loops(0.1 * SIZE)
     report = verified(*on_a_moved_base(q))
-    assert report.record["cause"] == "moved base"
-    assert report.record["range"] < 0.2
+    assert report.record.cause == "moved base"
+    assert report.record.range < 0.2
     assert "on so short a path" in " ".join(report.plain().split())
     report = verified(*on_a_moved_base(loops(SIZE)))
-    assert report.record["range"] > 0.5
+    assert report.record.range > 0.5
     assert "on so short a path" not in " ".join(report.plain().split())
 
 
@@ -141,21 +141,21 @@ def test_an_error_of_no_known_cause_is_not_explained(verified):
     q = loops(0.6 * SIZE)
     far = 3e-3 * np.random.default_rng(2).standard_normal((len(q), 3))
     report = verified(q, truth(q) + far)
-    assert (report.record["kept"], report.record["cause"]) == (False, None)
+    assert (report.record.kept, report.record.cause) == (False, None)
     assert "None of these explains the error" in report.plain()
 
 
 def test_parts_of_the_path_have_their_own_errors(verified):
     q, tips = partly_outside(loops(0.6 * SIZE))
-    parts = verified(q, tips).record["parts"]
+    parts = verified(q, tips).record.parts
     assert [*parts] == [
         "path",
         "inside the log",
         "outside the log",
         *(f"quarter {k}" for k in "1234"),
     ]
-    assert parts["inside the log"]["mean"] < 0.3 * parts["outside the log"]["mean"]
-    assert parts["path"]["rows"] == sum(parts[f"quarter {k}"]["rows"] for k in "1234")
+    assert parts["inside the log"].mean < 0.3 * parts["outside the log"].mean
+    assert parts["path"].rows == sum(parts[f"quarter {k}"].rows for k in "1234")
 
 
 def test_rows_are_matched_by_time(loaded, tmp_path):
@@ -163,9 +163,9 @@ def test_rows_are_matched_by_time(loaded, tmp_path):
     track = written(tmp_path / "track.csv", q, truth(q))
     few = slice(None, None, 3)
     log = Log(q[few], truth(q)[few], time=1e9 + 0.1 * np.arange(len(q))[few])
-    report, _ = workflow.verify_track(loaded, track, log)
-    assert report.record["parts"]["path"]["rows"] == len(range(12, len(q), 3))
-    assert report.record["parts"]["path"]["mean"] < NOISE
+    report = workflow.verify_track(loaded, track, log)
+    assert report.record.parts["path"].rows == len(range(12, len(q), 3))
+    assert report.record.parts["path"].mean < NOISE
     with pytest.raises(ValueError, match="`log` must have as many rows as the track or a column"):
         workflow.verify_track(loaded, track, Log(q[few], truth(q)[few]))
 
@@ -203,7 +203,7 @@ def test_a_film_begins_where_the_path_begins(loaded, tmp_path, monkeypatch):
     monkeypatch.setattr(TrackAnimation, "save", save)
     q = loops(0.6 * SIZE)
     written(tmp_path / "track.csv", q, truth(q))
-    record = workflow.animate_track(loaded, tmp_path, tmp_path / "film.gif")
+    record = workflow.animate_track(loaded, tmp_path, tmp_path / "film.gif").record
     np.testing.assert_allclose(films[0].target, truth(q)[10:])
     np.testing.assert_allclose(films[0].x, loaded.tips(q[10:]))
-    assert record["duration_s"] == pytest.approx(0.1 * (len(q) - 11))
+    assert record.duration_s == pytest.approx(0.1 * (len(q) - 11))

@@ -68,10 +68,10 @@ def log(tmp_path):
 def test_turns_of_rings_are_not_identified_apart_from_the_base(log, tmp_path):
     path, robot = log
     robot.write_text(ROBOT.replace('"base"]', '"turns", "base"]'))
-    report, _ = fit(path, robot, tmp_path / "m")
+    report = fit(path, robot, tmp_path / "m")
     text = (tmp_path / "m" / "report.md").read_text()
     assert re.search(r"\| turns\[1\] \[deg\] \|.*\| no \|", text)
-    (sentence,) = report.record["calibration"]["unidentified"]
+    (sentence,) = report.record.calibration.unidentified
     assert sentence.startswith("all turns +1 deg with base[rot z] -1 deg")
     assert f"- {sentence}" in text
 
@@ -81,12 +81,12 @@ def test_fit_warns_once_of_what_is_unphysical(log, tmp_path):
     path, robot = log
     robot.write_text(ROBOT.replace("0.11", "0.05"))
     with pytest.warns(UserWarning, match="gave unphysical values: radii") as caught:
-        report, _ = fit(path, robot, tmp_path / "m")
+        report = fit(path, robot, tmp_path / "m")
     assert len(caught) == 1
     # The same page does not call them identified, however far the data narrow the prior.
-    radii = [e for e in report.record["calibration"]["entries"] if e["name"].startswith("radii")]
-    assert max(entry["narrowing"] for entry in radii) > 10
-    assert not any(entry["identified"] or entry["physical"] for entry in radii)
+    radii = [e for e in report.record.calibration.entries if e.name.startswith("radii")]
+    assert max(entry.narrowing for entry in radii) > 10
+    assert not any(entry.identified or entry.physical for entry in radii)
     text = (tmp_path / "m" / "report.md").read_text()
     assert re.search(r"\| radii\[0\] \[mm\] \|.*\| not physical \|", text)
 
@@ -104,11 +104,11 @@ def test_rows_outside_the_domain_count_for_no_radius(log, tmp_path):
     np.savetxt(path, rows, "%.6f", ",", header=names, comments="")
     new = workflow.read_log(path, replace(form, groups="motion"))
     loaded = workflow.open_model(tmp_path / "model.safetensors", robot)
-    report, _ = workflow.evaluate_log(loaded, new, force=True)
-    motions = report.record["motions"]
-    shares = {float(name): entry["share_in_radius"] for name, entry in motions.items()}
+    report = workflow.evaluate_log(loaded, new, force=True)
+    motions = report.record.motions
+    shares = {float(name): entry.share_in_radius for name, entry in motions.items()}
     assert np.isnan(shares.pop(1.0))
-    assert report.record["all"]["share_in_radius"] == pytest.approx(np.mean([*shares.values()]))
+    assert report.record.all.share_in_radius == pytest.approx(np.mean([*shares.values()]))
     assert re.search(r"\| 1[.0]* \|.*\| 0 \| - \|", report.markdown())
     text = " ".join(report.plain().split())
     assert "radius covering 80 % of the tips: " in text
@@ -149,21 +149,21 @@ def test_fit_of_elastic_tendons(slack_log, tmp_path):
     path, data = slack_log
     robot = tmp_path / "elastic.toml"
     robot.write_text('model = "elastic-tendon"\n' + SLACK_ROBOT)
-    report, paths = fit(path, robot, tmp_path / "m", groups="motion")
-    held_out = report.record["held_out"]
-    calibrated = held_out["mechanical, calibrated"]["mean"]
+    report = fit(path, robot, tmp_path / "m", groups="motion")
+    held_out = report.record.held_out
+    calibrated = held_out["mechanical, calibrated"].mean
     assert calibrated < 0.0005
-    assert calibrated < 0.6 * held_out["data-driven, quadratic"]["mean"]
-    entries = {entry["name"]: entry for entry in report.record["calibration"]["entries"]}
+    assert calibrated < 0.6 * held_out["data-driven, quadratic"].mean
+    entries = {entry.name: entry for entry in report.record.calibration.entries}
     stiffness = entries["bending_stiffness[0]"], entries["axial_stiffness[0]"]
-    assert [entry["unit"] for entry in stiffness] == ["mm²/rad²", "-"]
-    assert [entry["start"] for entry in stiffness] == pytest.approx([0.25, 10.0])
+    assert [entry.unit for entry in stiffness] == ["mm²/rad²", "-"]
+    assert [entry.start for entry in stiffness] == pytest.approx([0.25, 10.0])
     for entry, true in zip(stiffness, (1.0, 2.0), strict=True):
-        assert entry["value"] == pytest.approx(true, rel=0.2)
-        assert 0 < entry["std_error"] < 0.2 * true
-    assert entries["tendon_zeros[0]"]["unit"] == "mm"
-    assert report.record["calibration"]["warnings"] == []
-    assert {"held_out.png", "error_histogram.png"} <= {path.name for path in paths}
+        assert entry.value == pytest.approx(true, rel=0.2)
+        assert 0 < entry.std_error < 0.2 * true
+    assert entries["tendon_zeros[0]"].unit == "mm"
+    assert report.record.calibration.warnings == []
+    assert {"held_out.png", "error_histogram.png"} <= {path.name for path in report.paths}
     model = load_model(tmp_path / "m" / "model.safetensors")
     assert isinstance(model.mechanical_model_, ElasticTendonChain)
     errors = np.linalg.norm(model.predict(data["q"]) - data["x"], axis=1)
@@ -209,13 +209,14 @@ def test_play_is_tried_by_itself_where_the_order_of_the_rows_matters(playful, mo
     robot, log = playful
     tried = []
     monkeypatch.setattr(
-        "hybridkin.workflow.fit._one_fold", lambda train, test: tried.append(train.settings.play)
+        "hybridkin.workflow.compare._one_fold",
+        lambda robot, settings, train, test: tried.append(settings.play),
     )
 
     def play_of(log, **settings):
         tried.clear()
         settings = workflow.FitSettings(n_folds=2, **settings)
-        with contextlib.suppress(TypeError):  # a fold returns no errors
+        with contextlib.suppress(AttributeError):  # a fold returns no errors
             workflow.compare_by_group(log, robot, settings, n_jobs=1)
         return tried[0]
 
@@ -254,11 +255,11 @@ def test_a_fit_to_a_thinned_log_knows_all_of_its_rows(log, tmp_path):
     loaded = workflow.open_model(tmp_path / "m")
     assert loaded.was_fitted(measured.q, measured.x, measured.motions).all()
     assert not loaded.was_fitted(measured.q, measured.x + 1e-5, measured.motions).any()
-    assert loaded.held_out["mean"] > 0
+    assert loaded.held_out.mean > 0
     nominal = workflow.open_model(robot)
     assert not nominal.was_fitted(measured.q, measured.x, measured.motions).any()
-    report, _ = workflow.evaluate_log(nominal, measured)
-    assert report.record["fitted_rows"] == 0
+    report = workflow.evaluate_log(nominal, measured)
+    assert report.record.fitted_rows == 0
 
 
 def test_given_limits_replace_those_of_the_description():
@@ -348,16 +349,16 @@ def test_a_robot_without_segments_from_the_log_to_the_commands(log, tmp_path):
     with pytest.raises(ValueError, match="`play` requires a robot with segments"):
         workflow.fit_log(measured, description, model, workflow.FitSettings(play="auto"))
     settings = workflow.FitSettings(n_folds=2, auto=False)
-    report, _ = workflow.fit_log(measured, description, model, settings, n_jobs=1)
-    errors = report.record["held_out"]
-    saved = report.record["saved"]
+    report = workflow.fit_log(measured, description, model, settings, n_jobs=1)
+    errors = report.record.held_out
+    saved = report.record.saved
     assert saved in ("hybrid, quadratic", "hybrid, ELM")
-    assert errors[saved]["mean"] < errors["data-driven, linear"]["mean"]
+    assert errors[saved].mean < errors["data-driven, linear"].mean
     loaded = workflow.open_model(model)
     assert (loaded.name, loaded.chain) == ("pneumatic arm", None)
     np.testing.assert_allclose(measured.q[0], 1e3 * np.array([0.25] * 6), rtol=0.3)  # as they are
-    evaluated, _ = workflow.evaluate_log(loaded, measured)
-    assert evaluated.record["all"]["mean"] < 0.005
+    evaluated = workflow.evaluate_log(loaded, measured)
+    assert evaluated.record.all.mean < 0.005
     assert loaded.hybrid.in_domain(measured.q).mean() > 0.9
     assert not loaded.hybrid.in_domain(measured.q + 300).any()
     text = workflow.describe(loaded).plain()
@@ -366,8 +367,8 @@ def test_a_robot_without_segments_from_the_log_to_the_commands(log, tmp_path):
     assert re.search(r"q_min = 2\d\d(\.\d)?(, 2\d\d(\.\d)?){5}\.\n", fitted_for)
     x = loaded.predict(measured.q[:1])[0]
     way = trajectories.line(x, (x[0] + 0.005, x[1], x[2]), duration=1.0, dt=0.5)
-    tracked, _ = workflow.track_path(loaded, way, tmp_path / "t", tol=1e-3)
-    assert tracked.record["reached"] == 3
+    tracked = workflow.track_path(loaded, way, tmp_path / "t", tol=1e-3)
+    assert tracked.record.reached == 3
 
 
 def test_a_log_that_does_not_pass_its_check_stops_the_fit(log, tmp_path):

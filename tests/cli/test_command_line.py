@@ -1,0 +1,143 @@
+"""The command line itself: help, options, errors, interrupts."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+from simulated_log import document, run
+
+from hybridkin import workflow
+from hybridkin.cli.main import main
+
+
+@pytest.mark.parametrize(
+    "command", ["init", "fit", "evaluate", "track", "verify", "animate", "describe", "demo"]
+)
+def test_every_command_has_help_with_exit_codes(command, capsys):
+    with pytest.raises(SystemExit) as left:
+        main([command, "--help"])
+    assert left.value.code == 0
+    text = capsys.readouterr().out
+    for words in ("--json", "--quiet", "exit codes: 0"):
+        assert words in text
+    assert f"hybridkin {command} " in text.split("examples:")[1]
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [],
+        ["fly"],
+        ["fit"],
+        ["animate", "model", "track", "--out", "a.gif", "--frames", "0"],
+        ["track", "model", "--shape", "line", "--tol", "-1", "--out", "out"],
+        ["fit", "l", "--robot", "r", "--play", "-1", "--out", "out"],
+        ["fit", "l", "--robot", "r", "--folds", "1", "--out", "out"],
+        ["track", "model", "--shape", "line", "--size", "1,a,0", "--out", "out"],
+    ],
+)
+def test_wrong_options_end_with_2(arguments, capsys):
+    with pytest.raises(SystemExit) as left:
+        main(arguments)
+    assert left.value.code == 2
+    assert capsys.readouterr().err.startswith("hybridkin: error: ")
+
+
+def test_errors_are_json_where_asked(tmp_path, capsys, monkeypatch):
+    code, record = document(capsys, "describe", tmp_path / "none")
+    assert code == record["exit_code"] == 2
+    assert "no such file" in record["error"]
+    monkeypatch.setattr(sys, "argv", ["hybridkin", "fly", "--json"])
+    with pytest.raises(SystemExit):
+        main(["fly", "--json"])
+    assert "invalid choice: 'fly'" in json.loads(capsys.readouterr().out)["error"]
+
+
+SHAPE = ["--shape", "figure-eight", "--size", "5,5", "--unit", "mm"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["evaluate", "log.csv", "robot.toml"], "must be a model or a robot description"),
+        (["track", "robot.toml"], "give either a file of points or --shape"),
+        (["track", "robot.toml", "none.csv"], "there is none at"),
+        (["track", "robot.toml", "noise.bin"], "noise.bin is not text"),
+        (["track", "robot.toml", "--shape", "line", "--size", "2,1"], "--size must be 3 numbers"),
+        (["track", "robot.toml", *SHAPE, "--q-min", "1,2"], "number or 6"),
+        (["track", "robot.toml", *SHAPE, "--duration", "1e9"], "times `dt`"),
+    ],
+)
+def test_a_slip_of_a_newcomer_has_an_answer(
+    robot, log, tmp_path, monkeypatch, capsys, arguments, message
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "noise.bin").write_bytes(bytes(range(256)))
+    code, _, errors = run(capsys, *arguments, "--out", "out")
+    assert code == 2
+    assert message in errors
+    assert not (tmp_path / "out").exists()
+
+
+def by_terminate(written):
+    def asked(log, robot, out, **_):
+        if written:
+            out.mkdir()
+            (out / "model").touch()
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    return asked
+
+
+def by_keyboard(*_, **__):
+    raise KeyboardInterrupt
+
+
+def in_an_import(*_, **__):
+    """C code turns an interrupt during an import into an ImportError."""
+    try:
+        os.kill(os.getpid(), signal.SIGINT)
+    except KeyboardInterrupt:
+        raise ImportError("could not import datetime") from None
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs signals of POSIX")
+@pytest.mark.parametrize(
+    ("fit_log", "code", "fate"),
+    [
+        (by_keyboard, 130, "nothing was written"),
+        (by_terminate(False), 143, "nothing was written"),
+        (by_terminate(True), 143, "files were written"),
+        (in_an_import, 130, "nothing was written"),
+    ],
+)
+def test_an_interrupt_leaves_cleanly_and_says_what_was_written(
+    log, robot, tmp_path, capsys, monkeypatch, fit_log, code, fate
+):
+    monkeypatch.setattr(workflow, "fit_log", fit_log, raising=False)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # background jobs ignore it
+    left = run(capsys, "fit", log, "--robot", robot, "--out", tmp_path / "m")
+    assert signal.signal(signal.SIGINT, before) is signal.default_int_handler
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    assert left[:2] == (code, "")
+    assert left[2].split("\n\n")[-1] == f"hybridkin: interrupted; {fate}\n"
+
+
+@pytest.mark.slow
+def test_what_is_not_needed_is_not_imported_and_a_pipe_may_close(robot):
+    code = "import sys, hybridkin.__main__; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+    describe = f"from hybridkin.cli.main import main; main(['describe', {str(robot)!r}])"
+    code = f"import sys; {describe}; sys.exit('matplotlib' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True)
+    assert (done.returncode, done.stderr) == (0, b"")
+    command = [sys.executable, "-m", "hybridkin", "describe", robot, "--json"]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    assert json.loads(done.stdout)["name"] == "two segments"
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        process.stdout.close()
+        assert process.stderr.read() == b""
+    assert process.returncode == 0

@@ -1,0 +1,284 @@
+"""`fit`, `evaluate` and `describe`: from a log to a model, its errors and what it is."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+import torch
+from simulated_log import COLUMNS, FIT, HEADER, ROBOT, document, rows, run, write
+
+from hybridkin import datasets, load_model, robots, workflow
+from hybridkin.cli.main import main
+
+
+def in_one_line(text):
+    return re.sub(r"\s+", " ", text)
+
+
+def test_fit_compares_models_saves_auto_and_prints_its_report(fitted):
+    record = json.loads((fitted / "model" / "report.json").read_text())
+    held_out = {name: entry["mean"] for name, entry in record["held_out"].items()}
+    assert held_out["hybrid, auto"] < 0.5 * held_out["mechanical, calibrated"]
+    chosen = record["auto"]
+    candidates = {f"hybrid, {name}" for name in chosen["candidates"]}
+    candidates -= {"hybrid, mechanical", "hybrid, blend"}
+    others = {"mechanical, nominal", "mechanical, calibrated", "hybrid, auto"}
+    others |= {"data-driven, quadratic", "data-driven, ELM"}
+    assert {*held_out} == candidates | others
+    assert all(name in record["chosen"] for name in chosen["weights"])
+    assert sum(chosen["weights"].values()) == pytest.approx(1.0)
+    assert (chosen["play"], chosen["play_asked"]) == (None, False)
+    assert record["saved"] == "hybrid, auto"
+    assert (fitted / "model" / "robot.toml").read_text() == ROBOT
+    text = (fitted / "model" / "report.md").read_text()
+    assert "no errors and no warnings" in text
+    printed = in_one_line((fitted / "out").read_text())
+    for sentence in chosen["words"]:
+        assert sentence in printed
+        assert sentence in text
+    assert f"hybrid, auto {1e3 * held_out['hybrid, auto']:.2f}" in printed
+    assert str(fitted / "model" / "model.safetensors") in printed
+    assert "120 rows, 8 motions, 6 actuators" in (fitted / "err").read_text()
+
+
+@pytest.mark.slow
+def test_fit_without_auto_and_with_a_radius(log, robot, tmp_path, capsys):
+    out = tmp_path / "m"
+    arguments = [log, "--robot", robot, "--out", out, "--no-auto", "--coverage", "0.8", *FIT]
+    code, record = document(capsys, "fit", *arguments)
+    assert code == 0
+    assert "hybrid, auto" not in record["held_out"]
+    assert record["saved"] in ("hybrid, quadratic", "hybrid, ELM")
+    _, record = document(capsys, "evaluate", out, log)
+    assert record["radius"]["coverage"] == 0.8
+    assert 0.8 < record["all"]["share_in_radius"] <= 1
+    assert "radius covering 80 % of the tips" in run(capsys, "describe", out)[1]
+
+
+def test_options_stand_over_the_log_table(log, robot, tmp_path, capsys):
+    table = rows()
+    table[:, 1:7] *= -0.1  # cm, shortening negative
+    path = tmp_path / "cm.csv"
+    header = HEADER.replace("t1", "a1").replace("time", "clock")
+    np.savetxt(path, table, delimiter=";", header=header.replace(",", ";"), comments="")
+    columns = ["--q", ",".join(["a1", *COLUMNS[1:]]), "--time", "clock"]
+    units = ["--q-unit", "cm", "--q-sign", "1"]
+    code, other = document(capsys, "describe", path, "--robot", robot, *columns, *units)
+    _, usual = document(capsys, "describe", log, "--robot", robot)
+    assert code == 0
+    np.testing.assert_allclose(other["q_range"], usual["q_range"], atol=1e-8)
+
+
+def in_metres(table):
+    return table, ROBOT.replace('"mm"', '"m"')
+
+
+def frozen(table):
+    table[20:40, 7:10] = table[20, 7:10]
+    return table, ROBOT
+
+
+def with_nan(table):
+    table[[10, 90, 91], 8] = np.nan
+    return table, ROBOT
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message", "advice"),
+    [
+        (in_metres, "look like millimetres", "set q_unit"),
+        (frozen, r"does not change .*\(lines 22-41\)", "--drop-frozen"),
+        (with_nan, r"NaN .*\(lines 12, 92-93\)", "--drop-invalid"),
+    ],
+)
+def test_spoilt_logs_stop_the_fit_with_advice(robot, tmp_path, capsys, spoil, message, advice):
+    table, description = spoil(rows())
+    robot.write_text(description)
+    log, out = write(tmp_path / "log.csv", table), tmp_path / "m"
+    code, printed, errors = run(capsys, "fit", log, "--robot", robot, "--out", out, *FIT)
+    assert (code, printed, out.exists()) == (2, "", False)
+    assert re.search(message, in_one_line(errors))
+    assert advice in errors
+    assert errors.splitlines()[-1].startswith("hybridkin: error: the log did not pass its check")
+    # `describe` tells the same without a fit.
+    code, record = document(capsys, "describe", log, "--robot", robot)
+    assert (code, record["ok"]) == (1, False)
+    assert any(re.search(message, finding["message"]) for finding in record["findings"])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"log": "none.csv"}, "there is none at"),
+        ({"robot": "none.toml"}, "no such file"),
+        ({"--groups": "motions"}, "did you mean 'motion'"),
+        ({"--exclude": "*"}, "at least 2 motions"),
+        ({"--q": "t1,t2"}, "must have 6 actuators"),
+        ({"text": HEADER + "\n0,1,2,3,4,5,6,7,8,9,1\n1,2,1,3,4,5,6,7,7,9,1\n"}, "at least 2 mot"),
+        ({"toml": "[[segment]]\nradius = 0.1\n"}, r"\[log\]"),
+        ({"out": "robot.toml"}, "must be a folder"),
+    ],
+)
+def test_user_errors_have_no_traceback_and_leave_nothing(
+    log, robot, tmp_path, capsys, change, message
+):
+    if "text" in change:
+        log.write_text(change["text"])
+    if "toml" in change:
+        robot.write_text(change["toml"])
+    before = sorted(tmp_path.iterdir())
+    arguments = [tmp_path / change.get("log", "log.csv")]
+    arguments += ["--robot", tmp_path / change.get("robot", "robot.toml")]
+    arguments += ["--out", tmp_path / change.get("out", "model")]
+    for option in ("--groups", "--exclude", "--q"):
+        if option in change:
+            arguments += [option, change[option]]
+    code, printed, errors = run(capsys, "fit", *arguments, *FIT)
+    assert (code, printed) == (2, "")
+    assert errors.splitlines()[-1].startswith("hybridkin: error: ")
+    assert re.search(message, errors)
+    assert "Traceback" not in errors
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_evaluate_tells_errors_by_motion_and_which_rows_were_fitted(fitted, tmp_path, capsys):
+    held_out = json.loads((fitted / "model" / "report.json").read_text())["held_out"]
+    held_out = held_out["hybrid, auto"]
+    out = tmp_path / "evaluation"
+    below = ["--fail-above", 1e3 * 0.9 * held_out["mean"]]  # and above the training error
+    arguments = ["evaluate", fitted / "model", fitted / "log.csv"]
+    code, record = document(capsys, *arguments, *below, "--out", out)
+    assert code == 1
+    model = load_model(fitted / "model" / "model.safetensors")
+    table = rows()
+    q, x = -1e-3 * table[:, 1:7], 1e-3 * table[:, 7:10]
+    errors = np.linalg.norm(model.predict(q) - x, axis=1)
+    everything = record["all"]
+    wanted = [errors.mean(), np.median(errors), np.percentile(errors, 95), errors.max()]
+    shown = [everything[key] for key in ("mean", "median", "p95", "max")]
+    np.testing.assert_allclose(shown, wanted, rtol=1e-4)
+    assert len(record["motions"]) == 8
+    second = record["motions"]["2"]
+    assert second["mean"] == pytest.approx(errors[table[:, 10] == 2].mean(), rel=1e-4)
+    assert everything["share_in_domain"] == model.in_domain(q).mean() > 0.9
+    assert (record["fitted_rows"], record["new"]) == (120, None)
+    assert record["fitted"] == everything
+    assert record["held_out"] == held_out
+    for name in ("workspace.png", "error_histogram.png", "report.md"):
+        assert str(out / name) in record["written"]
+        assert (out / name).stat().st_size > 500
+    printed = in_one_line(run(capsys, *arguments)[1])
+    assert "120 of 120 rows were fitted: their errors are training errors" in printed
+    assert f" held out in the fit 120 {1e3 * held_out['mean']:.2f} " in printed
+
+
+def test_evaluate_takes_new_and_fitted_rows_apart(fitted, tmp_path, capsys):
+    table = np.vstack([rows(), rows(10)[120:]])
+    table[6:15, 7] += 0.01  # mm: other tips; less than half of the motion is fitted
+    table[22:30, 7] += 0.01  # seven of fifteen rows of it are not
+    table[22, 7] -= 0.01
+    log = write(tmp_path / "more.csv", table)
+    code, record = document(capsys, "evaluate", fitted / "model", log)
+    assert code == 0
+    assert record["fitted_rows"] == record["fitted"]["rows"] == 120 - 9
+    assert record["new"]["rows"] == 9 + 30
+    assert record["new"]["mean"] > record["all"]["mean"] > record["fitted"]["mean"]
+    new = write(tmp_path / "new.csv", table[120:])
+    _, record = document(capsys, "evaluate", fitted / "model", new)
+    assert (record["fitted_rows"], record["fitted"], record["held_out"]) == (0, None, None)
+
+
+def test_evaluate_of_a_description_is_the_mechanical_model(fitted, capsys):
+    arguments = [fitted / "robot.toml", fitted / "log.csv"]
+    code, record = document(capsys, "evaluate", *arguments)
+    assert code == 0
+    table = rows()
+    with torch.no_grad():
+        x = robots.from_toml(fitted / "robot.toml")(torch.from_numpy(-1e-3 * table[:, 1:7]))
+    mean = np.linalg.norm(x.numpy() - 1e-3 * table[:, 7:10], axis=1).mean()
+    assert record["all"]["mean"] == pytest.approx(mean, rel=1e-6)
+    assert record["all"]["share_in_domain"] is None
+    assert document(capsys, "evaluate", *arguments, "--fail-above", "0.01")[0] == 1
+    assert document(capsys, "evaluate", *arguments, "--fail-above", "1000")[0] == 0
+
+
+def test_describe_tells_what_a_model_is(fitted, capsys):
+    code, record = document(capsys, "describe", fitted / "model")
+    assert code == 0
+    model = load_model(fitted / "model" / "model.safetensors")
+    radii = [segment["radius"] for segment in record["geometry"]["segments"]]
+    np.testing.assert_allclose(radii, model.mechanical_model_.radii.tolist())
+    report = json.loads((fitted / "model" / "report.json").read_text())
+    for key in ("rows", "log", "n_motions", "saved", "chosen", "held_out"):
+        assert record["training"][key] == report[key]
+    assert record["auto"] == report["auto"]
+    assert record["versions"]["torch"] == str(torch.__version__)
+    assert record["radius"] is None
+    q = -1e-3 * rows()[:, 1:7]
+    np.testing.assert_allclose(record["domain"]["q_min"], q.min(axis=0), atol=1e-8)
+    printed = run(capsys, "describe", fitted / "model")[1]
+    assert "segment  radius [mm]  length [mm]" in printed
+    assert "Fitted to log.csv: 120 rows, 8 motions" in printed
+    assert f"Model: hybrid, auto, {record['training']['chosen']}" in in_one_line(printed)
+
+
+def test_describe_of_a_description_and_of_what_is_none(fitted, tmp_path, capsys):
+    code, printed, _ = run(capsys, "describe", fitted / "robot.toml")
+    assert code == 0
+    assert printed.startswith("two segments: ConstantCurvatureChain, 6 actuators")
+    assert "5.500" in printed
+    code, _, errors = run(capsys, "describe", fitted / "log.csv")
+    assert code == 2
+    assert "--robot" in errors
+    other = tmp_path / "other.safetensors"
+    other.write_bytes(b"no model")
+    code, _, errors = run(capsys, "describe", other)
+    assert code == 2
+    assert "not a model" in errors
+
+
+@pytest.mark.parametrize(
+    ("option", "play"), [("auto", "auto"), ("0.4", 4e-4), ("0", 0.0), (None, "detect")]
+)
+def test_play_reaches_the_fit_in_metres(log, robot, tmp_path, monkeypatch, option, play):
+    seen = []
+
+    def fit_log(*_, settings, **__):
+        seen.append(settings.play)
+        raise ValueError("enough")
+
+    monkeypatch.setattr(workflow, "fit_log", fit_log, raising=False)
+    arguments = ["fit", log, "--robot", robot, "--out", tmp_path / "m"]
+    arguments += [] if option is None else ["--play", option]
+    assert main([str(argument) for argument in arguments]) == 2
+    assert seen == [play]
+    assert type(seen[0]) is type(play)
+
+
+def test_play_needs_motions_in_the_order_of_time(robot, tmp_path, capsys):
+    table = rows()
+    table[[3, 4], 0] = table[[4, 3], 0]
+    log = write(tmp_path / "log.csv", table)
+    arguments = ["fit", log, "--robot", robot, "--out", tmp_path / "m", "--play", "auto", *FIT]
+    assert "sort the log by motion and time" in run(capsys, *arguments)[2]
+    assert "--no-auto" in run(capsys, *arguments, "--no-auto")[2]
+    robot.write_text(ROBOT.replace('groups = "motion"', ""))
+    code, _, errors = run(capsys, *arguments)
+    assert code == 2
+    assert "`play` needs motions" in errors
+
+
+@pytest.mark.slow
+def test_fit_of_armlab_as_csv_with_nothing_but_a_robot_description(data_home, tmp_path, capsys):
+    data = datasets.load_armlab(data_home)
+    table = np.column_stack([-1e3 * data.q, 1e3 * data.x, data.groups])
+    header = "cable_1,cable_2,cable_3,tip_x,tip_y,tip_z,line"
+    log, out = tmp_path / "armlab.csv", tmp_path / "m"
+    np.savetxt(log, table, delimiter=",", header=header, comments="", fmt="%.6g")
+    arguments = [log, "--robot", "examples/robots/armlab_3cable.toml", "--out", out]
+    code, record = document(capsys, "fit", *arguments, *FIT, "--max-rows", "440", "--no-auto")
+    assert (code, record["n_whole"]) == (0, 24019)
+    assert {f["kind"] for f in record["log_check"]["findings"]} == {"jumps"}
+    held_out = {name: entry["mean"] for name, entry in record["held_out"].items()}
+    assert held_out["hybrid, ELM"] < 0.5 * held_out["mechanical, calibrated"] < 0.003

@@ -1,0 +1,262 @@
+"""`next`, `track`, `animate` and `export`: from a model to commands."""
+
+import re
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from simulated_log import COLUMNS, ROBOT, document, rows, run, write
+from sklearn.kernel_ridge import KernelRidge
+
+import hybridkin
+from hybridkin import PlayOperator, datasets, load_model, save_model
+
+SHAPE = ["--shape", "figure-eight", "--unit", "mm", "--dt", "0.1"]
+CHAIN = hybridkin.ConstantCurvatureChain([0.005, 0.005], lengths=[0.1, 0.1])
+
+
+def planned(folder):
+    """Return the configurations of next.csv (N, 6) [mm, pulled positive], and the errors [mm]."""
+    table = np.genfromtxt(folder / "next.csv", delimiter=",", names=True)
+    assert table.dtype.names == (*COLUMNS, "expected_error")
+    table = np.array([*map(tuple, table)])
+    return table[:, :6], table[:, 6]
+
+
+def commands(folder):
+    return np.loadtxt(folder / "track.csv", delimiter=",", skiprows=1, usecols=range(1, 7))
+
+
+def test_next_keeps_to_the_limits_with_balanced_tendons(robot, tmp_path, capsys):
+    code, out, _ = run(capsys, "next", robot, "-n", 12, "--out", tmp_path / "plan")
+    assert code == 0
+    q, error = planned(tmp_path / "plan")
+    assert len(q) == 12
+    assert 4.0 < np.abs(q).max() <= 6.0
+    np.testing.assert_allclose(q.reshape(-1, 2, 3).sum(axis=2), 0.0, atol=1e-6)
+    assert (np.diff(error) < 0.0).all()
+    assert f"{error[-1]:.2f}" in out
+    options = ["--q-min", 0, "--q-max", 4, "-n", 3, "--out", tmp_path / "pull"]
+    assert run(capsys, "next", robot, *options)[0] == 0
+    q, _ = planned(tmp_path / "pull")
+    assert (q.min(), q.max() <= 4.0) == (0.0, True)
+    np.testing.assert_allclose(q.reshape(-1, 2, 3).min(axis=2), 0.0, atol=1e-6)  # one is slack
+
+
+@pytest.mark.slow
+def test_next_counts_what_is_measured_and_where_the_error_matters(robot, log, tmp_path, capsys):
+    plan = ["next", robot, "-n", 3, "--out", tmp_path / "plan"]
+    code, fresh = document(capsys, *plan)
+    assert (code, fresh["n_measured"], fresh["limits"]["source"]) == (0, 0, "robot description")
+    _, record = document(capsys, *plan, "--measured", log)
+    assert record["n_measured"] == 120
+    assert record["expected_errors"][0] < 0.5 * fresh["expected_errors"][0]
+    (tmp_path / "path.csv").write_text("x,y,z\n0,0,190\n10,0,190\n20,0,189\n")
+    path = ["--path", tmp_path / "path.csv", "--dt", 1, "--unit", "mm"]
+    _, record = document(capsys, *plan, *path)
+    assert record["where"].startswith("along the path")
+    assert record["expected_errors"][-1] < 0.3 * fresh["expected_errors"][-1]
+
+
+@pytest.mark.slow
+def test_track_of_a_shape_can_be_sent_and_read_back(fitted, tmp_path, capsys):
+    out = tmp_path / "track"
+    shape = ["--shape", "figure-eight", "--size", "20,10", "--duration", "2", "--dt", "0.05"]
+    code, record = document(capsys, "track", fitted / "model", *shape, "--out", out)
+    assert code == 0
+    assert record["reached"] == record["n"] == 41
+    assert record["limits"]["source"] == "robot description, within the training range"
+    assert (record["in_domain"], record["play"]) == (1.0, None)
+    assert record["columns"]["x"] == ["x", "y", "z"]
+    # What the file says, in the robot's units and sign, leads the model where it says.
+    target = ["target_x", "target_y", "target_z"]
+    units = {"q_unit": "mm", "x_unit": "mm", "q_sign": -1}
+    data = datasets.load_log(out / "track.csv", COLUMNS, target, "status", time="t", **units)
+    model = load_model(fitted / "model" / "model.safetensors")
+    assert np.linalg.norm(model.predict(data.q) - data.x, axis=1).max() < 1e-4
+    assert np.abs(data.q).max() <= 0.006
+    n_lead = record["lead_in"]["rows"]
+    assert data.groups.tolist() == n_lead * ["LEAD_IN"] + 41 * ["CONVERGED"]
+    np.testing.assert_allclose(data.time, 0.05 * np.arange(n_lead + 41), atol=1e-9)
+    np.testing.assert_allclose(np.ptp(data.x[n_lead:], axis=0)[:2], [0.02, 0.01], rtol=0.02)
+    # The robot starts at rest, and the lead-in keeps to a tenth of the range per second.
+    assert not data.q[0].any()
+    low, high = (np.array(record["limits"][name]) for name in ("q_min", "q_max"))
+    speed = np.abs(np.diff(data.q[: n_lead + 1], axis=0)).max() / 0.05
+    assert 0.08 * (high - low).max() < speed <= 0.1 * (high - low).max() + 1e-9
+    assert (out / "track.png").stat().st_size > 500
+    for film in (tmp_path / "film.gif", tmp_path / "film.html"):
+        options = ["--out", film, "--frames", "3"]
+        code, record = document(capsys, "animate", fitted / "model", out, *options)
+        assert (code, record["frames"], record["written"]) == (0, 3, [str(film)])
+        assert record["bytes"] == film.stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_track_of_points_within_given_limits(fitted, tmp_path, capsys):
+    tip = 1e3 * load_model(fitted / "model" / "model.safetensors").predict(np.zeros((1, 6)))[0]
+    path, out = tmp_path / "path.csv", tmp_path / "track"
+    far = tip + np.array([[0, 0, -0.1], [15, 0, -4], [30, 0, -8]])
+    np.savetxt(path, far, delimiter=",", header="x,y,z", comments="")
+    arguments = ["track", fitted / "model", path, "--out", out]
+    assert "--dt" in run(capsys, *arguments)[2]
+    # In the log's sign: at least -1 mm pulled, at most 0.2.
+    limits = ["--dt", "1", "--q-min=-1", "--q-max", "0.2"]
+    code, _, errors = run(capsys, *arguments, *limits)
+    assert (code, out.exists()) == (2, False)
+    assert "2 of 3 checked points are out of reach" in errors
+    code, record = document(capsys, *arguments, *limits, "--force")
+    assert code == 1
+    assert record["reached"] < 3
+    assert record["limits"]["q_min"] == pytest.approx([-0.0002] * 6)
+    assert record["limits"]["q_max"] == pytest.approx([0.001] * 6)
+    assert commands(out).min() >= -1 - 1e-9
+    assert commands(out).max() <= 0.2 + 1e-9
+
+
+@pytest.mark.slow
+def test_track_says_how_much_of_a_path_is_within_reach(robot, tmp_path, capsys):
+    arguments = ["track", robot, *SHAPE, "--out", tmp_path / "track"]
+    arguments += ["--center", "0,0,190"]  # else it is placed where it fits
+    code, _, errors = run(capsys, *arguments, "--size", "800,400")
+    assert code == 2
+    assert "leaves the reach of the robot within its limits (robot description)" in errors
+    scale = float(re.search(r"--scale ([\d.]+\d)", errors)[1])
+    assert document(capsys, *arguments, "--size", "800,400", "--scale", scale)[0] == 0
+    _, _, errors = run(capsys, *arguments, "--size", f"{960 * scale},{480 * scale}")
+    assert float(re.search(r"--scale ([\d.]+\d)", errors)[1]) == pytest.approx(1 / 1.2, rel=0.1)
+    _, _, errors = run(capsys, *arguments, "--size", "8,4", "--center", "0,0,500")
+    assert "its centre is out of reach too" in errors
+
+
+@pytest.mark.parametrize("force", [[], ["--force"]])
+def test_track_names_the_unit_of_a_path_a_thousand_times_too_large(robot, tmp_path, capsys, force):
+    (tmp_path / "path.csv").write_text("t,x,y,z\n0,0,0,190\n1,5,0,190\n2,0,0,190\n")
+    arguments = ["track", robot, tmp_path / "path.csv", "--out", tmp_path / "t"]
+    code, _, errors = run(capsys, *arguments, "--unit", "m", *force)
+    assert code == 2
+    assert errors.endswith("give --unit mm.\n")
+
+
+@pytest.mark.slow
+def test_track_leads_in_from_where_the_robot_stands(robot, tmp_path, capsys):
+    out = tmp_path / "track"
+    arguments = ["track", robot, *SHAPE, "--size", "20,10", "--out", out]
+    arguments += ["--duration", "2", "--dq-max", "4"]  # mm/s
+    first, on_path = {}, {}
+    for start in ("1,-2,1,0.5,0,-0.5", "rest", "path"):
+        code, record = document(capsys, *arguments, f"--from={start}")
+        assert code == 0
+        q = commands(out)
+        assert np.abs(np.diff(q, axis=0)).max() <= 0.4 + 1e-8
+        n_lead = record["lead_in"]["rows"]
+        assert record["lead_in"]["duration_s"] == pytest.approx(0.1 * n_lead)
+        assert len(q) == n_lead + 21
+        first[start], on_path[start] = q[0], q[n_lead:]
+    assert first["1,-2,1,0.5,0,-0.5"].tolist() == [1, -2, 1, 0.5, 0, -0.5]
+    assert not first["rest"].any()
+    assert n_lead == 0
+    for q in on_path.values():
+        np.testing.assert_array_equal(q, on_path["path"])
+    for start in ("1000,0,0,0,0,0", "1,2"):
+        assert run(capsys, *arguments, f"--from={start}")[0] == 2
+
+
+@pytest.mark.slow
+def test_track_without_known_limits_asks_for_them(fitted, tmp_path, capsys):
+    bare = tmp_path / "robot.toml"
+    bare.write_text(ROBOT[: ROBOT.index("[limits]")])
+    shape = ["--shape", "line", "--size", "0,10,0", "--out", tmp_path / "t"]
+    code, _, errors = run(capsys, "track", bare, *shape)
+    assert code == 2
+    assert "--q-min" in errors
+    # A fitted model knows the range that it was fitted on.
+    shutil.copy(fitted / "model" / "model.safetensors", tmp_path / "alone.safetensors")
+    alone = ["track", tmp_path / "alone.safetensors", *shape, "--unit", "mm", "--dt", "0.1"]
+    code, record = document(capsys, *alone)
+    assert (code, record["limits"]["source"]) == (0, "training range")
+    assert record["columns"]["q"] == ["q1", "q2", "q3", "q4", "q5", "q6"]
+
+
+@pytest.fixture(scope="module")
+def playful(tmp_path_factory):
+    """A folder with a model whose actuators have play, its robot and a log of it."""
+    home = tmp_path_factory.mktemp("playful")
+    table = rows()
+    q = PlayOperator(4e-4).apply_by_group(-1e-3 * table[:, 1:7], table[:, 10])
+    with torch.no_grad():
+        table[:, 7:10] = 1e3 * (CHAIN(torch.from_numpy(q)).numpy() + 5e-4 * np.sin(200 * q[:, :3]))
+    write(home / "log.csv", table)
+    (home / "robot.toml").write_text(ROBOT)
+    model = hybridkin.HybridForwardModel(CHAIN, "quadratic", play=4e-4)
+    model.fit(-1e-3 * table[:, 1:7], 1e-3 * table[:, 7:10], groups=table[:, 10])
+    save_model(model, home / "model.safetensors")
+    return home
+
+
+def test_evaluate_knows_where_the_motions_of_play_begin(playful, tmp_path, capsys):
+    code, record = document(capsys, "evaluate", playful, playful / "log.csv")
+    assert code == 0
+    assert record["all"]["mean"] < 1e-4
+    table = rows()
+    table[:15] = table[14::-1]  # the first motion backwards, its times too
+    log = write(tmp_path / "backwards.csv", table)
+    code, _, errors = run(capsys, "evaluate", playful, log)
+    assert code == 2
+    assert "order of time, but 14 rows" in errors
+
+
+def test_code_and_trackers_tell_unit_sign_and_backlash_of_q(playful, tmp_path, capsys):
+    out = tmp_path / "c"
+    export = ["export", playful, "--out", out, "--name", "robot", "--dt", "0.01"]
+    code, printed, _ = run(capsys, *export)
+    assert code == 0
+    for text in (printed, *((out / name).read_text() for name in ("README.md", "robot.h"))):
+        text = " ".join(text.split())
+        assert f"log in mm: q[0] = -0.001 * {COLUMNS[0]}, q[1] = -0.001 * {COLUMNS[1]}" in text
+        assert "backlash (play) of 0.0004" in text
+    model = load_model(playful / "model.safetensors")
+    ik = hybridkin.InverseKinematics(model, q_min=-0.005, q_max=0.005)
+    with pytest.warns(UserWarning, match=r"backlash \(play\) of 0.0004"):
+        ik.tracker(np.zeros(6))
+
+
+@pytest.mark.slow
+def test_track_with_play_tells_what_to_send_and_what_it_does(playful, tmp_path, capsys):
+    out = tmp_path / "track"
+    shape = ["--shape", "figure-eight", "--size", "20,10", "--duration", "2", "--dt", "0.05"]
+    code, record = document(capsys, "track", playful, *shape, "--out", out)
+    assert (code, record["play"]) == (0, [4e-4])
+    table = np.genfromtxt(out / "track.csv", delimiter=",", names=True, dtype=None, encoding=None)
+    sent = -1e-3 * np.column_stack([table[name] for name in COLUMNS])
+    does = -1e-3 * np.column_stack([table[f"effective_{name}"] for name in COLUMNS])
+    np.testing.assert_allclose(PlayOperator(4e-4).apply(sent)[0], does, atol=1e-10)
+    assert np.abs(sent - does).max() == pytest.approx(2e-4)
+    assert np.abs(sent).max() <= 0.006
+    target = 1e-3 * np.column_stack([table["target_" + axis] for axis in "xyz"])
+    model = load_model(playful / "model.safetensors")
+    assert np.linalg.norm(model.predict(sent) - target, axis=1).max() < 1e-4
+    assert "actuators: 0.4 mm" in run(capsys, "describe", playful)[1]
+
+
+@pytest.mark.slow
+def test_first_track_of_a_kernel_model_stays_where_the_model_is_at_home(tmp_path, capsys):
+    """Most of the box around its training rows lies outside the domain of such a model."""
+    table = rows(10, 24)
+    table = table[table[:, 1] > 1.0]  # mm: a half of the workspace
+    q, x = -1e-3 * table[:, 1:7], 1e-3 * table[:, 7:10]
+    kernel = KernelRidge(kernel="rbf", gamma=1e5, alpha=1e-3)
+    path = tmp_path / "kernel.safetensors"
+    model = hybridkin.HybridForwardModel(CHAIN, kernel).fit(q, x)
+    save_model(model, path)
+    low, high = q.min(axis=0), q.max(axis=0)
+    box = np.random.default_rng(0).uniform(low, high, (500, 6))
+    assert model.in_domain(box).mean() < 0.5
+    track = ["track", path, *SHAPE, "--size", "10,5", "--out", tmp_path / "track"]
+    code, record = document(capsys, *track)
+    assert code == 0
+    assert record["statuses"] == {"CONVERGED": record["n"]}
+    assert record["in_domain"] == 1.0
+    np.testing.assert_allclose(record["limits"]["q_min"], low)
+    np.testing.assert_allclose(record["limits"]["q_max"], high)
