@@ -34,7 +34,20 @@ ELSEWHERE = {
     *("from_urdf", "from_mjcf", "to_urdf", "load_armlab", "load_asl_trunk", "load_ftdcr"),
     # arguments go to matplotlib, or are dictionaries and sentences
     *("new_figure", "lines", "caption", "save", "figure", "table", "text", "file", "markdown"),
-    *("plain", "write", "geometry", "errors", "accepting", "summary", "to_dict", "html_rows"),
+    *(
+        "plain",
+        "write",
+        "json",
+        "verbatim",
+        "check_columns",
+        "commands",
+        "geometry",
+        "errors",
+        "accepting",
+        "summary",
+        "to_dict",
+        "html_rows",
+    ),
     # of numbers that a description has checked; of rows as NumPy indexes them
     *(
         "available",

@@ -83,7 +83,7 @@ def test_a_terminal_shows_a_bar_and_the_time_left(clock):
 
 @pytest.fixture
 def report():
-    report = Report("A table")
+    report = Report("A table", {})
     report.table(["tip error [mm]", "mean"], [["hybrid, auto", "1.50"], ["[/nominal]", "22.75"]])
     return report
 
