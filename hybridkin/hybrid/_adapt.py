@@ -37,7 +37,8 @@ PARAMETERS = ("base", "actuator_zeros")
 # Prior standard deviations, in natural units.
 _SCALES = 10.0 ** np.arange(-3.0, 0.6, 0.5)
 _COMMON = 0.5  # share of the variance of a row that its whole group shares
-_ROUNDS, _CHOOSING = 30, 6  # Gauss-Newton rounds; the first ones also choose the scales
+_ROUNDS = 30  # of Gauss-Newton
+_CHOOSING = 6  # of these that also choose the scales
 _SETTLED = 1e-9
 _LARGE = 3.0  # ratio of remaining errors to those of the fit that gives a warning
 _SINGULAR = np.linalg.LinAlgError, torch.linalg.LinAlgError  # pyright: ignore

@@ -75,7 +75,9 @@ class Drift(NamedTuple):
             raise too_far()
         phi = np.column_stack([np.ones(len(q)), (q - self.center) / self.scale])
         later = weights[::-1].cumsum()[::-1] - weights
-        decayed = weights if decay == 1.0 else (1.0 - decay**weights) / (1.0 - decay)
+        decayed = weights
+        if decay < 1.0:
+            decayed = (1.0 - decay**weights) / (1.0 - decay)
         weighed = (decayed * decay**later)[:, None] * phi
         remaining = decay ** weights.sum()
         gram = remaining * self.gram + np.einsum(

@@ -31,11 +31,8 @@ _ROWS = 128  # number of rows that represent the training rows
 _BLOCK = 4096  # training rows whose distances are computed at once
 _TESTED = 0.98  # share of these rows whose distances from other groups count as tested
 _STEP = 0.2  # least tested distance, and the domain without data; the range of an actuator is 2
-# Domain off the plane of a log: in this unit, and in its rms there.
-_OFF, _AS_LOGGED = (
-    0.02,
-    3.0,
-)
+_OFF = 0.02  # domain off the plane of a log; the range of an actuator is 2
+_AS_LOGGED = 3.0  # plus so many times its rms there
 
 
 class Guard(PortableModule):
@@ -396,7 +393,9 @@ class GroupDistance(PortableModule):
         Where mechanics predict what happens there, steps of a tenth of the range stay in the
         domain; off the plane, only steps of a hundredth. None if there is nothing to measure.
         """
-        tested = None if groups is None else cls.fit(q, groups)
+        tested = None
+        if groups is not None:
+            tested = cls.fit(q, groups)
         if not directions.still.size and plane is None:
             return tested
         if tested is None:

@@ -92,9 +92,10 @@ def _error(model: Any) -> dict[str, str]:
             f"{results['candidate'][0]} model alone {_mm(results['mean_distance'][0])}"
         )
         return {"held-out error": f"mean {_mm(results['expected_distance'])}, {alone}"}
-    held_out = isinstance(_first_error_model(model), _HELD_OUT)
     words = f"standard deviation of a coordinate {_mm(model._noise)}"
-    return {"held-out error" if held_out else "training error": words}
+    if isinstance(_first_error_model(model), _HELD_OUT):
+        return {"held-out error": words}
+    return {"training error": words}
 
 
 def _radius(model: Any) -> str:

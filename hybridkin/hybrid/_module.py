@@ -33,9 +33,10 @@ class Inside:
         return self.mechanical.from_coordinates(self.z)
 
     @cached_property
-    def jacobian(self) -> Tensor:
-        """Return df/dq, (N, m, n)."""
-        return self.mechanical.from_coordinates_and_jacobian(self.z)[1] @ self.slope
+    def x_and_jacobian(self) -> tuple[Tensor, Tensor]:
+        """The tip f(q) (N, m), and df/dq (N, m, n)."""
+        x, slope = self.mechanical.from_coordinates_and_jacobian(self.z)
+        return x, slope @ self.slope
 
 
 class Fading(NamedTuple):
@@ -59,10 +60,6 @@ class Fading(NamedTuple):
     def times(self, x: Tensor, J: Tensor) -> tuple[Tensor, Tensor]:
         """Return the weight times x (N, m), and its derivative from J = dx/dq (N, m, n)."""
         return self.weight * x, self.weight[..., None] * J + x[..., None] * self.slope
-
-
-# A correction, its derivative and its fading.
-Guarded = tuple[Tensor, Tensor, Fading | None]
 
 
 class TipCorrection(PortableModule):
@@ -90,17 +87,25 @@ class TipCorrection(PortableModule):
         """Return c(q) at rows q (N, n), shape (N, m) [m]."""
         return self.module(q)
 
-    def guarded_and_jacobian(self, q: Tensor, inside: Inside | None) -> Guarded:
+    def value_and_jacobian(
+        self, q: Tensor, inside: Inside | None
+    ) -> tuple[Tensor, Tensor]:
+        """Return c(q) (N, m) and dc/dq (N, m, n) at rows q (N, n)."""
+        return self.module.forward_and_jacobian(q)
+
+    def guarded_and_jacobian(
+        self, q: Tensor, inside: Inside | None
+    ) -> tuple[Tensor, Tensor, Fading | None]:
         """Return s (N, m) and ds/dq (N, m, n) at rows q (N, n), and the fading."""
         guard = self.guard
         if guard is None:
-            return *self.module.forward_and_jacobian(q), None
+            return *self.value_and_jacobian(q, inside), None
         if isinstance(guard, LeverageGuard) and guard.model is self.module:
-            # Value and leverage share the features.
+            # Value and leverage share the features, which halves the time.
             x, J, leverage = guard.model.forward_jacobian_and_leverage(q)
             distance = leverage / guard.limit.to(q)
         else:
-            x, J = self.module.forward_and_jacobian(q)
+            x, J = self.value_and_jacobian(q, inside)
             distance = guard.domain_distance(q)
         fading = Fading.of(guard, q, distance)
         if fading is not None:
@@ -130,27 +135,15 @@ class InnerCorrection(TipCorrection):
         moved = inside.mechanical.from_coordinates(inside.z + self.module(q))
         return moved - inside.x
 
-    def guarded_and_jacobian(self, q: Tensor, inside: Inside | None) -> Guarded:
-        """Return f + s (N, m) and its derivative (N, m, n) at rows q (N, n), and the fading.
-
-        If no row fades or is too long, f + s = F(z + W phi) and df/dq is not needed.
-        """
+    def value_and_jacobian(
+        self, q: Tensor, inside: Inside | None
+    ) -> tuple[Tensor, Tensor]:
+        """Return c(q) (N, m) and dc/dq (N, m, n) at rows q (N, n)."""
         assert inside is not None
         delta, turn = self.module.forward_and_jacobian(q)
         x, columns = inside.mechanical.from_coordinates_and_jacobian(inside.z + delta)
-        J = columns @ (inside.slope + turn)
-        guard = self.guard
-        if guard is None:
-            return x, J, None
-        fading = Fading.of(guard, q, guard.domain_distance(q))
-        if fading is None and not guard.is_long(x - inside.x).any():
-            return x, J, None
-        x = x - inside.x
-        J = J - inside.jacobian
-        if fading is not None:
-            x, J = fading.times(x, J)
-        x, J = guard.shortened_with_jacobian(x, J)
-        return inside.x + x, inside.jacobian + J, fading
+        before, J = inside.x_and_jacobian
+        return x - before, columns @ (inside.slope + turn) - J
 
 
 class Hybrid(ForwardModel):
@@ -399,7 +392,11 @@ class HybridModule(Hybrid):
 
     def _forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         inside = self._inside(q)
-        total = self._mechanical_and_jacobian(q, inside)
+        total = None
+        if inside is not None:
+            total = inside.x_and_jacobian
+        elif self.mechanical is not None:
+            total = self.mechanical.forward_and_jacobian(q)
         trust = Fading(q.new_ones(1, 1), q.new_zeros(1, 1, 1))
         for weight, correction in self._parts():
             x, J, fading = correction.guarded_and_jacobian(q, inside)
@@ -413,22 +410,6 @@ class HybridModule(Hybrid):
             total = _plus(total, 1.0, *trust.times(*self.drift.forward_and_jacobian(q)))
         assert total is not None, "a hybrid needs a mechanical model or a correction"
         return total
-
-    def _mechanical_and_jacobian(
-        self, q: Tensor, inside: Inside | None
-    ) -> tuple[Tensor, Tensor] | None:
-        """Return the part of f and df/dq beside inner corrections, which include f."""
-        if inside is None:
-            f = self.mechanical
-            return None if f is None else f.forward_and_jacobian(q)
-        left = 1.0
-        for weight, correction in self._parts():
-            if correction.inside:
-                left -= weight
-        # df/dq is needed only if the weights of inner corrections sum to less than 1.
-        if left <= _ROUNDING:
-            return None
-        return left * inside.x, left * inside.jacobian
 
 
 def _plus(

@@ -178,12 +178,21 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return bundle
 
     def _fit_html(self) -> str:
+        if "module_" not in vars(self):
+            return ""
         title = f"{type(self).__name__}: what the fit found"
-        return html_table(title, fitted_rows(self)) if "module_" in vars(self) else ""
+        return html_table(title, fitted_rows(self))
+
+    @property
+    def _chain(self) -> Chain | None:
+        """The mechanical model if it is a chain."""
+        mechanical = self.mechanical_model_
+        return mechanical if isinstance(mechanical, Chain) else None
 
     def _warn_of_units(self, rows: Rows) -> None:
         """Warn if measured tips span far more than the robot, so they cannot be in metres."""
-        if not isinstance(chain := self.mechanical_model_, Chain):
+        chain = self._chain
+        if chain is None:
             return
         measured, tips = known_tips(chain, rows)
         message = motion_message(
@@ -197,9 +206,9 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
         Negative lengths are extrapolation, no error.
         """
-        chain = self.mechanical_model_
+        chain = self._chain
         plausible = self._plausible_rows
-        if not isinstance(chain, Chain) or (plausible and plausible.hold(q)):
+        if chain is None or (plausible and plausible.hold(q)):
             return []
         rows = torch.from_numpy(q)
         messages = [*chain.unit_messages(rows, "X"), chain.contradiction(rows, "X")]
@@ -225,8 +234,8 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             mechanical = self.change_.after(mechanical)
         self.mechanical_model_ = mechanical
         self._plausible_rows = None
-        if isinstance(mechanical, Chain):
-            self._plausible_rows = mechanical.plausible_rows()
+        if self._chain is not None:
+            self._plausible_rows = self._chain.plausible_rows()
 
     def _tips(self, q: NDArray, **results: bool) -> tuple[NDArray, ...]:
         """Return the tips of rows q (N, n), or other `results` of `evaluate`."""

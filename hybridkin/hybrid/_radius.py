@@ -53,7 +53,9 @@ def conformal_radius(
     spec = replace(spec, left_out=False)
     X = rows.X
     y = rows.tips
-    groups = np.arange(len(y)) if rows.groups is None else rows.groups
+    groups = rows.groups
+    if groups is None:
+        groups = np.arange(len(y))
     inside = np.zeros(len(y), dtype=bool)
     errors = np.full(len(y), np.nan)
     for train, test in folds(X, rows.groups):

@@ -26,17 +26,11 @@ _OTHER = 0.0165
 _SHIFT = 0.033
 _TURN = 0.1
 _NOISE = 0.0055
-# Parameters: above the first, features are reduced; hard limit.
-_LARGEST, _MOST = (
-    1000,
-    5000,
-)
+_LARGEST = 1000  # parameters above which features are reduced
+_MOST = 5000  # parameters
 _BLOCK = 1000  # rows whose design matrix is in memory at once
-# Rows that represent a motion; they count as so many independent rows.
-_ROWS, _WORTH = (
-    8,
-    2.0,
-)
+_ROWS = 8  # that represent a motion
+_WORTH = 2.0  # independent rows that they count as
 
 
 def choose_rows(
@@ -131,7 +125,9 @@ def choose_rows(
         measured_rows = q[:0]
     else:
         measured_rows = _actuators(robot, measured, "measured")
-    aim = q if target is None else _actuators(robot, target, "target")
+    aim = q
+    if target is not None:
+        aim = _actuators(robot, target, "target")
     names = np.arange(len(q))
     places = np.arange(len(q))[:, None]
     if groups is not None:
@@ -162,10 +158,9 @@ def _actuators(robot: ForwardModel, value: ArrayLike, name: str) -> Tensor:
         raise ValueError(f"`{name}` must hold at least one row, got none.")
     check_finite(**{name: q})
     rows = torch.from_numpy(q)
-    for message in (
-        robot.check_actuators(rows, name) if isinstance(robot, Chain) else ()
-    ):
-        warnings.warn(message, stacklevel=3)
+    if isinstance(robot, Chain):
+        for message in robot.check_actuators(rows, name):
+            warnings.warn(message, stacklevel=3)
     return rows
 
 
@@ -184,9 +179,8 @@ class _TipErrors:
     """
 
     def __init__(self, robot: ForwardModel, q: Tensor) -> None:
-        arcs = isinstance(robot, ArcChain)
         self.robot = robot
-        if arcs:
+        if isinstance(robot, ArcChain):
             self.features = PoseFeatures.of_range(q, robot)
         else:
             self.features = QuadraticFeatures.of_range(q)

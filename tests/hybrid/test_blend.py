@@ -1,11 +1,10 @@
 """Hybrids averaged: value, Jacobian, domain and drift of the mean."""
 
-import numpy as np
 import pytest
 import torch
 from torch.testing import assert_close
 
-from hybridkin import ELMRegressor, HybridForwardModel, InverseKinematics, datasets, robots
+from hybridkin import ELMRegressor, HybridForwardModel, datasets, robots
 from hybridkin.hybrid._module import HybridModule
 from hybridkin.learning.regressor_modules import AffineModule
 
@@ -50,7 +49,6 @@ def mean(parts, function):
     return sum(w * function(part) for w, part in zip(WEIGHTS, parts, strict=True))
 
 
-@pytest.mark.slow
 def test_all_is_the_mean_of_the_parts(blend, parts, q):
     assert_close(blend(q), mean(parts, lambda part: part(q)))
     assert_close(blend.jacobian(q), mean(parts, lambda part: part.jacobian(q)))
@@ -73,21 +71,3 @@ def test_drift_is_added_once_and_leaves_the_parts_alone(blend, parts, q):
     h, J = 1e-6, moved.jacobian(q)
     ahead = [(moved(q + h * e) - moved(q - h * e)) / (2 * h) for e in torch.eye(9).double()]
     assert_close(torch.stack(ahead, -1), J, rtol=0.0, atol=1e-6)
-
-
-@pytest.mark.slow
-def test_a_blend_of_a_hybrid_with_itself_is_the_hybrid():
-    data, rng = datasets.load_trunk(), np.random.default_rng(0)
-    chain = robots.bionic_handling_assistant()
-    for settings in ({}, {"error_model": "quadratic", "coupling": "serial"}):
-        model = HybridForwardModel(chain, random_state=0, **settings).fit(data.q, data.x).module_
-        twice = blended([model, model], torch.tensor([0.5, 0.5], dtype=torch.float64))
-        q = torch.from_numpy(rng.uniform(0.1, 0.4, (100, 9)))
-        assert_close(twice.domain_distance(q), model.domain_distance(q), rtol=0.0, atol=0.0)
-        assert (twice.in_domain(q) == model.in_domain(q)).all()
-        assert_close(twice.forward_and_jacobian(q), model.forward_and_jacobian(q))
-        targets = model(q).detach()
-        options = dict(q_min=0.1, q_max=0.4, q_pref=0.33)
-        found = [InverseKinematics(one, **options).solve(targets) for one in (model, twice)]
-        assert (found[0].status == found[1].status).all()
-        assert 0.3 < found[0].converged.double().mean() < 1.0

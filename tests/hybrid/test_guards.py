@@ -9,7 +9,6 @@ from torch.testing import assert_close
 
 from hybridkin import ConstantCurvatureChain, HybridForwardModel
 from hybridkin.hybrid._guards import BoxGuard, GroupDistance, LeverageGuard, QuadraticLeverage
-from hybridkin.learning.network import ELM
 
 LONGEST = torch.tensor(0.01).double()
 
@@ -106,42 +105,24 @@ def test_group_distance_ignores_directions_without_data():
     assert_close(pulled, found.domain_distance(q), rtol=0, atol=1e-12)
 
 
-def test_all_rows_of_a_long_log_are_within_the_group_distance():
-    t = torch.linspace(0.0, 60.0, 2000).double()[:, None]
-    q = torch.cat([torch.sin(t), torch.cos(1.3 * t), torch.sin(0.7 * t)], 1)
-    groups = np.arange(2000) // 100
-    found = GroupDistance.fit(q, groups)
-    assert len(found.rows) == 128
-    assert found.domain_distance(q).max() < 1.0
-    of = torch.from_numpy(groups)
-    y = q @ found.axes
-    apart = torch.cat([torch.cdist(y[of == k], y[of != k]).amin(1) for k in range(20)])
-    assert apart.quantile(0.95) <= found.farthest < apart.max() + 0.5
-
-
-@pytest.mark.parametrize("error_model", [None, LinearRegression()], ids=["elm", "quadratic"])
-def test_a_long_log_is_fitted_block_by_block(monkeypatch, error_model):
+def test_a_long_log_is_fitted_block_by_block(monkeypatch):
     """Its leverages and distances took 6 kB for each row: 6 GB for a million rows."""
-    sizes, cdist = [], torch.cdist
-    for kind in (ELM, QuadraticLeverage):
-        leverage = kind.leverage
-
-        def watched(self, q, leverage=leverage):
-            sizes.append(len(q))
-            return leverage(self, q)
-
-        monkeypatch.setattr(kind, "leverage", watched)
+    sizes, cdist, leverage = [], torch.cdist, QuadraticLeverage.leverage
+    monkeypatch.setattr(
+        QuadraticLeverage, "leverage", lambda model, q: sizes.append(len(q)) or leverage(model, q)
+    )
     monkeypatch.setattr(torch, "cdist", lambda a, b: sizes.append(len(b)) or cdist(a, b))
     q = 0.25 + 0.05 * rows(9000, 3)
+    groups = np.arange(9000) // 90
     chain = ConstantCurvatureChain([0.05])
-    x = chain(q) + 0.01 * torch.sin(20.0 * q)
-    model = HybridForwardModel(chain, error_model, random_state=0)
-    model.fit(q.numpy(), x.numpy(), groups=np.arange(9000) // 90)
+    model = HybridForwardModel(chain, LinearRegression()).fit(q, chain(q) + 0.1 * q, groups=groups)
     assert 2 * 9000 <= sum(sizes)
     assert max(sizes) <= 4096
-    guard = model.module_.corrections[0].guard
+    guard, tested = model.module_.corrections[0].guard, model.module_.tested
     h = guard.model.leverage(q)
     assert_close((h / (1.0 - h)).max(), guard.limit, rtol=1e-9, atol=0)
+    assert len(tested.rows) == 128
+    assert tested.domain_distance(q).max() < 1.0
 
 
 def test_slope_of_the_group_distance():
@@ -170,21 +151,15 @@ def bent_tips(q):
 @pytest.mark.parametrize("guard", ["leverage", "box"])
 def test_motions_of_single_actuators_do_not_vouch_for_what_lies_between(guard):
     q, x, groups = corner_log()
-    chain = ConstantCurvatureChain([0.05])
-    with_groups = HybridForwardModel(chain, LinearRegression(), guard=guard).fit(
-        q, x, groups=groups
-    )
-    without = HybridForwardModel(chain, LinearRegression(), guard=guard).fit(q, x)
-    assert without.module_.tested is None
-    assert with_groups.in_domain(q).all()
+    model = HybridForwardModel(ConstantCurvatureChain([0.05]), LinearRegression(), guard=guard)
     new = 0.16 + 0.1 * np.random.default_rng(1).random((500, 3))
-    assert without.in_domain(new).mean() > 0.4
-    assert with_groups.in_domain(new).mean() < 0.25
-    # The weight is that of the guard alone.
-    alone = HybridForwardModel(chain, LinearRegression(), guard=guard).fit(q, x, groups=groups)
-    alone.module_.tested = None
-    assert_array_equal(alone.predict(new), with_groups.predict(new))
-    assert_array_equal(alone.error_weight(new), with_groups.error_weight(new))
+    without = model.fit(q, x).in_domain(new).mean()
+    weight = model.error_weight(new)
+    model.fit(q, x, groups=groups)
+    assert model.in_domain(q).all()
+    assert without > 0.4
+    assert model.in_domain(new).mean() < 0.25
+    assert_array_equal(model.error_weight(new), weight)  # that of the guard alone
 
 
 def test_no_guard_or_nothing_learned_has_no_domain():

@@ -103,14 +103,3 @@ def test_names_of_columns_are_escaped():
     html = shown(HybridForwardModel(CHAIN, "linear").fit(frame, x))
     assert HOSTILE not in html
     assert "&lt;script&gt;alert(1)&lt;/script&gt;" in html
-
-
-def test_showing_computes_no_prediction(monkeypatch):
-    model = HybridForwardModel(CHAIN, "linear").fit(*log())
-
-    def refused(*_, **__):
-        raise AssertionError("a table must not wait for predictions")
-
-    monkeypatch.setattr(HybridForwardModel, "_evaluated", refused)
-    monkeypatch.setattr(torch.nn.Module, "__call__", refused)
-    assert FOUND in shown(model)

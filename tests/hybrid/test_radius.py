@@ -1,7 +1,5 @@
 """The radius about a predicted tip: it covers new motions like the known ones, or is infinite."""
 
-import json
-
 import numpy as np
 import pytest
 import torch
@@ -12,14 +10,10 @@ from hybridkin import (
     ConstantCurvatureChain,
     ELMRegressorCV,
     HybridForwardModel,
-    load_model,
     robots,
-    save_model,
-    workflow,
 )
 from hybridkin.hybrid._radius import _quantile
 from hybridkin.hybrid.estimator import fit_quietly
-from hybridkin.workflow.report import json_text
 
 
 def motions(seed, n_motions=240, n=6, noise=2e-3):
@@ -102,24 +96,6 @@ def test_every_group_has_the_same_mass():
     assert _quantile(values, groups, ones, 0.5) == 5.0
     assert _quantile(values, groups, ones, 0.75) == 6.0
     assert _quantile(values, groups, ones, 0.76) == np.inf
-
-
-def test_one_dimensional_targets_and_no_mechanical_model():
-    q, x, _ = motions(0, 10)
-    model = HybridForwardModel(None, coverage=0.9, random_state=0).fit(q, x[:, 0])
-    tips, radius = model.predict(q, return_radius=True)
-    assert tips.shape == radius.shape == (len(q),)
-    assert np.mean(np.abs(tips - x[:, 0]) < radius) > 0.85
-
-
-def test_an_infinite_radius_is_saved_and_described(tmp_path):
-    model, _, _ = few(8, 0.9)
-    save_model(model, tmp_path / "model.safetensors")
-    assert load_model(tmp_path / "model.safetensors").radius_ == model.radius_
-    report = workflow.describe(workflow.open_model(tmp_path / "model.safetensors"))
-    assert "radius covering 90 % of the tips: not known" in report.plain()
-    assert "at least 9" in " ".join(report.plain().split())
-    assert json.loads(json_text(report.record))["radius"]["inside"] is None
 
 
 @pytest.mark.slow

@@ -15,8 +15,6 @@ from hybridkin import (
     ELMRegressor,
     ELMRegressorCV,
     HybridForwardModel,
-    load_model,
-    save_model,
 )
 from hybridkin._core.directions import moved_directions
 from hybridkin.native.library import backend, evaluate
@@ -24,9 +22,9 @@ from hybridkin.native.library import backend, evaluate
 CHAIN = ConstantCurvatureChain([0.05, 0.05])
 ELM = ELMRegressor(20, direct_link=True, random_state=0)
 CV = ELMRegressorCV(20, cv=3, relevance_rounds=1, max_hidden=20, random_state=0)
-PARALLEL = ["linear", "quadratic", "pose", ELM, CV, "kernel", LinearRegression()]
+PARALLEL = ["quadratic", "pose", ELM, CV, "kernel", LinearRegression()]
 MODELS = [("parallel", model) for model in PARALLEL]
-MODELS += [("serial", model) for model in ("linear", "quadratic", "pose", ELM, CV)]
+MODELS += [("serial", model) for model in ("quadratic", "pose", ELM, CV)]
 NOISE = 1e-5 * np.random.default_rng(1).standard_normal((40, 3))
 PAIRS = [("line", "leverage"), ("line", None), ("rest", "box"), ("rest", "leverage")]
 
@@ -97,15 +95,12 @@ def test_corrections_are_constant_where_no_row_moves(coupling, error_model, kind
         assert model.in_domain(q + 1e-6 * normal).all()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["posture", "line", "rest"])
 @pytest.mark.parametrize("groups", [None, np.arange(40) // 5])
-def test_one_domain_in_torch_compiled_and_in_files(kind, groups, tmp_path):
+def test_one_domain_in_torch_and_compiled(kind, groups):
     q, rng = log(kind), np.random.default_rng(2)
-    for coupling, error_model in (MODELS[1], MODELS[3], MODELS[5], MODELS[8]):
+    for coupling, error_model in (MODELS[2], MODELS[6]):
         model = fitted(q, error_model, coupling=coupling, groups=groups)
-        save_model(model, tmp_path / "model")
-        twin = load_model(tmp_path / "model")
         assert backend(model.module_) == "compiled"
         steps = across(q)
         for size in (0.0, 0.05, 1.0):
@@ -117,8 +112,6 @@ def test_one_domain_in_torch_compiled_and_in_files(kind, groups, tmp_path):
             distance = model.module_.domain_distance(torch.from_numpy(new)).numpy()
             (found,) = evaluate(model.module_, new, value=False, distance=True)
             assert_allclose(found, distance, rtol=1e-8, atol=1e-12)
-            assert_array_equal(twin.predict(new), x)
-            assert_array_equal(twin.in_domain(new), model.in_domain(new))
 
 
 def test_the_warning_names_what_does_not_move():
