@@ -10,11 +10,9 @@ from scipy.linalg.lapack import dpocon, dpotrf, dtrtri  # pyright: ignore
 from sklearn.utils import gen_batches
 
 from hybridkin._core.arrays import copied
-from hybridkin.learning.network import READOUT
 
-BLOCK_ELEMENTS = (
-    500_000  # 4 MB of float64: enough rows to feed the BLAS, near the cache
-)
+# 4 MB of float64: enough rows to feed the BLAS, near the cache.
+BLOCK_ELEMENTS = 500_000
 
 
 class Statistics(NamedTuple):
@@ -40,35 +38,32 @@ def gather(stats, elm, X, y, sample_weight, block_size):
     block_size = block_size or max(1, BLOCK_ELEMENTS // n_columns)
     n = stats.n
     mean = torch.tensor(stats.mean, device=device)
-    scatter = torch.tensor(
-        stats.scatter, device=device
-    ).T  # BLAS order; only one half is updated
+    # In the order of BLAS; only one half is updated.
+    scatter = torch.tensor(stats.scatter, device=device).T
     buffer = mean.new_empty(min(block_size, len(X)) + 1, len(mean))
     for rows in gen_batches(len(X), block_size):
         q = copied(X[rows], device, np.float64)
         z = buffer[: len(q) + 1]
         block = z[:-1]
-        elm._write_features(q, block[:, :n_features])
+        elm.write_features(q, block[:, :n_features])
         block[:, n_features:] = copied(y[rows], device)
-        w = None if sample_weight is None else copied(sample_weight[rows], device)
-        n_block = float(len(block)) if w is None else w.sum().item()
-        mean_block = block.mean(0) if w is None else w @ block / n_block
-        block -= mean_block
-        if w is not None:
+        if sample_weight is None:
+            n_block = float(len(block))
+            mean_block = block.mean(0)
+            block -= mean_block
+        else:
+            w = copied(sample_weight[rows], device)
+            n_block = w.sum().item()
+            mean_block = w @ block / n_block
+            block -= mean_block
             block *= w.sqrt()[:, None]
         step = mean_block - mean
         torch.mul(step, (n / (n + n_block) * n_block) ** 0.5, out=z[-1])
         n += n_block
         mean += step * (n_block / n)
         if z.device.type == "cpu":  # half the work of a general product
-            c = dsyrk(
-                1.0,
-                z.T.numpy(),
-                beta=1.0,
-                c=scatter.numpy(),
-                overwrite_c=True,
-                lower=True,
-            )
+            options = {"beta": 1.0, "overwrite_c": True, "lower": True}
+            c = dsyrk(1.0, z.T.numpy(), c=scatter.numpy(), **options)
             scatter = torch.from_numpy(c)
         else:
             scatter.addmm_(z.T, z)
@@ -152,11 +147,15 @@ def fit_readout(stats, n_features, alpha, fit_intercept):
     # This form of the residual is stationary in W: rounding in W enters squared.
     rss = yy - np.sum(W * (2 * C - G @ W), axis=0)
     dof_left = n - dof - fit_intercept
-    resolved = (dof_left > np.sqrt(np.finfo(np.float64).eps) * n) & np.isfinite(
-        dof_left
-    )
+    smallest = np.sqrt(np.finfo(np.float64).eps) * n
+    resolved = np.isfinite(dof_left) & (dof_left > smallest)
     noise = np.maximum(rss, 0.0) / np.where(resolved, dof_left, np.nan)
     mu = mean[:n_features]
-    offset = np.float64(1 / n if fit_intercept else 0)
-    arrays = (W, mean[n_features:] - mu @ W, mu, R, offset)
-    return dict(zip(READOUT, arrays, strict=True)), noise, max(solvers)  # "eigh" if any
+    readout = {
+        "output_weights": W,
+        "intercept": mean[n_features:] - mu @ W,
+        "leverage_center": mu,
+        "leverage_factor": R,
+        "leverage_offset": np.float64(1 / n if fit_intercept else 0),
+    }
+    return readout, noise, max(solvers)  # "eigh" if any

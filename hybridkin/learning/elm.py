@@ -324,35 +324,30 @@ class ELMRegressor(FittedNetwork):
             )
         check_is_fitted(self, "module_")
         check_is_fitted(other, "module_")
-        ours, theirs = (
-            {**vars(m), "activation": m.module_.activation} for m in (self, other)
-        )
-        for name in (
-            *(f"{name}_" for name in LAYER),
-            "activation",
-            "feature_names_in_",
-        ):
-            if not np.array_equal(ours.get(name, ()), theirs.get(name, ())):
-                raise ValueError(
-                    f"`other` must have this model's hidden layer, input scaling and columns, but "
-                    f"its {name.rstrip('_')} differs; give both models the same int as "
-                    f"`random_state`, the same parameters, and bounds as `input_scaling`."
-                )
-        shape, other_shape = (m.module_.output_weights.shape for m in (self, other))
-        if shape != other_shape:
-            raise ValueError(
-                f"`other` must have output_weights_ of shape {tuple(shape)}, got "
-                f"{tuple(other_shape)}; "
-                f"fit both models with the same `direct_link` and the same columns of `y`."
-            )
+        for name in (*(f"{name}_" for name in LAYER), "feature_names_in_"):
+            ours = vars(self).get(name, ())
+            if not np.array_equal(ours, vars(other).get(name, ())):
+                self._refuse(name.rstrip("_"))
+        if self.module_.activation != other.module_.activation:
+            self._refuse("activation")
+        if self.output_weights_.shape != other.output_weights_.shape:
+            self._refuse("shape of output_weights_ (`direct_link`, columns of `y`)")
         return self._solve(merge(self._stats, other._stats), self.module_)
+
+    def _refuse(self, what):
+        raise ValueError(
+            f"`other` must have this model's hidden layer, input scaling and columns, but its "
+            f"{what} differs; give both models the same int as `random_state`, the same "
+            f"parameters, and bounds as `input_scaling`."
+        )
 
     def _learn(self, X, y, sample_weight, first, decay=1.0):
         X, y, sample_weight = check_rows(self, X, y, sample_weight, reset=first)
-        if sample_weight is not None and not sample_weight.all():
-            X, y, sample_weight = (
-                part[sample_weight > 0] for part in (X, y, sample_weight)
-            )
+        if sample_weight is not None:
+            counted = sample_weight > 0
+            X = X[counted]
+            y = y[counted]
+            sample_weight = sample_weight[counted]
         y_ndim = y.ndim
         y = y.reshape(len(y), -1)
         if first:
@@ -378,18 +373,17 @@ class ELMRegressor(FittedNetwork):
         """Fit the readout to statistics of the features of `elm`."""
         n_features = len(elm.output_weights)
         n_outputs = len(stats.mean) - n_features
-        if np.ndim(self.alpha):
-            alpha = real_array(self.alpha, "alpha").astype(np.float64)
-            if (
-                alpha.shape != (n_outputs,)
-                or not (np.isfinite(alpha) & (alpha >= 0)).all()
-            ):
+        alpha = self.alpha
+        if np.ndim(alpha):
+            alpha = real_array(alpha, "alpha").astype(np.float64)
+            fits = alpha.shape == (n_outputs,) and np.isfinite(alpha).all()
+            if not fits or (alpha < 0.0).any():
                 raise ValueError(
                     f"`alpha` must be a number >= 0, or {n_outputs} of them, one for each column "
                     f"of `y`, got {self.alpha!r}."
                 )
         readout, self.noise_variance_, self.solver_ = fit_readout(
-            stats, n_features, self.alpha, self.fit_intercept
+            stats, n_features, alpha, self.fit_intercept
         )
         if self.solver_ == "eigh":
             warnings.warn(

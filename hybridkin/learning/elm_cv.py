@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from itertools import product
 from numbers import Integral
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from sklearn.base import _fit_context
@@ -28,24 +28,12 @@ from hybridkin.learning.hidden_layer import check_rows, device_named, draw_layer
 
 # Times the largest eigenvalue of the features' Gram matrix.
 _AUTO_ALPHAS = np.logspace(-11, 2, 40)
-# Factors on the best weight scale, tried with new input scales.
-_ZOOM = (
-    0.5,
-    1.0,
-    2.0,
-    4.0,
-)
+_ZOOM = (0.5, 1.0, 2.0, 4.0)  # times the best weight scale, with new input scales
 _WORTH_GROWING = 0.96  # of the mean squared error: 2 % of the error
 _LEAST_RELEVANCE = 0.01
 _ROWS_OF_JACOBIANS = 10_000
-_SHARED = [
-    "activation",
-    "input_scaling",
-    "fit_intercept",
-    "direct_link",
-    "block_size",
-    "device",
-]
+_SHARED = ("activation", "input_scaling", "fit_intercept", "direct_link")
+_SHARED += ("block_size", "device")
 
 
 class ELMRegressorCV(FittedNetwork):
@@ -194,10 +182,9 @@ class ELMRegressorCV(FittedNetwork):
         if groups is not None:
             groups = labels(groups, len(X))
         # Listed splits are used as given, even if equal rows fall into different splits.
-        if isinstance(self.cv, (Iterable, PredefinedSplit)):
+        apart = groups
+        if _is_listed(self.cv):
             apart = np.arange(len(X))
-        else:
-            apart = groups
         first, sample_weight, place = distinct_rows(X, y, sample_weight, apart)
         X = X[first]
         y = y[first]
@@ -208,68 +195,38 @@ class ELMRegressorCV(FittedNetwork):
                 f"`X` must have at least 2 different rows of positive weight, so that one can be "
                 f"held out, got n_samples={len(y)}; use ELMRegressor, which holds out no rows."
             )
-        weights = np.ones(len(X)) if sample_weight is None else sample_weight
         splits = _splits(self.cv, groups, len(X), place)
-        task = _Task(
-            X, y.reshape(len(y), -1), sample_weight, weights, splits, self.alphas
-        )
-        seed = self.random_state
-        if not isinstance(seed, Integral):
-            seed = int(check_random_state(seed).randint(2**31))
-        shared = {name: vars(self)[name] for name in _SHARED} | {"random_state": seed}
-        sizes = _positive(self.n_hidden, "n_hidden", integer=True)
-        scales = _positive(self.weight_scales, "weight_scales")
-        untouched = np.ones(X.shape[1])
-        tried = []
-        for size, scale in product(sizes, scales):
-            params = {**shared, "n_hidden": int(size), "weight_scale": float(scale)}
-            tried.append(_candidate(params, untouched, task))
-        best = min(tried, key=lambda candidate: candidate.score)
+        targets = y.reshape(len(y), -1)
+        search = _Search(X, targets, sample_weight, splits, self.alphas)
+        self._try_sizes_and_scales(search)
         for _ in range(self.relevance_rounds):
-            relevance, bounds = _relevance(best, task)
-            before = best
-            for zoom in _ZOOM:
-                scale = zoom * before.params["weight_scale"]
-                params = {
-                    **before.params,
-                    "weight_scale": scale,
-                    "input_scaling": bounds,
-                }
-                tried.append(_candidate(params, relevance, task))
-            best = min(
-                best, *tried[-len(_ZOOM) :], key=lambda candidate: candidate.score
-            )
-            if best is before:
+            if not _rescale_inputs(search):
                 break
-        while 2 * best.params["n_hidden"] <= self.max_hidden:
-            params = {**best.params, "n_hidden": 2 * best.params["n_hidden"]}
-            tried.append(_candidate(params, best.relevance, task))
-            if not tried[-1].score < _WORTH_GROWING * best.score:
-                break
-            best = tried[-1]
+        best = _grown(search, self.max_hidden)
         self.alpha_ = best.params["alpha"]
         self.best_params_ = best.params
         self.best_score_ = -best.score
-        chosen = ELMRegressor(**best.params).fit(X, y, sample_weight)
-        self.best_estimator_ = chosen
-        self.module_ = chosen.module_
-        self.noise_variance_ = chosen.noise_variance_
+        self.best_estimator_ = ELMRegressor(**best.params).fit(X, y, sample_weight)
+        self.module_ = self.best_estimator_.module_
+        self.noise_variance_ = self.best_estimator_.noise_variance_
         self._y_ndim = y.ndim
-        self.left_out_errors_ = at_place(
-            _left_out_errors(best, task).reshape(y.shape), place
-        )
-        names = (
-            "n_hidden",
-            "weight_scale",
-            "relevance",
-            "alphas",
-            "mean_squared_error",
-        )
-        rows = [{**candidate.params, **candidate._asdict()} for candidate in tried]
-        self.cv_results_ = {
-            name: np.array([row[name] for row in rows]) for name in names
-        }
+        errors = search.held_out_errors(best).reshape(y.shape)
+        self.left_out_errors_ = at_place(errors, place)
+        self.cv_results_ = search.results()
         return self
+
+    def _try_sizes_and_scales(self, search):
+        seed = self.random_state
+        if not isinstance(seed, Integral):
+            seed = int(check_random_state(seed).randint(2**31))
+        params = {name: vars(self)[name] for name in _SHARED}
+        params["random_state"] = seed
+        sizes = _positive(self.n_hidden, "n_hidden", integer=True)
+        scales = _positive(self.weight_scales, "weight_scales")
+        for size, scale in product(sizes, scales):
+            params["n_hidden"] = int(size)
+            params["weight_scale"] = float(scale)
+            search.add(params, np.ones(search.X.shape[1]))
 
     def stored(self):
         """Return the description of the chosen ELMRegressor."""
@@ -279,17 +236,6 @@ class ELMRegressorCV(FittedNetwork):
             vars(self).get("feature_names_in_", [])
         )
         return chosen
-
-
-class _Task(NamedTuple):
-    """The different rows, and which of them are held out together (None: each alone)."""
-
-    X: np.ndarray
-    targets: np.ndarray  # with two dimensions
-    sample_weight: np.ndarray | None
-    weights: np.ndarray  # the same, or ones
-    splits: list | None
-    alphas: Any
 
 
 class _Candidate(NamedTuple):
@@ -303,71 +249,144 @@ class _Candidate(NamedTuple):
     left_out: LeftOut
 
 
-@np.errstate(all="ignore")  # errors that overflow are never the smallest
-def _candidate(params, relevance, task):
-    X, targets, sample_weight, weights, splits, alphas = task
-    candidate = ELMRegressor(**params)
-    elm = draw_layer(candidate, X, sample_weight).to(device_named(candidate.device))
-    stats = gather(None, elm, X, targets, sample_weight, candidate.block_size)
-    left_out = LeftOut(elm, stats, X, targets, weights, candidate.fit_intercept)
-    largest = left_out.eigenvalues[-1] or 1.0
-    if isinstance(alphas, str):
-        alphas = _AUTO_ALPHAS * largest
-    else:
-        alphas = _positive(alphas, "alphas")
-    total = np.zeros((len(alphas), targets.shape[1]))
-    weight = 0.0
-    for rows, errors in _errors(left_out, splits, alphas):
-        total += np.einsum("r, lrm -> lm", weights[rows], errors * errors)
-        weight += weights[rows].sum()
-    mse = np.where(np.isfinite(total), total / weight, np.inf).mean(axis=1)
-    params = {**params, "alpha": float(alphas[mse.argmin()])}
-    return _Candidate(params, relevance, alphas, mse, float(mse.min()), left_out)
+class _Search:
+    """The candidates tried, on different rows.
+
+    Parameters
+    ----------
+    X, targets : ndarray of shape (n, d) and (n, m)
+        The rows.
+    sample_weight : ndarray of shape (n,) or None
+        Their weights.
+    splits : list or None
+        Which rows are held out together, see `LeftOut.together`. None: each alone.
+    alphas : "auto" or array-like
+        Penalties.
+    """
+
+    def __init__(self, X, targets, sample_weight, splits, alphas):
+        self.X = X
+        self.targets = targets
+        self.sample_weight = sample_weight
+        self.weights = np.ones(len(X)) if sample_weight is None else sample_weight
+        self.splits = splits
+        self.alphas = alphas
+        self.tried: list[_Candidate] = []
+
+    @property
+    def best(self):
+        """The first candidate with the smallest error."""
+        return min(self.tried, key=lambda candidate: candidate.score)
+
+    @np.errstate(all="ignore")  # errors that overflow are never the smallest
+    def add(self, params, relevance):
+        """Try a hidden layer with all penalties."""
+        candidate = ELMRegressor(**params)
+        elm = draw_layer(candidate, self.X, self.sample_weight)
+        elm = elm.to(device_named(candidate.device))
+        rows = self.X, self.targets, self.sample_weight
+        stats = gather(None, elm, *rows, candidate.block_size)
+        left_out = LeftOut(
+            elm, stats, self.X, self.targets, self.weights, candidate.fit_intercept
+        )
+        if isinstance(self.alphas, str):
+            alphas = _AUTO_ALPHAS * (left_out.eigenvalues[-1] or 1.0)
+        else:
+            alphas = _positive(self.alphas, "alphas")
+        total = np.zeros((len(alphas), self.targets.shape[1]))
+        weight = 0.0
+        for held_out, errors in self._errors(left_out, alphas):
+            w = self.weights[held_out]
+            total += np.einsum("r, lrm -> lm", w, errors * errors)
+            weight += w.sum()
+        mse = np.where(np.isfinite(total), total / weight, np.inf).mean(axis=1)
+        params = {**params, "alpha": float(alphas[mse.argmin()])}
+        score = float(mse.min())
+        self.tried.append(_Candidate(params, relevance, alphas, mse, score, left_out))
+
+    def _errors(self, left_out, alphas):
+        """Yield held-out rows and their errors (n_alphas, n_rows, n_outputs)."""
+        if self.splits is None:
+            return left_out.alone(alphas)
+        return left_out.together(self.splits, alphas)
+
+    def held_out_errors(self, candidate):
+        """Return target minus prediction of every row, held out; a mean over splits, or NaN."""
+        total = np.zeros(self.targets.shape)
+        count = np.zeros((len(self.X), 1))
+        alpha = np.array([candidate.params["alpha"]])
+        for rows, errors in self._errors(candidate.left_out, alpha):
+            total[rows] += errors[0]
+            count[rows] += 1
+        return total / np.where(count > 0, count, np.nan)
+
+    def results(self):
+        """Return what was tried, as `ELMRegressorCV.cv_results_`."""
+        tried = self.tried
+        sizes = [candidate.params["n_hidden"] for candidate in tried]
+        scales = [candidate.params["weight_scale"] for candidate in tried]
+        errors = [candidate.mean_squared_error for candidate in tried]
+        return {
+            "n_hidden": np.array(sizes),
+            "weight_scale": np.array(scales),
+            "relevance": np.array([candidate.relevance for candidate in tried]),
+            "alphas": np.array([candidate.alphas for candidate in tried]),
+            "mean_squared_error": np.array(errors),
+        }
 
 
-def _errors(left_out, splits, alphas):
-    """Yield held-out rows and their errors (n_alphas, n_rows, n_outputs)."""
-    if splits is None:
-        return left_out.alone(alphas)
-    return left_out.together(splits, alphas)
+def _rescale_inputs(search):
+    """Try input scales that follow the relevance of the inputs, and return whether it helped."""
+    before = search.best
+    relevance, bounds = _relevance(before, search)
+    for zoom in _ZOOM:
+        params = dict(before.params)
+        params["weight_scale"] = zoom * before.params["weight_scale"]
+        params["input_scaling"] = bounds
+        search.add(params, relevance)
+    return search.best is not before
 
 
-def _left_out_errors(best, task):
-    total = np.zeros(task.targets.shape)
-    count = np.zeros((len(task.X), 1))
-    alpha = np.array([best.params["alpha"]])
-    for rows, errors in _errors(best.left_out, task.splits, alpha):
-        total[rows] += errors[0]
-        count[rows] += 1
-    return total / np.where(count > 0, count, np.nan)
+def _grown(search, max_hidden):
+    """Return the best candidate, with as many doublings of its neurons as are worth it."""
+    best = search.best
+    while 2 * best.params["n_hidden"] <= max_hidden:
+        params = {**best.params, "n_hidden": 2 * best.params["n_hidden"]}
+        search.add(params, best.relevance)
+        if not search.tried[-1].score < _WORTH_GROWING * best.score:
+            break
+        best = search.tried[-1]
+    return best
 
 
-def _relevance(best, task):
+def _relevance(best, search):
     """Return how much the derivative along each input varies (at most 1), and matching bounds.
 
     The derivative refers to inputs in their initial scaling.
     """
-    model = ELMRegressor(**best.params).fit(task.X, task.targets, task.sample_weight)
-    center, scale = (
-        model.module_.get_buffer(name).numpy(force=True)
-        for name in ("input_center", "input_scale")
-    )
-    scale = scale * best.relevance
+    model = ELMRegressor(**best.params)
+    model.fit(search.X, search.targets, search.sample_weight)
+    center = model.input_center_
+    scale = model.input_scale_ * best.relevance
     total = 0.0
     squares = 0.0
-    weight = 0.0
-    for batch in gen_batches(len(task.X), _ROWS_OF_JACOBIANS):
-        J = model.jacobian(task.X[batch]) * scale
-        w = task.weights[batch]
-        total = total + np.tensordot(w, J, 1)
-        squares = squares + np.tensordot(w, J * J, 1)
-        weight = weight + w.sum()
+    for batch in gen_batches(len(search.X), _ROWS_OF_JACOBIANS):
+        J = model.jacobian(search.X[batch]) * scale
+        weights = search.weights[batch]
+        total = total + np.tensordot(weights, J, 1)
+        squares = squares + np.tensordot(weights, J * J, 1)
+    weight = search.weights.sum()
     spread = np.sqrt(
         np.maximum(squares / weight - (total / weight) ** 2, 0.0).sum(axis=0)
     )
     relevance = np.maximum(spread / (spread.max() or 1.0), _LEAST_RELEVANCE)
     half = scale / relevance
     return relevance, np.array([center - half, center + half])
+
+
+def _is_listed(cv):
+    """Return whether `cv` names the rows of every split."""
+    return isinstance(cv, (Iterable, PredefinedSplit))
 
 
 def _splits(cv, groups, n_rows, place):
@@ -378,34 +397,33 @@ def _splits(cv, groups, n_rows, place):
     """
     if groups is None and cv is None:
         return None
-    if groups is not None and cv is None:
+    if cv is None:
         cv = LeaveOneGroupOut()
     elif groups is not None and isinstance(cv, Integral):
         cv = GroupKFold(int(cv))
-    if not isinstance(cv, (Iterable, PredefinedSplit)):
+    if not _is_listed(cv):
         place = np.arange(n_rows)
-    splits = []
     rows = np.arange(len(place))
-    splitter: Any = check_cv(cv)  # pyright: ignore[reportArgumentType]
+    splitter = check_cv(cv)  # pyright: ignore[reportArgumentType]
     with TURNS.filters:
         all_splits = [*splitter.split(rows, rows, groups)]
+    splits = []
     for train, test in all_splits:
         if np.isin(rows[test], rows[train]).any():
             raise ValueError(
                 "`cv` must not test on rows that it trains on, but one of its splits does; use a "
                 "splitter of sklearn.model_selection."
             )
-        out = np.ones(n_rows + 1, dtype=bool)
+        # The place after the last row is that of all rows of weight 0.
+        trained = np.zeros(n_rows + 1, dtype=bool)
         tested = np.zeros(n_rows + 1, dtype=bool)
-        # The last: rows of weight 0.
-        out[place[train]], tested[place[test]] = (
-            False,
-            True,
-        )
-        splits.append(
-            (np.flatnonzero((out | tested)[:-1]), np.flatnonzero(tested[:-1]))
-        )
-    return [split for split in splits if len(split[1])]
+        trained[place[train]] = True
+        tested[place[test]] = True
+        held_out = np.flatnonzero((~trained | tested)[:-1])
+        asked = np.flatnonzero(tested[:-1])
+        if len(asked):
+            splits.append((held_out, asked))
+    return splits
 
 
 def _positive(values, name, integer=False):

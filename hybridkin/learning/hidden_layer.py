@@ -6,7 +6,7 @@ from sklearn.utils import check_random_state
 from sklearn.utils.validation import _check_sample_weight, validate_data
 
 from hybridkin._core.arrays import real_array, table
-from hybridkin.learning.network import ELM, LAYER, READOUT
+from hybridkin.learning.network import ELM
 
 DTYPES = (np.float64, np.float32)
 
@@ -49,19 +49,16 @@ def check_rows(estimator, X, y, sample_weight, reset=True):
     good = _is_finite(y, 1) or _is_finite(y, 2)
     checks = {"multi_output": True, "y_numeric": True}
     X, y = _validated(estimator, X, y, good=good, reset=reset, **checks)
+    y = y.astype(np.float64, copy=False)
     if sample_weight is None:
-        weights = None
-    else:
-        weights = np.asarray(sample_weight, dtype=np.float64)
-    if weights is not None:
-        good = (
-            _is_finite(weights, 1) and len(weights) == len(X) and weights.min() >= 0.0
+        return X, y, None
+    weights = np.asarray(sample_weight, dtype=np.float64)
+    good = _is_finite(weights, 1) and len(weights) == len(X)
+    if not good or weights.min() < 0.0 or not weights.any():
+        weights = _check_sample_weight(
+            sample_weight, X, dtype=np.float64, ensure_non_negative=True
         )
-        if not good or not weights.any():
-            weights = _check_sample_weight(
-                sample_weight, X, dtype=np.float64, ensure_non_negative=True
-            )
-    return X, y.astype(np.float64, copy=False), weights
+    return X, y, weights
 
 
 def check_inputs(estimator, X):
@@ -77,12 +74,9 @@ def check_inputs(estimator, X):
 
 def _is_finite(a, ndim):
     """Return whether an object is a plain array of real, finite numbers."""
-    if (
-        type(a) is not np.ndarray
-        or a.ndim != ndim
-        or a.dtype not in DTYPES
-        or not a.size
-    ):
+    if type(a) is not np.ndarray or a.ndim != ndim:
+        return False
+    if a.dtype not in DTYPES or not a.size:
         return False
     with np.errstate(all="ignore"):
         return bool(np.isfinite(a.sum()))
@@ -99,7 +93,7 @@ def _validated(estimator, X, *y, good=True, **checks):
     with np.errstate(invalid="ignore"):  # a sum of both infinities
         validated = validate_data(estimator, X, *y, **checks)
     if good:
-        return [np.asarray(X), *map(np.asarray, y)]
+        return [X, *y]
     return [*map(np.asarray, validated if y else [validated])]
 
 
@@ -109,11 +103,20 @@ def draw_layer(params, X, sample_weight):
     shape = (params.n_hidden, X.shape[1])
     W = rng.uniform(-params.weight_scale, params.weight_scale, shape)
     b = rng.uniform(-params.weight_scale, params.weight_scale, params.n_hidden)
-    layer = (W, b, *_scaling(X, sample_weight, params.input_scaling))
+    center, scale = _scaling(X, sample_weight, params.input_scaling)
     n_features = params.n_hidden + params.direct_link * X.shape[1]
-    shapes = ((n_features, 0), 0, n_features, (n_features, 0), ())
-    arrays = (*layer, *map(np.zeros, shapes))
-    return ELM(params.activation, **dict(zip(LAYER + READOUT, arrays, strict=True)))
+    return ELM(
+        params.activation,
+        input_weights=W,
+        input_bias=b,
+        input_center=center,
+        input_scale=scale,
+        output_weights=np.zeros((n_features, 0)),
+        intercept=np.zeros(0),
+        leverage_center=np.zeros(n_features),
+        leverage_factor=np.zeros((n_features, 0)),
+        leverage_offset=np.zeros(()),
+    )
 
 
 def device_named(name):
@@ -121,13 +124,7 @@ def device_named(name):
     try:
         device = torch.device("cpu" if name is None else name)
         torch.zeros(1, dtype=torch.float64, device=device).item()
-    except (
-        RuntimeError,
-        AssertionError,
-        TypeError,
-        ValueError,
-        NotImplementedError,
-    ) as error:
+    except (RuntimeError, AssertionError, TypeError, ValueError) as error:
         raise RuntimeError(
             f"`device` must name a device on which torch can compute in float64, got "
             f"{str(name)!r}; use device=None for the CPU."

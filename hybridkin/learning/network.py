@@ -185,7 +185,8 @@ class ELM(LeverageModule):
             a = torch.addmm(b, u, W.T, out=out)
         return u, a, ACTIVATIONS[self.activation][0](a, out=out)
 
-    def _write_features(self, q, out):
+    def write_features(self, q, out):
+        """Write the features of rows `q` (N, n_inputs) into `out` (N, n_features)."""
         # In place: large temporary arrays would fragment the heap by hundreds of megabytes.
         n_hidden = len(self.input_weights)
         u, _, _ = self._hidden(q, out[:, :n_hidden])

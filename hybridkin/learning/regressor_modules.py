@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
-from sklearn.gaussian_process import GaussianProcessRegressor
-from sklearn.gaussian_process import kernels as gp
+from numpy.typing import ArrayLike, NDArray
 from sklearn.kernel_ridge import KernelRidge
 from sklearn.linear_model import ElasticNet, LinearRegression, Ridge, RidgeCV
 from sklearn.pipeline import Pipeline
@@ -18,7 +16,7 @@ from torch.autograd.function import once_differentiable
 
 from hybridkin._core.arrays import copied
 from hybridkin._core.blocks import in_blocks
-from hybridkin._core.model import ForwardModel, as_forward_model
+from hybridkin._core.model import Fitted, ForwardModel, as_forward_model
 from hybridkin._core.plan import Plan
 from hybridkin._core.stored import Layout, Stored
 from hybridkin.learning.network import write_units
@@ -29,48 +27,84 @@ _LARGEST = float(np.finfo(np.float32).max)
 _KERNEL_BLOCK = 2**20  # numbers in the kernel matrix of a block of rows
 
 
-def error_module(regressor: object, q: Tensor) -> ForwardModel:
+class Regressor(Protocol):
+    """A fitted scikit-learn regressor."""
+
+    def predict(self, X: NDArray) -> NDArray:
+        """Return the prediction of every row."""
+        ...
+
+
+def error_module(regressor: Regressor, q: Tensor) -> ForwardModel:
     """Return a fitted regressor as a forward model q (..., n) -> (..., m).
 
     Parameters
     ----------
     regressor : estimator
         In closed form: a regressor with a torch ``module_``, a linear model (also on
-        `PolynomialFeatures`), and a `KernelRidge` or `GaussianProcessRegressor` with an RBF kernel,
-        each also after standard or min-max scalers. Others: finite differences of ``predict``.
+        `PolynomialFeatures`), and a `KernelRidge` with an RBF kernel, each also after standard or
+        min-max scalers. Others: finite differences of ``predict``.
     q : Tensor of shape (N, n)
         The training rows.
     """
-    if isinstance(getattr(regressor, "module_", None), nn.Module):
+    if isinstance(regressor, Fitted):
         return as_forward_model(regressor)
+    steps = [regressor]
     if isinstance(regressor, Pipeline):
         steps = [*regressor.named_steps.values()]
-    else:
-        steps = [regressor]
+    # u = (q - center) / scale of all scalers in front
     center = np.zeros(q.shape[1])
     scale = np.ones(q.shape[1])
-    while len(steps) > 1 and (found := _affine(steps[0])) is not None:
-        center = center + scale * found[0]
-        scale = scale * found[1]
-        steps = steps[1:]
+    while len(steps) > 1 and _is_affine(steps[0]):
+        offset, slope = _affine(steps.pop(0))
+        center = center + scale * offset
+        scale = scale * slope
     readout = steps[-1]
-    if isinstance(readout, _LINEAR):
-        coef = np.atleast_2d(np.asarray(readout.coef_))
-        if len(steps) == 1:
-            return AffineModule(
-                coef / scale, readout.intercept_ - coef / scale @ center
-            )
-        if len(steps) == 2 and isinstance(steps[0], PolynomialFeatures):
-            # The intercept is a monomial.
-            powers = np.pad(steps[0].powers_, ((1, 0), (0, 0)))
-            constant = np.broadcast_to(readout.intercept_, len(coef))
-            return PolynomialModule(
-                powers, np.vstack([constant, coef.T]), center, scale
-            )
-    if len(steps) == 1 and (expansion := _expansion(readout)) is not None:
-        rows, weights, widths, bias = expansion
-        return KernelModule(rows / widths, weights, bias, center, scale * widths)
+    if len(steps) == 1 and isinstance(readout, _LINEAR):
+        coef = np.atleast_2d(readout.coef_) / scale
+        return AffineModule(coef, readout.intercept_ - coef @ center)
+    if len(steps) == 1 and type(readout) is KernelRidge and readout.kernel == "rbf":
+        return _kernel_module(readout, center, scale)
+    if (
+        len(steps) == 2
+        and isinstance(steps[0], PolynomialFeatures)
+        and isinstance(readout, _LINEAR)
+    ):
+        coef = np.atleast_2d(readout.coef_)
+        # The intercept is a monomial.
+        powers = np.pad(steps[0].powers_, ((1, 0), (0, 0)))
+        constant = np.broadcast_to(readout.intercept_, len(coef))
+        return PolynomialModule(powers, np.vstack([constant, coef.T]), center, scale)
     return RegressorModule(regressor, q)
+
+
+def _is_affine(step: object) -> bool:
+    if isinstance(step, MinMaxScaler):
+        return not step.clip
+    return isinstance(step, StandardScaler)
+
+
+def _affine(
+    scaler: StandardScaler | MinMaxScaler,
+) -> tuple[NDArray | float, NDArray | float]:
+    """Return center and scale of a fitted scaler, u = (q - center) / scale."""
+    if isinstance(scaler, MinMaxScaler):
+        return -scaler.min_ / scaler.scale_, 1.0 / scaler.scale_
+    center = scaler.mean_ if scaler.with_mean else 0.0
+    scale = scaler.scale_ if scaler.with_std else 1.0
+    return center, scale
+
+
+def _kernel_module(
+    fitted: KernelRidge, center: NDArray, scale: NDArray
+) -> KernelModule:
+    rows = fitted.X_fit_
+    gamma = fitted.gamma
+    if gamma is None:
+        gamma = 1.0 / rows.shape[1]
+    width = (2.0 * gamma) ** -0.5
+    weights = fitted.dual_coef_.reshape(len(rows), -1)
+    return KernelModule(rows / width, weights, 0.0, center, scale * width)
 
 
 def _register(module: nn.Module, **arrays: ArrayLike) -> None:
@@ -301,7 +335,7 @@ class RegressorModule(ForwardModel):
     Jacobian is zero almost everywhere.
     """
 
-    def __init__(self, regressor: Any, q: Tensor) -> None:
+    def __init__(self, regressor: Regressor, q: Tensor) -> None:
         super().__init__()
         self.regressor = regressor
         width = (q.amax(0) - q.amin(0)).numpy()
@@ -352,57 +386,3 @@ class _Differenced(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:  # pyright: ignore
         (q,) = ctx.saved_tensors
         return (grad[..., None, :] @ ctx.module.differences(q))[..., 0, :], None
-
-
-def _affine(step: object) -> tuple[Any, Any] | None:
-    """Return center and scale of a fitted scaler, u = (q - center) / scale."""
-    if isinstance(step, StandardScaler):
-        return (
-            step.mean_ if step.with_mean else 0.0,
-            step.scale_ if step.with_std else 1.0,
-        )
-    if isinstance(step, MinMaxScaler) and not step.clip:
-        return -step.min_ / step.scale_, 1.0 / step.scale_
-    return None
-
-
-def _expansion(fitted: Any) -> tuple[Any, Any, Any, Any] | None:
-    """Return rows, weights, widths and bias of a regressor with a Gaussian kernel."""
-    kind = type(fitted)
-    if kind is KernelRidge and fitted.kernel == "rbf":
-        rows = fitted.X_fit_
-        weights = fitted.dual_coef_
-        gamma = fitted.gamma if fitted.gamma is not None else 1.0 / rows.shape[1]
-        return rows, weights.reshape(len(rows), -1), (2.0 * gamma) ** -0.5, 0.0
-    if kind is GaussianProcessRegressor:
-        kernel = _gaussian(fitted.kernel_)
-        if kernel is not None:
-            height, widths = kernel
-            rows = fitted.X_train_
-            weights = (
-                height * fitted.alpha_.reshape(len(rows), -1) * fitted._y_train_std
-            )
-            return rows, weights, widths, fitted._y_train_mean
-    return None
-
-
-def _gaussian(kernel: gp.Kernel) -> tuple[float, Any] | None:
-    """Return height and widths of a kernel if it is Gaussian between different rows, else None."""
-    if type(kernel) is gp.RBF:  # isinstance would accept a Matern kernel
-        return 1.0, kernel.length_scale
-    if isinstance(kernel, gp.KernelOperator):
-        for one, other in ((kernel.k1, kernel.k2), (kernel.k2, kernel.k1)):
-            part = _gaussian(one)
-            if (
-                part
-                and isinstance(kernel, gp.Sum)
-                and isinstance(other, gp.WhiteKernel)
-            ):
-                return part
-            if (
-                part
-                and isinstance(kernel, gp.Product)
-                and isinstance(other, gp.ConstantKernel)
-            ):
-                return other.constant_value * part[0], part[1]
-    return None

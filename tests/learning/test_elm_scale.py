@@ -1,7 +1,6 @@
 """The ELM at scale: streams of chunks, dask, processes, searches over frames, metadata."""
 
 import importlib.util
-import os
 from pathlib import Path
 
 import joblib
@@ -9,15 +8,9 @@ import numpy as np
 import pandas as pd
 import polars as pl
 import pytest
-import sklearn
-import threadpoolctl
 import torch
-from joblib.externals.loky import get_reusable_executor
 from numpy.testing import assert_allclose, assert_array_equal
-from sklearn.model_selection import GridSearchCV, KFold, cross_val_score, cross_validate
-from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import MinMaxScaler
-from sklearn.utils import estimator_html_repr
+from sklearn.model_selection import GridSearchCV, cross_val_score
 
 from hybridkin import (
     ELMRegressor,
@@ -50,16 +43,6 @@ def assert_same_predictions(a, b, X, rtol=1e-10):
     assert_allclose(a.predict(X), expected, rtol=0, atol=rtol * np.abs(expected).max())
 
 
-class WatchedELM(ELMRegressor):
-    """Remembers the process in which it was fitted, and the threads that process may use."""
-
-    def fit(self, X, y, sample_weight=None):
-        super().fit(X, y, sample_weight)
-        pools = [pool["num_threads"] for pool in threadpoolctl.threadpool_info()]
-        self.process_, self.threads_ = os.getpid(), max(*pools, torch.get_num_threads())
-        return self
-
-
 # Streams
 
 
@@ -76,20 +59,6 @@ def together(chunks):
     Xs, ys = zip(*chunks, strict=True)
     chunk = np.repeat(np.arange(len(Xs)), [len(X) for X in Xs])
     return np.vstack(Xs, dtype=np.float64), np.vstack(ys, dtype=np.float64), chunk
-
-
-@pytest.mark.parametrize("fit_intercept", [False, True])
-def test_a_generator_of_chunks_equals_one_fit(fit_intercept):
-    params = {"input_scaling": BOUNDS, "fit_intercept": fit_intercept, "direct_link": True}
-    streamed = elm(**params)
-    for X, y in stream():
-        streamed.partial_fit(X, y)
-    X, y, _ = together(stream())
-    whole = elm(**params).fit(X, y)
-    assert streamed.n_samples_seen_ == 500
-    assert_same_predictions(streamed, whole, X)
-    assert_allclose(streamed.noise_variance_, whole.noise_variance_, rtol=1e-10)
-    assert_allclose(streamed.leverage(X), whole.leverage(X), rtol=1e-10)
 
 
 @pytest.mark.parametrize("fit_intercept", [False, True])
@@ -117,7 +86,7 @@ def test_decay_is_a_weight_that_falls_with_age(fit_intercept):
     assert np.abs(forgetful.predict(X) - elm(**params).fit(X, y).predict(X)).max() > 1e-3
 
 
-@pytest.mark.parametrize("decay", [0, -1, 1.5, np.nan, np.inf])
+@pytest.mark.parametrize("decay", [0, 1.5, np.nan])
 def test_a_wrong_decay_or_chunk_changes_nothing(decay):
     X, y = data()
     model = elm(input_scaling=BOUNDS).fit(X, y)
@@ -180,50 +149,6 @@ def test_dask_example_equals_one_fit(scaled_out):
     assert len(example.draw(tree, curve, seconds).axes) == 2
 
 
-@pytest.mark.slow
-def test_order_of_merges_does_not_matter():
-    example = load_example()
-    bounds = np.array([[0.2] * 9, [0.25] * 9])
-    parts = [example.fitted(block, N_ROWS, bounds) for block in BLOCKS]
-    hashes = [joblib.hash(part) for part in parts]
-    q, _ = example.chunk(99, 1000)
-    expected, _ = example.fit_by_loop(BLOCKS, N_ROWS, bounds)
-    rng = np.random.default_rng(0)
-    for _ in range(5):
-        left = list(parts)
-        while len(left) > 1:  # any two, in any order
-            a, b = (left.pop(rng.integers(len(left))) for _ in range(2))
-            left.append(example.merged(a, b))
-        assert left[0].n_samples_seen_ == 11 * N_ROWS
-        assert_same_predictions(left[0], expected, q)
-        assert_allclose(left[0].noise_variance_, expected.noise_variance_, rtol=1e-10)
-    assert [joblib.hash(part) for part in parts] == hashes
-
-
-# Processes and threads
-
-
-@pytest.fixture
-def two_processes():
-    with joblib.parallel_config(backend="loky", n_jobs=2):
-        yield
-    get_reusable_executor().shutdown(wait=True)
-
-
-@pytest.mark.slow
-def test_processes_share_the_cores(two_processes):
-    X, y = data()
-    estimator = WatchedELM(20, random_state=0)
-    here = cross_validate(estimator, X, y, return_estimator=True, n_jobs=1)
-    there = cross_validate(estimator, X, y, return_estimator=True)
-    assert os.getpid() not in {model.process_ for model in there["estimator"]}
-    fair = max(1, joblib.cpu_count() // 2)
-    assert max(model.threads_ for model in there["estimator"]) <= fair
-    assert_allclose(there["test_score"], here["test_score"], rtol=1e-9)
-    for a, b in zip(there["estimator"], here["estimator"], strict=True):
-        assert_same_predictions(a, b, X)
-
-
 # Frames, pipelines, pictures, metadata
 
 
@@ -249,28 +174,3 @@ def test_frames_through_a_search(library):
     choosing = elm_cv()
     scores = cross_val_score(choosing, X, y[:, 0])
     assert_allclose(cross_val_score(choosing, X_frame, y_frame["x"]), scores, rtol=1e-9)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "estimator",
-    [
-        elm(),
-        elm(alpha=[0.1, 1.0], input_scaling=np.array(BOUNDS), device=torch.device("cpu")),
-        elm_cv(alphas=np.array([0.1, 1.0]), cv=KFold(3)),
-    ],
-    ids=["elm", "arrays", "cv"],
-)
-def test_html_repr(estimator):
-    X, y = data()
-    name = type(estimator).__name__
-    fresh = sklearn.clone(estimator)
-    fitted = sklearn.clone(estimator).fit(X, y)
-    for model, state in ((fresh, "Not fitted"), (fitted, "Fitted")):
-        html = estimator_html_repr(model)
-        assert f"<span>{state}</span>" in html
-        assert name in html
-        assert name in model._repr_html_()
-        assert "text/html" in model._repr_mimebundle_()
-        assert name in estimator_html_repr(make_pipeline(MinMaxScaler(), model))
-    assert name in estimator_html_repr(GridSearchCV(fresh, {"random_state": [0, 1]}).fit(X, y))

@@ -4,8 +4,7 @@ import torch
 from numpy.testing import assert_array_equal
 from safetensors.numpy import load_file
 from saved_models import trunk_log
-from sklearn.gaussian_process import GaussianProcessRegressor
-from sklearn.gaussian_process.kernels import RBF
+from sklearn.kernel_ridge import KernelRidge
 from sklearn.linear_model import Ridge
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import PolynomialFeatures, StandardScaler
@@ -23,7 +22,7 @@ from hybridkin.learning.regressor_modules import error_module
         Ridge(),
         ELMRegressor(4, direct_link=True, random_state=0),
         make_pipeline(StandardScaler(), PolynomialFeatures(3), Ridge()),
-        GaussianProcessRegressor(RBF([0.05, 0.1, 0.2]), alpha=0.01, optimizer=None),
+        make_pipeline(StandardScaler(), KernelRidge(kernel="rbf", alpha=0.01)),
     ],
     ids=["affine", "network", "polynomial", "kernel"],
 )
