@@ -14,12 +14,12 @@ from hybridkin.workflow.report import millimetres
 
 @dataclass(frozen=True)
 class RadiusEntry:
-    """An estimated error radius [m]; infinite if the log supports none.
+    """An estimated error radius.
 
     Attributes
     ----------
-    inside, outside : float
-        In the domain of the error model, and outside.
+    inside : float
+        The radius in the domain of the error model [m]; infinite if the log supports none.
     coverage : float
         Share of the tips that it covers.
     n_rows : int
@@ -29,7 +29,6 @@ class RadiusEntry:
     """
 
     inside: float
-    outside: float
     coverage: float
     n_rows: int
     words: str
@@ -45,7 +44,7 @@ class RadiusEntry:
         else:
             size = f"not known; at least {radius.least_groups} motions in the domain are needed."
         words = f"Estimated error radius covering {100 * radius.coverage:g} % of the tips: {size}"
-        return cls(*radius, words)
+        return cls(radius.inside, radius.coverage, radius.n_rows, words)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -92,7 +92,10 @@ class HeldOutErrors(Errors):
 
 @dataclass(frozen=True)
 class ExpectedErrors:
-    """Mean errors (N,) to expect of a robot, and the errors that 95 % do not exceed [m]."""
+    """Mean errors to expect of a robot, and the errors that 95 % do not exceed [m].
+
+    Of rows (N,), or their means over rows.
+    """
 
     mean: NDArray
     p95: NDArray

@@ -23,7 +23,7 @@ from hybridkin.ik import trajectories
 from hybridkin.ik.results import IKStatus, Track, score
 from hybridkin.ik.trajectories import Trajectory
 from hybridkin.workflow.domain import Domain, PathLimits, path_limits
-from hybridkin.workflow.errors import Errors
+from hybridkin.workflow.errors import Errors, ExpectedErrors
 from hybridkin.workflow.model import LoadedModel, play_widths
 from hybridkin.workflow.path import interpolated
 from hybridkin.workflow.reach import better_place, check_reach
@@ -67,14 +67,6 @@ class LeadIn:
     start: NDArray | None
 
 
-@dataclass(frozen=True)
-class MeanExpected:
-    """Error to expect of the robot on a path, on average, and that which 95 % do not exceed [m]."""
-
-    mean: float
-    p95: float
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TrackRecord:
     """What `track_path` found.
@@ -97,8 +89,8 @@ class TrackRecord:
         How many points have each status.
     in_domain : float or None
         Share of the points in the domain of the model, None without a learned part.
-    expected : MeanExpected or None
-        Error to expect of the robot in the domain, None if not known.
+    expected : ExpectedErrors or None
+        Mean errors to expect of the robot in the domain, None if not known.
     play : list of float or None
         Backlash of every actuator [m].
     lead_in : LeadIn
@@ -124,7 +116,7 @@ class TrackRecord:
     errors: Errors
     statuses: dict[str, int]
     in_domain: float | None
-    expected: MeanExpected | None
+    expected: ExpectedErrors | None
     play: list[float] | None
     lead_in: LeadIn
     limits: PathLimits
@@ -276,12 +268,12 @@ def track_path(
     return report
 
 
-def _expected(loaded: LoadedModel, q: NDArray) -> MeanExpected | None:
+def _expected(loaded: LoadedModel, q: NDArray) -> ExpectedErrors | None:
     """Return the mean errors to expect where the actuators do q (N, n); None if not known."""
     promised = loaded.promised_errors(q)
     if promised is None or len(q) == 0:
         return None
-    return MeanExpected(promised.mean.mean(), promised.p95.mean())
+    return ExpectedErrors(promised.mean.mean(), promised.p95.mean())
 
 
 def _start(domain: Domain, start: ArrayLike | str) -> NDArray | None:

@@ -13,8 +13,8 @@ from hybridkin import (
     ElasticTendonChain,
     HybridForwardModel,
     PlayOperator,
+    calibrate,
     datasets,
-    load_model,
     robots,
     save_model,
     trajectories,
@@ -22,6 +22,7 @@ from hybridkin import (
 )
 from hybridkin.cli.main import main
 from hybridkin.hybrid.estimator import fit_quietly
+from hybridkin.workflow.calibrated import calibrated_parameters
 from hybridkin.workflow.domain import Domain
 
 ROBOT = """
@@ -65,18 +66,6 @@ def log(tmp_path):
 
 
 @pytest.mark.slow
-def test_turns_of_rings_are_not_identified_apart_from_the_base(log, tmp_path):
-    path, robot = log
-    robot.write_text(ROBOT.replace('"base"]', '"turns", "base"]'))
-    report = fit(path, robot, tmp_path / "m")
-    text = (tmp_path / "m" / "report.md").read_text()
-    assert re.search(r"\| turns\[1\] \[deg\] \|.*\| no \|", text)
-    (sentence,) = report.record.calibration.unidentified
-    assert sentence.startswith("all turns +1 deg with base[rot z] -1 deg")
-    assert f"- {sentence}" in text
-
-
-@pytest.mark.slow
 def test_fit_warns_once_of_what_is_unphysical(log, tmp_path):
     path, robot = log
     robot.write_text(ROBOT.replace("0.11", "0.05"))
@@ -115,71 +104,16 @@ def test_rows_outside_the_domain_count_for_no_radius(log, tmp_path):
     assert "in the domain and for motions as in the log. Rows without a radius" in text
 
 
-@pytest.fixture
-def slack_log(tmp_path):
-    """A log of an elastic robot of one segment, its tendons pulled at random, in 6 motions."""
-    rng = np.random.default_rng(0)
-    q = 0.004 * rng.uniform(-1, 1, (120, 3))
-    truth = ElasticTendonChain(
-        [0.005], [0.1], bending_stiffness=1e-6, axial_stiffness=2.0, tendon_zeros=-2e-4
-    )
-    x = truth(torch.from_numpy(q)).numpy() + 1e-4 * rng.standard_normal((120, 3))
-    rows = np.column_stack([-1000 * q, 1000 * x, np.repeat(np.arange(6), 20)])
-    path = tmp_path / "slack.csv"
-    header = "a,b,c,x,y,z,motion"
-    np.savetxt(path, rows, delimiter=",", header=header, comments="", fmt="%.6f")
-    return path, {"q": q, "x": x}
-
-
-SLACK_ROBOT = """
-[[segment]]
-radius = 0.005
-length = 0.1
-[log]
-q = ["a", "b", "c"]
-x = ["x", "y", "z"]
-q_unit = "mm"
-x_unit = "mm"
-q_sign = -1
-"""
-
-
-@pytest.mark.slow
-def test_fit_of_elastic_tendons(slack_log, tmp_path):
-    path, data = slack_log
-    robot = tmp_path / "elastic.toml"
-    robot.write_text('model = "elastic-tendon"\n' + SLACK_ROBOT)
-    report = fit(path, robot, tmp_path / "m", groups="motion")
-    held_out = report.record.held_out
-    calibrated = held_out["mechanical, calibrated"].mean
-    assert calibrated < 0.0005
-    assert calibrated < 0.6 * held_out["data-driven, quadratic"].mean
-    entries = {entry.name: entry for entry in report.record.calibration.entries}
-    stiffness = entries["bending_stiffness[0]"], entries["axial_stiffness[0]"]
-    assert [entry.unit for entry in stiffness] == ["mm²/rad²", "-"]
-    assert [entry.start for entry in stiffness] == pytest.approx([0.25, 10.0])
-    for entry, true in zip(stiffness, (1.0, 2.0), strict=True):
-        assert entry.value == pytest.approx(true, rel=0.2)
-        assert 0 < entry.std_error < 0.2 * true
-    assert entries["tendon_zeros[0]"].unit == "mm"
-    assert report.record.calibration.warnings == []
-    assert {"held_out.png", "error_histogram.png"} <= {path.name for path in report.paths}
-    model = load_model(tmp_path / "m" / "model.safetensors")
-    assert isinstance(model.mechanical_model_, ElasticTendonChain)
-    errors = np.linalg.norm(model.predict(data["q"]) - data["x"], axis=1)
-    assert errors.mean() < 0.0005
-
-
-@pytest.mark.slow
-def test_real_nine_tendon_robot_hybrid_is_not_worse_than_calibrated(data_home):
-    robot = robots.read_description("examples/robots/ftdcr_v4.toml")
-    data = datasets.load_ftdcr(data_home)
-    log = datasets.Log(data.q, data.x, data.groups, data.time)
-    settings = workflow.FitSettings(n_folds=3, auto=False)
-    errors = workflow.compare_by_group(log, robot, settings).errors
-    mean = {name: values.mean() for name, values in errors.items()}
-    assert mean["hybrid, ELM"] <= mean["mechanical, calibrated"] < mean["mechanical, nominal"]
-    assert mean["hybrid, ELM"] < mean["data-driven, quadratic"]
+def test_parameters_of_elastic_tendons_have_their_units():
+    q = 0.004 * np.random.default_rng(0).uniform(-1, 1, (120, 3))
+    options = {"bending_stiffness": 1e-6, "axial_stiffness": 2.0, "tendon_zeros": -2e-4}
+    x = ElasticTendonChain([0.005], [0.1], **options)(torch.from_numpy(q)).numpy()
+    start = ElasticTendonChain([0.005], [0.1])
+    names = ["bending_stiffness", "axial_stiffness", "tendon_zeros"]
+    entries = calibrated_parameters(start, calibrate(start, q, x, names))
+    assert [entry.unit for entry in entries] == ["mm²/rad²", "-", *3 * ["mm"]]
+    assert [entry.start for entry in entries[:2]] == pytest.approx([0.25, 10.0])
+    assert [entry.value for entry in entries] == pytest.approx([1.0, 2.0, *3 * [-0.2]], rel=0.01)
 
 
 @pytest.fixture(scope="module")
