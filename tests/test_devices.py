@@ -137,7 +137,7 @@ WORK = {
     "functions": lambda _: [of_numpy()],
     "calibrate": lambda _: calibrated("radii", groups=GROUPS),
     "calibrate tensors": lambda _: calibrated("radii", "base", tensors=1),
-    "calibrate robustly": lambda _: calibrated("turns", "rest_bends", "tool", loss="huber"),
+    "calibrate robustly": lambda _: calibrated("turns", "rest_bends", "tool", loss="soft_l1"),
     "play": lambda _: [
         PlayOperator(0.01).apply(Q)[0],
         fit_play(trunk(), Q, X, GROUPS, [0.001], ("radii",)).cv_rmse,

@@ -32,26 +32,14 @@ def _soft_l1(s: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     return 2 * s / (1 + np.sqrt(1 + s)), (1 + s) ** -0.5, -0.5 * (1 + s) ** -1.5
 
 
-def _huber(s: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    far = np.maximum(s, 1.0)
-    rho = np.where(s > 1, 2 * np.sqrt(far) - 1, s)
-    return rho, far**-0.5, -0.5 * (s > 1) * far**-1.5
-
-
 def _cauchy(s: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     return np.log1p(s), 1 / (1 + s), -((1 + s) ** -2.0)
-
-
-def _arctan(s: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    return np.arctan(s), 1 / (1 + s * s), -2 * s / (1 + s * s) ** 2
 
 
 LOSSES: dict[str, _Loss] = {
     "linear": _linear,
     "soft_l1": _soft_l1,
-    "huber": _huber,
     "cauchy": _cauchy,
-    "arctan": _arctan,
 }
 """rho(s), rho'(s) and rho''(s), for the squared distance s of a row over its noise."""
 

@@ -166,7 +166,7 @@ def calibrate(
         arms "joint_zeros", "links" and "tool". Smaller sets: "turns", one common turn of each
         segment's actuators, instead of "angles"; "tool", the last offset, instead of "offsets";
         "gain", a common factor, instead of "gains".
-    loss : {"linear", "soft_l1", "huber", "cauchy", "arctan"}, default="linear"
+    loss : {"linear", "soft_l1", "cauchy"}, default="linear"
         All but "linear" bound the influence of outliers: ``rho(|e|^2 / 3)`` of SciPy's
         ``least_squares``, with the distance ``|e|`` of a row over the noise, times its weight.
     prior : float, default=0.5

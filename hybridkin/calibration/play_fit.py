@@ -7,16 +7,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike, NDArray
 
 from hybridkin._core.arrays import Numbers, check_shape, labels, real_array
 from hybridkin.calibration.calibrate import CalibrationResult, calibrate, fit_geometry
 from hybridkin.calibration.measured import folds
-from hybridkin.calibration.play_search import search_width
+from hybridkin.calibration.play_search import WidthSearch, search_width
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.play import PlayOperator
+from hybridkin.native.library import evaluate
 
 __all__ = ["PlayFit", "fit_play"]
 
@@ -24,15 +24,15 @@ _WIDTHS = np.array([0.05e-3, 0.1e-3, 0.2e-3, 0.4e-3])  # [m]
 
 
 @dataclass(frozen=True)
-class PlayFit:
+class PlayFit(WidthSearch):
     """Backlash (also called play) identified from a log, and the chain calibrated with it.
 
     Attributes
     ----------
     width : float
-        Chosen play [m]; zero if none was kept.
+        Chosen play [unit of q]; zero if none was kept.
     widths : ndarray of shape (W,)
-        Widths tried [m], ascending from zero, including doubled ones if the largest was the best.
+        Widths tried, ascending from zero, including doubled ones if the largest was the best.
     cv_rmse : ndarray of shape (W,)
         Root mean square tip distance on held-out motions for each width [m].
     gain : float
@@ -45,12 +45,6 @@ class PlayFit:
         The calibration on all rows with the chosen width.
     """
 
-    width: float
-    widths: NDArray
-    cv_rmse: NDArray
-    gain: float
-    gain_std_error: float
-    kept: bool
     result: CalibrationResult
 
     @property
@@ -122,16 +116,14 @@ def fit_play(
     >>> fit.kept, fit.width
     (True, 0.0004)
     """
+    size = 1.0
     if isinstance(chain, ArcChain):
         size = float(chain.gains.detach().abs().mean())
-    else:
-        size = 1.0
-    if widths is None:
-        tried_widths = _WIDTHS / size
-    else:
-        tried_widths = real_array(widths, "widths").ravel()
-    tried = np.unique(np.concatenate([[0.0], tried_widths])).tolist()
-    names = tuple(chain.default_parameters) if parameters is None else parameters
+    tried = _WIDTHS / size
+    if widths is not None:
+        tried = real_array(widths, "widths").ravel()
+    tried = np.unique([0.0, *tried]).tolist()
+    names = parameters or chain.default_parameters
     q = real_array(q, "q")
     x = real_array(x, "x")
     check_shape(x, "x", ("N", chain.n_outputs))
@@ -146,31 +138,21 @@ def fit_play(
     def held_out_errors(width: float) -> NDArray:
         """Return the root mean square tip distance of every fold."""
         y = effective(width)
-        squares = []
+        errors = []
         for train, test in splits:
             result, _ = fit_geometry(
                 chain, y[train], x[train], names, **calibrate_options
             )
-            with torch.no_grad():
-                tips = result.chain(
-                    torch.from_numpy(y[test]).to(result.chain.base)
-                ).numpy()
+            tips = evaluate(result.chain, y[test])[0]
             # NaN: missing markers.
-            squares.append(np.nansum((tips - x[test]) ** 2) / len(test))
-        return np.sqrt(squares)
+            errors.append(np.sqrt(np.nansum((tips - x[test]) ** 2) / len(test)))
+        return np.array(errors)
 
     def root_mean_square(errors: NDArray) -> float:
-        return float(np.sqrt(np.average(errors**2, weights=sizes)))
+        return np.sqrt(np.average(errors**2, weights=sizes))
 
     widest = float(np.ptp(q, axis=0).max())
     search = search_width(held_out_errors, root_mean_square, tried, widest)
-    width = search.width if search.kept else 0.0
-    return PlayFit(
-        width,
-        np.array(search.widths),
-        np.array(search.errors),
-        search.gain,
-        search.gain_std_error,
-        search.kept,
-        calibrate(chain, effective(width), x, names, **calibrate_options),
-    )
+    y = effective(search.width)
+    result = calibrate(chain, y, x, names, **calibrate_options)
+    return PlayFit(**vars(search), result=result)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cache
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,31 +13,32 @@ from scipy.optimize import minimize_scalar
 _CLOSE = 0.02  # tolerance of a refined width, relative to it
 
 
-class WidthSearch(NamedTuple):
-    """Result of `search_width`.
+@dataclass(frozen=True)
+class WidthSearch:
+    """Backlash (also called play) with the least held-out error.
 
     Attributes
     ----------
     width : float
-        The best width [unit of q].
-    widths : list of float
-        Widths tried, ascending; without those of a refinement.
-    errors : list of float
-        Their mean held-out errors [m].
-    gain, gain_std_error : float
-        Mean reduction of the errors of the parts by the best width, and its standard error [m].
+        The chosen width [unit of q]; zero if none lowers the error.
+    widths : ndarray of shape (W,)
+        Widths tried, ascending from zero, including doubled ones if the largest was the best.
+    cv_rmse : ndarray of shape (W,)
+        Mean held-out error for each width [m].
+    gain : float
+        Mean reduction of the errors of the parts by the best width [m].
+    gain_std_error : float
+        Standard error of `gain` over the parts [m].
+    kept : bool
+        Whether the play lowers the error: `gain` is above `gain_std_error`.
     """
 
     width: float
-    widths: list[float]
-    errors: list[float]
+    widths: NDArray
+    cv_rmse: NDArray
     gain: float
     gain_std_error: float
-
-    @property
-    def kept(self) -> bool:
-        """Whether the width lowers the error: `gain` is above `gain_std_error`."""
-        return self.width > 0.0 and self.gain > self.gain_std_error
+    kept: bool
 
 
 def search_width(
@@ -83,7 +84,14 @@ def search_width(
         )
         best = min(best, float(minimum.x), key=error)
     gains = errors_of(0.0) - errors_of(best)
+    gain = float(gains.mean())
     std_error = float(gains.std(ddof=1) / np.sqrt(len(gains)))
+    kept = best > 0.0 and gain > std_error
     return WidthSearch(
-        best, widths, [*map(error, widths)], float(gains.mean()), std_error
+        best if kept else 0.0,
+        np.array(widths),
+        np.array([error(width) for width in widths]),
+        gain,
+        std_error,
+        kept,
     )

@@ -257,7 +257,7 @@ def _fit(command: argparse.ArgumentParser) -> None:
     add(
         "--loss",
         default="linear",
-        choices=("linear", "soft_l1", "huber", "cauchy", "arctan"),
+        choices=("linear", "soft_l1", "cauchy"),
         help="loss of the calibration; all but linear limit the effect of outliers (linear)",
     )
     radius = "also estimate the error radius that covers this share of tips, such as 0.9; slow"

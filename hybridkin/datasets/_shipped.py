@@ -19,7 +19,7 @@ _PAPER = (
 )
 
 
-def load_trunk(*, return_X_y: bool = False) -> Any:
+def load_trunk() -> Bunch:
     """Return the shipped simulated data of a pneumatic trunk: 2000 rows of the paper's protocol.
 
     The rows are chamber lengths and tip positions of a MuJoCo model similar to Festo's Bionic
@@ -27,11 +27,6 @@ def load_trunk(*, return_X_y: bool = False) -> Any:
     one segment moves and 500 random ones. All data are simulated, not measured on a robot, with
     1 mm noise of the lengths and 0.5 mm of the tip. ``make_trunk(random_state=0)`` of the folder
     examples/paper of the repository made them. Loading does not need MuJoCo.
-
-    Parameters
-    ----------
-    return_X_y : bool, default=False
-        If True, return ``(q, x)`` only.
 
     Returns
     -------
@@ -56,8 +51,6 @@ def load_trunk(*, return_X_y: bool = False) -> Any:
     ):
         columns = {name: file[name] for name in ("q", "x", "q_target", "part")}
         parameters = json.loads(str(file["parameters"]))
-    if return_X_y:
-        return columns["q"], columns["x"]
     return Bunch(
         **columns,
         row=np.arange(len(columns["q"])),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from hybridkin import ConstantCurvatureChain, ElasticTendonChain, HybridForwardModel, RigidChain
+from hybridkin import ConstantCurvatureChain, ElasticTendonChain, HybridForwardModel
 from hybridkin.calibration.calibrate import refitted
 from hybridkin.calibration.choice import choose_geometry
 
@@ -120,16 +120,6 @@ def test_without_learning_the_held_out_error_decides():
     assert choice.name == "radii + rest_bends + base"
     model = HybridForwardModel(nominal, "drop", calibrate="auto").fit(q, x)
     assert set(model.calibration_.values) == set(choice.parameters)
-
-
-@pytest.mark.slow
-def test_rigid_robots_choose_their_base():
-    origins = np.tile(np.eye(4), (2, 1, 1))
-    origins[1, 0, 3] = 0.3
-    arm = RigidChain(origins, [[0, 0, 1], [0, 1, 0]], tool=[0.2, 0, 0])
-    q = np.random.default_rng(0).uniform(-1, 1, (60, 2))
-    moved = arm.with_geometry(base=moved_base())
-    assert choose_geometry(arm, q, measured(moved, q)).name == "base"
 
 
 def test_rows_held_out_of_a_long_log_are_predicted_from_evenly_spaced_others():

@@ -101,13 +101,6 @@ def test_chambers_identify_gain_and_zeros_by_their_lengths():
     assert start.default_parameters == ("radii", "gain", "base")
 
 
-def test_zeros_that_are_not_identified_are_named_in_units_of_q():
-    q, x = measured(tendon_robot(actuator_zeros=300.0), 2)
-    result = calibrate(tendon_robot(actuator_zeros=250.0), q, x, ["actuator_zeros"])
-    assert any("of q" in sentence for sentence in result.unidentified)
-    assert not any("mm with" in sentence for sentence in result.unidentified)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("elastic", [False, True])
 def test_the_unit_of_q_changes_no_calibration(elastic):

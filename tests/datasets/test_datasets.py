@@ -1,4 +1,3 @@
-import json
 import sys
 
 import numpy as np
@@ -10,7 +9,6 @@ from scipy.optimize import least_squares
 from hybridkin import ConstantCurvatureChain
 from hybridkin.datasets import (
     Log,
-    check_log,
     load_armlab,
     load_asl_trunk,
     load_ftdcr,
@@ -34,7 +32,8 @@ def test_shipped_data_say_what_they_are():
 
 
 def test_shipped_data_break_constant_curvature_as_the_papers_trunk_does():
-    q, x = map(torch.as_tensor, load_trunk(return_X_y=True))
+    data = load_trunk()
+    q, x = torch.from_numpy(data.q), torch.from_numpy(data.x)
 
     def error(radii):
         return (ConstantCurvatureChain(radii)(q) - x).numpy()
@@ -186,200 +185,6 @@ def test_files_that_are_no_logs_raise(tmp_path, monkeypatch):
             load_log(tmp_path / name, ["q"], ["x", "y", "z"])
     with pytest.raises(FileNotFoundError):
         load_log(tmp_path / "absent.npz", ["q"], ["x"])
-
-
-# what is wrong with a log
-
-
-def tendon_log(n_motions=8, n=30, **truth):
-    """A simulated log of a robot of two segments, without noise but for the tracker's."""
-    rng = np.random.default_rng(0)
-    chain = ConstantCurvatureChain([0.005, 0.005], lengths=[0.1, 0.1], **truth)
-    u = np.stack([np.cos(np.arange(3) * 2 * np.pi / 3), np.sin(np.arange(3) * 2 * np.pi / 3)])
-    q = []
-    for _ in range(n_motions):
-        first, second = (0.003 * (rng.standard_normal((2, 2)) @ u).ravel() for _ in range(2))
-        s = np.linspace(0.0, 4.0, n)[:, None]
-        q.append(np.sin(s) * first + 0.5 * np.sin(2 * s) * second)
-    q = np.concatenate(q)
-    x = chain(torch.from_numpy(q)).numpy() + 1e-5 * rng.standard_normal((len(q), 3))
-    time = np.linspace(0.0, 24.0, len(q))
-    return {"q": q, "x": x, "groups": np.repeat(np.arange(n_motions), n), "time": time}
-
-
-CHAIN = ConstantCurvatureChain([0.0055, 0.0055], lengths=[0.11, 0.09])
-
-
-def found(log, **options):
-    return {(f.kind, f.severity): f for f in check_log(Log(**log), **options).findings}
-
-
-def test_a_clean_log_passes():
-    report = check_log(Log(**tendon_log()), chain=CHAIN)
-    (balance,) = report.findings  # what the log cannot show is no fault
-    assert (balance.kind, balance.severity) == ("no motion", "note")
-    assert "along +1 q[0] +1 q[1] +1 q[2]; +1 q[3] +1 q[4] +1 q[5], or only" in balance.message
-    assert report.ok
-    assert "240 rows, 8 motions, 6 actuators, 24 s" in str(report)
-    assert "no errors and no warnings" in str(report)
-
-
-@pytest.mark.parametrize(
-    ("column", "severity", "what"),
-    [("x", "error", "the tip"), ("x[1]", "warning", "'x[1]'"), ("q[4]", "warning", "'q[4]'")],
-)
-def test_frozen_sensors(column, severity, what):
-    log = tendon_log()
-    values = log[column[0]]
-    if len(column) > 1:
-        values = values[:, int(column[2])]
-    values[70:85] = values[70]
-    kind = "frozen tip" if column[0] == "x" else "frozen actuator"
-    finding = found(log)[kind, severity]
-    assert finding.rows.tolist() == [*range(70, 85)]
-    assert what in finding.message
-    assert "rows 70-84" in finding.message
-
-
-def test_a_tip_at_rest_is_not_frozen():
-    log = tendon_log()
-    log["q"][70:85], log["x"][70:85] = log["q"][70], log["x"][70]
-    assert not any(kind == "frozen tip" for kind, _ in found(log))
-
-
-def test_invalid_rows():
-    log = tendon_log()
-    log["x"][[3, 4, 90], 2] = np.nan
-    log["q"][10, 0] = np.inf
-    finding = found(log)["invalid", "error"]
-    assert "4 of 240 rows" in finding.message
-    assert "rows 3-4, 10, 90" in finding.message
-    assert finding.rows.tolist() == [3, 4, 10, 90]
-
-
-def test_columns_that_never_change():
-    log = tendon_log()
-    log["q"][:, 2] = 0.001
-    log["x"][:, 0] = 0.0
-    report = check_log(Log(**log))
-    messages = [f.message for f in report.warnings if f.kind == "constant"]
-    assert len(messages) == 2
-    assert "never move: 'q[2]'" in messages[0]
-    assert "never change: 'x[0]'" in messages[1]
-    log["x"][:] = 0.0
-    assert ("constant", "error") in found(log)
-
-
-def test_duplicates_and_same_commands():
-    log = tendon_log()
-    for name in ("q", "x"):
-        log[name][200:203] = log[name][20:23]
-    finding = found(log)["duplicates", "warning"]
-    assert finding.rows.tolist() == [200, 201, 202]
-    assert "3 of them in another motion" in finding.message
-    log = tendon_log()
-    log["q"][120:], log["x"][120:] = log["q"][:120], log["x"][:120] + np.array([3e-4, 0, 0])
-    finding = found(log)["same command", "note"]
-    assert "differ by 0.21 mm rms" in finding.message  # 0.3 / sqrt(2), and all start at 0
-
-
-def test_jumps():
-    log = tendon_log()
-    log["x"][100] += [0.15, 0.0, 0.0]
-    finding = found(log)["jumps", "warning"]
-    assert finding.rows.tolist() == [100, 101]
-    assert "soft_l1" in finding.advice
-
-
-def test_times():
-    log = tendon_log()
-    log["time"][100:] += 5.0
-    log["time"][[40, 41]] = log["time"][[41, 40]]
-    messages = [f.message for f in check_log(Log(**log)).warnings]
-    assert "do not increase at 1 rows (row 41)" in messages[0]
-    assert "1 gaps in time within a motion, up to 5.1 s" in messages[1]
-    assert "(row 100)" in messages[1]
-
-
-def test_motions():
-    log = tendon_log()
-    assert "--groups" in found({**log, "groups": None})["motions", "warning"].advice
-    few = found({**log, "groups": np.arange(240) // 100})["motions", "warning"]
-    assert "only 3 motions" in few.message
-    alone = found({**log, "groups": np.arange(240)})["motions", "warning"]
-    assert "random split" in alone.message
-    assert ("rows", "warning") in found({name: value[:20] for name, value in log.items()})
-
-
-@pytest.mark.parametrize(
-    ("q", "x", "units", "advice"),
-    [
-        (1e3, 1e3, {"q": "m", "x": "m"}, ['q_unit = "mm"', 'x_unit = "mm"']),
-        (1e2, 1.0, {"q": "m", "x": "mm"}, ['q_unit = "cm"']),
-        (1.0, 1e3, {"q": "mm", "x": "m"}, ['x_unit = "mm"']),
-        (1e-3, 1e-3, {"q": "mm", "x": "mm"}, ['q_unit = "m"', 'x_unit = "m"']),
-        (1.0, 1e-2, {"q": "mm", "x": "mm"}, ["`x_unit`"]),
-    ],
-)
-def test_units_that_cannot_be(q, x, units, advice):
-    log = tendon_log()
-    log |= {"q": q * log["q"], "x": x * log["x"], "file_units": units}
-    report = check_log(Log(**log), chain=CHAIN)
-    assert [f.kind for f in report.errors] == ["units"] * len(advice)
-    for finding, wanted in zip(report.errors, advice, strict=True):
-        assert wanted in finding.advice
-
-
-def test_logs_in_counts_are_checked_in_metres():
-    gains = np.array([2e-5, -3e-5, 2.5e-5, 1e-5, 4e-5, 2e-5])
-    zeros = torch.full((6,), 512.0, dtype=torch.float64)
-    chain = CHAIN.with_geometry(gains=torch.from_numpy(gains), actuator_zeros=zeros)
-    log, units = tendon_log(), {"q": "1", "x": "m"}
-
-    def findings(sign):
-        counts = {**log, "q": sign * log["q"] / gains + 512, "units": units}
-        metres = {**log, "q": sign * log["q"]}
-        pair = (check_log(Log(**counts), chain=chain), check_log(Log(**metres), chain=CHAIN))
-        # What did not move is named in the unit of the log.
-        return [[f.message for f in r.findings if f.kind != "no motion"] for r in pair]
-
-    assert findings(1.0)[0] == findings(1.0)[1]
-    found, wanted = findings(-1.0)
-    assert found == wanted
-    assert any("sign of q flipped" in message for message in found)
-
-
-def test_a_wrong_sign_is_told():
-    log = tendon_log()
-    flipped = {**log, "q": -log["q"]}
-    finding = found(flipped, chain=CHAIN, base_is_free=False)["sign", "warning"]
-    assert "set q_sign = -1" in finding.advice
-    # A half turn of a free base makes up for it where all tendons are taut.
-    turned = found(flipped, chain=CHAIN)["sign", "warning"]
-    assert "rotated by" in turned.message
-    assert "set q_sign = -1" in turned.advice
-    mounted = CHAIN.with_geometry(base=torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0]).double()))
-    assert [*found(flipped, chain=mounted)] == [("no motion", "note")]
-    released = {**log, "q": np.abs(log["q"])}
-    assert "only lengthened" in found(released, chain=CHAIN)["sign", "warning"].message
-
-
-@pytest.mark.parametrize("base_is_free", [True, False])
-def test_clockwise_numbering_is_told(base_is_free):
-    turned = np.negative([2 * np.pi / 3 * np.arange(3)] * 2)
-    log = tendon_log(angles=turned)
-    finding = found(log, chain=CHAIN, base_is_free=base_is_free)["numbering", "warning"]
-    assert "clockwise = true" in finding.advice
-    assert check_log(Log(**tendon_log()), chain=CHAIN, base_is_free=base_is_free).ok
-
-
-def test_a_report_is_json(log):
-    data = load_log(
-        log(HEADER + "0,r,1,2,3,1,2,3\n1,r,1,nan,3,1,2,3\n"), **COLUMNS, drop_invalid=True
-    )
-    record = json.loads(json.dumps(check_log(data).to_dict()))
-    assert record["n_rows"] == 1
-    assert any("(line 3)" in finding["message"] for finding in record["findings"])
 
 
 # recordings of real robots

@@ -103,7 +103,7 @@ def works() -> dict[str, tuple[Callable[[], Any], Callable[[], Any], str]]:
     return {
         "save_model": (lambda: save_new(arm()), lambda: save_new(trunk()), "out"),
         "fit --out": (
-            lambda: main([*FIT, "--out", "out", "--loss", "huber"]),
+            lambda: main([*FIT, "--out", "out", "--loss", "soft_l1"]),
             lambda: main([*FIT, "--out", "out"]),
             "out",
         ),
@@ -114,7 +114,7 @@ def works() -> dict[str, tuple[Callable[[], Any], Callable[[], Any], str]]:
         ),
         "make_trunk": (lambda: None, lambda: simulate(0), "out"),
         "processes": (
-            lambda: main([*FIT, "--out", "out", "--loss", "huber"]),
+            lambda: main([*FIT, "--out", "out", "--loss", "soft_l1"]),
             lambda: os.execve(sys.executable, command, SETTINGS),
             "out",
         ),
