@@ -86,12 +86,12 @@ def search_width(
     gains = errors_of(0.0) - errors_of(best)
     gain = float(gains.mean())
     std_error = float(gains.std(ddof=1) / np.sqrt(len(gains)))
-    kept = best > 0.0 and gain > std_error
+    helps = best > 0.0 and gain > std_error
     return WidthSearch(
-        best if kept else 0.0,
+        best if helps else 0.0,
         np.array(widths),
         np.array([error(width) for width in widths]),
         gain,
         std_error,
-        kept,
+        helps,
     )

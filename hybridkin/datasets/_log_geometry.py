@@ -249,7 +249,7 @@ def _wrong_units(comparison: _Comparison) -> Iterator[LogFinding]:
     for columns in comparison.segments:
         length += (comparison.absolute * log.q)[:, columns].mean()
     if comparison.all_extensible:
-        what = "the chambers are"
+        subject = "the chambers are"
         size = float(np.median(log.q[:, comparison.absolute]))
         radius = radii.mean()
         low, usual, high = _LONG
@@ -257,7 +257,7 @@ def _wrong_units(comparison: _Comparison) -> Iterator[LogFinding]:
             # The length is that of q; its unit is checked next.
             length /= _factor(size / radius, usual)
     else:
-        what = "the longest stroke is"
+        subject = "the longest stroke is"
         size, radius = _longest_stroke(comparison)
         low, usual, high = _BEND
     stroke = size / radius
@@ -289,7 +289,7 @@ def _wrong_units(comparison: _Comparison) -> Iterator[LogFinding]:
         return
     if q_factor is not None:
         radius_text = f"{stroke:.3g} times the radii ({1e3 * radius:.4g} mm)"
-        problem = f"{what} {1e3 * size:.4g} mm, {radius_text}"
+        problem = f"{subject} {1e3 * size:.4g} mm, {radius_text}"
         yield _unit_finding("q", problem, log.file_units["q"], q_factor)
     if x_factor is not None:
         problem = f"the tip moves within {1e3 * tip_range:.4g} mm, {reach:.3g} of the robot's reach"

@@ -324,23 +324,22 @@ class _Table(NamedTuple):
     columns: Sequence[NDArray | Sequence[str]] | _Cells
     lines: NDArray | None = None
 
-    def names(self, argument: str, asked: Sequence[str]) -> list[str]:
+    def names(self, argument: str, names: Sequence[str]) -> list[str]:
         """Return names of columns; the name of an array (N, k) becomes those of its columns."""
-        asked = [asked] if isinstance(asked, str) or asked is None else list(asked)
-        if not asked or not all(isinstance(name, str) for name in asked):
-            raise ValueError(f"`{argument}` must be column names, got {asked!r}.")
-        if len(set(asked)) < len(asked):
-            raise ValueError(f"`{argument}` names a column twice: {asked}.")
-        names = []
-        for name in asked:
-            parts = re.compile(rf"{re.escape(name)}\[\d+\]").fullmatch
-            columns = [name]
-            if name not in self.header:
-                columns = [*filter(parts, self.header)] or columns
-            names += columns
+        names = [names] if names is None or isinstance(names, str) else list(names)
+        if not names or not all(isinstance(name, str) for name in names):
+            raise ValueError(f"`{argument}` must be column names, got {names!r}.")
+        if len(set(names)) < len(names):
+            raise ValueError(f"`{argument}` names a column twice: {names}.")
+        columns = []
         for name in names:
-            self.column(name)
-        return names
+            part = re.compile(rf"{re.escape(name)}\[\d+\]")
+            if name not in self.header and any(map(part.fullmatch, self.header)):
+                columns += filter(part.fullmatch, self.header)
+            else:
+                self.column(name)
+                columns.append(name)
+        return columns
 
     def column(self, name: str) -> NDArray | Sequence[str]:
         """Return the column of that name."""
