@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -180,20 +180,22 @@ def solve(
     def slope(theta: NDArray, sigma: float) -> NDArray:
         return np.vstack([jacobian(theta) / sigma, np.diag(1.0 / problem.prior_std)])
 
+    functions: dict[str, Any] = {"jac": slope}
+    if robust:
+        functions["loss"] = partial(row_loss, weight=weight, loss=loss)
     sigma = noise(theta)
     converged = False
     for _ in range(accuracy.rounds):
         solution = least_squares(
             whitened,
             theta,
-            slope,
             bounds=(problem.low, problem.high),
             ftol=accuracy.tolerance,
             xtol=accuracy.tolerance,
             gtol=accuracy.tolerance,
-            loss=partial(row_loss, weight=weight, loss=loss) if robust else "linear",
             max_nfev=100,
             args=(sigma,),
+            **functions,
         )
         theta = solution.x
         converged = solution.status > 0
