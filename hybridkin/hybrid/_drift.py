@@ -89,7 +89,12 @@ class Drift(NamedTuple):
 
     def emptied(self) -> Drift:
         """Return the drift before any measurement."""
-        return Drift(*self[:2], *(0.0 * part for part in self[2:5]))
+        return self._replace(
+            gram=0.0 * self.gram,
+            moment=0.0 * self.moment,
+            squares=0.0 * self.squares,
+            alpha=inf,
+        )
 
     def likeliest_alpha(self, noise: float) -> float:
         """Return the penalty of largest evidence, infinite if no correction is as likely.

@@ -341,7 +341,7 @@ class WithPose(Hybrid, PoseModel):
 
     def __init__(self, mechanical: PoseModel, learned: HybridModule) -> None:
         super().__init__()
-        self.mechanical = mechanical
+        self.mechanical = mechanical  # pyright: ignore[reportIncompatibleVariableOverride]
         self.learned = learned
         self.n_actuators = learned.n_actuators
 
