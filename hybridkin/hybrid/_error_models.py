@@ -1,15 +1,17 @@
-"""Error models: one class for each way to learn the residual of a mechanical model."""
+"""Error models: one class for each way to learn the residual of a mechanical model.
+
+A class with a name is an option of ``HybridForwardModel(error_model=...)``, see `named`.
+"""
 
 from __future__ import annotations
 
 import copy
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 from math import inf, nan
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -20,7 +22,7 @@ from sklearn.utils.validation import has_fit_parameter
 from torch import Tensor
 from typing_extensions import Self
 
-from hybridkin._core.directions import Directions, moved_directions
+from hybridkin._core.directions import Directions
 from hybridkin._core.model import ForwardModel
 from hybridkin._core.turns import TURNS
 from hybridkin.calibration.measured import points
@@ -33,100 +35,100 @@ from hybridkin.hybrid._features import (
     Projected,
     QuadraticFeatures,
 )
-from hybridkin.hybrid._guards import fit_guard
 from hybridkin.hybrid._kernel import tuned_kernel
 from hybridkin.hybrid._linearised import Pair
-from hybridkin.hybrid._module import (
-    HybridModule,
-    InnerCorrection,
-    TipCorrection,
-)
+from hybridkin.hybrid._module import InnerCorrection, TipCorrection
 from hybridkin.hybrid._readout_fit import ReadoutFit, fit_readout
 from hybridkin.hybrid._rows import Rows
+from hybridkin.hybrid._spec import ErrorModel, FittedError, Seed, Spec, Weighted
 from hybridkin.learning.elm import ELMRegressor, draw_layer
 from hybridkin.learning.elm_cv import ELMRegressorCV
 from hybridkin.learning.regressor_modules import error_module
 
-FEATURES = ("linear", "quadratic", "pose")
 _LEAST = 0.2  # assumed lower limit of training errors, as a share of the errors before learning
 _LARGEST_LEVERAGE = 0.999
 _MOST = 2000  # rows whose training errors are computed
 
-
-class Blend(NamedTuple):
-    """Several fitted error models; the result is the weighted mean of their hybrids."""
-
-    weights: tuple[float, ...]
-    error_models: tuple[Any, ...]
+NAMED: dict[str, type[ErrorModel]] = {}
+"""Error models by name."""
+_Class = TypeVar("_Class", bound=type[ErrorModel])
 
 
-@dataclass(frozen=True)
-class Residuals:
-    """What a mechanical model leaves of measured rows, and how a correction of it is limited."""
+def named(name: str) -> Callable[[_Class], _Class]:
+    """Return a decorator that makes an error model an option of `HybridForwardModel`."""
 
-    rows: Rows  # different rows; y are tips [m]
-    error: NDArray  # measured minus mechanical model, shaped like y [m]
-    mechanical: ForwardModel | None
-    guard: str | None = None  # see `fit_guard`
-    left_out: bool = True  # whether held-out residuals are needed as well
+    def register(cls: _Class) -> _Class:
+        NAMED[name] = cls
+        return cls
 
-    @cached_property
-    def directions(self) -> Directions:
-        """The directions of q that the rows move."""
-        return moved_directions(self.rows.X)
+    return register
 
 
-@dataclass(frozen=True)
-class FittedError:
-    """A fitted error model.
+class TipModel(ErrorModel):
+    """An error model of one tip; several markers are fitted one by one."""
 
-    Attributes
-    ----------
-    result : estimator, ReadoutFit, Blend, tuple or None
-        What `HybridForwardModel.error_model_` shows; a tuple holds one for each marker.
-    corrections : tuple of (float, TipCorrection)
-        Weights and guarded corrections.
-    settled : ErrorModel
-        The error model with the settings that were chosen, for fits to other rows.
-    noise : float
-        Standard deviation of one coordinate of the residual that remains, on held-out rows where
-        the error model has them [m]. NaN: not computed.
-    """
-
-    result: Any
-    corrections: tuple[tuple[float, TipCorrection], ...]
-    settled: ErrorModel
-    noise: float = nan
-
-
-class ErrorModel(ABC):
-    """A way to learn the residual, measured minus mechanical model."""
-
-    learns = True
+    def fit(self, rows: Rows, spec: Spec) -> FittedError:
+        """Return the error model fitted to every marker."""
+        return _of_markers([self.fit_tip(*part) for part in spec.by_marker(rows)])
 
     @abstractmethod
-    def fit(self, residuals: Residuals) -> FittedError:
-        """Return the error model fitted to residuals; it does not change itself."""
-
-    def for_markers(
-        self, residuals: Residuals, tips: Sequence[Any]
-    ) -> list[ErrorModel]:
-        """Return the error model of every marker, given the residuals of all and their chains."""
-        return [self for _ in tips]
+    def fit_tip(self, rows: Rows, spec: Spec) -> FittedError:
+        """Return the error model fitted to the rows of one tip."""
 
 
-class NoCorrection(ErrorModel):
+class PerMarker(ErrorModel):
+    """One error model for each marker.
+
+    Parameters
+    ----------
+    models : sequence of ErrorModel
+        In the order of the markers.
+    """
+
+    def __init__(self, models: Sequence[ErrorModel]) -> None:
+        self.models = tuple(models)
+
+    def fit(self, rows: Rows, spec: Spec) -> FittedError:
+        """Return every error model fitted to its marker."""
+        fits = []
+        for model, part in zip(self.models, spec.by_marker(rows), strict=True):
+            fits.append(model.fit(*part))
+        return _of_markers(fits)
+
+
+def _of_markers(fits: list[FittedError]) -> FittedError:
+    """Return the fits of all markers as one."""
+    if len(fits) == 1:
+        return fits[0]
+    results = tuple(fitted.result for fitted in fits)
+    return FittedError(
+        None if results[0] is None else results,
+        [fitted.corrections[0] for fitted in fits],
+        PerMarker([fitted.settled for fitted in fits]),
+        float(np.sqrt(np.mean([fitted.noise**2 for fitted in fits]))),
+        fits[0].rejected,
+        fits[0].held_out,
+    )
+
+
+@named("drop")
+class NoCorrection(TipModel):
     """The mechanical model alone."""
 
     learns = False
+    for_poses = True
 
-    def fit(self, residuals: Residuals) -> FittedError:
+    def fit_tip(self, rows: Rows, spec: Spec) -> FittedError:
         """Return the error model without corrections."""
-        noise = _spread(residuals.error, residuals.rows.counts)
-        return FittedError(None, (), self, noise)
+        return _nothing(self, rows)
 
 
-class FeatureModel(ErrorModel):
+def _nothing(model: ErrorModel, rows: Rows) -> FittedError:
+    """Return the result of an error model for rows that give nothing to learn."""
+    return FittedError(None, [[]], model, _spread(rows.residual, rows.counts))
+
+
+class FeatureModel(TipModel):
     """A readout of features of q, at the tip or inside the robot.
 
     Parameters
@@ -146,88 +148,95 @@ class FeatureModel(ErrorModel):
         self.alphas = alphas
         self.noise_ratio = noise_ratio
 
+    @classmethod
+    def of(cls, coupling: str, random_state: Seed) -> Self:
+        """Return the error model for these settings of a HybridForwardModel."""
+        return cls(coupling)
+
     @abstractmethod
     def features(self, q: Tensor, mechanical: ForwardModel) -> Features:
         """Return the features for training rows q (N, n)."""
 
-    def fit(self, residuals: Residuals) -> FittedError:
-        """Return the fitted readout; without motion of the rows there is nothing to learn."""
-        if not residuals.directions.moved.size:
-            return replace(NoCorrection().fit(residuals), settled=self)
-        return self._fitted(self.read_out(residuals), residuals)
+    def fit(self, rows: Rows, spec: Spec) -> FittedError:
+        """Return the fitted readouts; inside the robot one readout is learned from all markers."""
+        markers = spec.by_marker(rows)
+        at_tip = self.coupling == "parallel"
+        if at_tip or len(markers) == 1 or not rows.directions.moved.size:
+            return super().fit(rows, spec)
+        read_out = self.read_out(rows, spec)
+        fits = []
+        for of_marker, marker in markers:
+            readout = read_out.readout.up_to(marker.mechanical)
+            fit = read_out._replace(readout=readout)
+            fits.append(self._fitted(fit, of_marker))
+        return replace(_of_markers(fits), settled=fits[0].settled)
 
-    def read_out(self, residuals: Residuals) -> ReadoutFit:
+    def fit_tip(self, rows: Rows, spec: Spec) -> FittedError:
+        """Return the fitted readout; without motion of the rows there is nothing to learn."""
+        if not rows.directions.moved.size:
+            return _nothing(self, rows)
+        return self._fitted(self.read_out(rows, spec), rows)
+
+    def read_out(self, rows: Rows, spec: Spec) -> ReadoutFit:
         """Return the readout of least tip error."""
-        rows = residuals.rows
-        mechanical = residuals.mechanical
-        assert mechanical is not None
+        assert spec.mechanical is not None
         try:
             return fit_readout(
-                mechanical,
-                self.features(rows.q, mechanical),
+                spec.mechanical,
+                self.features(rows.q, spec.mechanical),
                 rows,
                 self.coupling,
                 self.alphas,
                 self.noise_ratio,
-                residuals.left_out,
+                spec.held_out,
             )
         except torch.linalg.LinAlgError as error:  # pyright: ignore
             raise too_far() from error
 
-    def for_markers(
-        self, residuals: Residuals, tips: Sequence[Any]
-    ) -> list[ErrorModel]:
-        """Return the error model of every marker; a serial one is learned once from all."""
-        if self.coupling == "parallel" or not residuals.directions.moved.size:
-            return super().for_markers(residuals, tips)
-        read_out = self.read_out(residuals)
-        return [_ReadOut(self, read_out, tip) for tip in tips]
-
-    def _settled(self, fit: ReadoutFit) -> Self:
-        settled = copy.copy(self)
-        settled.alphas = fit.alphas
-        settled.noise_ratio = fit.noise_ratio
-        return settled
-
-    def _fitted(self, fit: ReadoutFit, residuals: Residuals) -> FittedError:
-        module = _on_moved_directions(fit.readout, residuals.directions)
+    def _fitted(self, fit: ReadoutFit, rows: Rows) -> FittedError:
+        module = _on_moved_directions(fit.readout, rows.directions)
         if self.coupling == "serial":
             correction = InnerCorrection(module)
         else:
             correction = TipCorrection(module)
+        settled = copy.copy(self)
+        settled.alphas = fit.alphas
+        settled.noise_ratio = fit.noise_ratio
         noise = fit.rmse / points(fit.residual).shape[2] ** 0.5
         return FittedError(
-            fit, _guarded(correction, module, residuals), self._settled(fit), noise
+            fit,
+            [[(1.0, correction)]],
+            settled,
+            noise,
+            rejected=fit.alphas == (inf, inf),
+            held_out=True,
         )
 
 
-class NamedFeatures(FeatureModel):
-    """A readout of features that a name stands for.
-
-    Parameters
-    ----------
-    name : {"linear", "quadratic", "pose"}
-        The features.
-    coupling, alphas, noise_ratio
-        As of `FeatureModel`.
-    """
-
-    def __init__(
-        self,
-        name: str,
-        coupling: str,
-        alphas: Pair | None = None,
-        noise_ratio: float = inf,
-    ) -> None:
-        super().__init__(coupling, alphas, noise_ratio)
-        self.name = name
+@named("linear")
+class LinearModel(FeatureModel):
+    """A linear function of q."""
 
     def features(self, q: Tensor, mechanical: ForwardModel) -> Features:
         """Return the features for training rows q (N, n)."""
-        if self.name == "linear":
-            return Features.of_range(q)
-        if self.name == "quadratic":
-            return QuadraticFeatures.of_range(q)
+        return Features.of_range(q)
+
+
+@named("quadratic")
+class QuadraticModel(FeatureModel):
+    """A quadratic function of q."""
+
+    def features(self, q: Tensor, mechanical: ForwardModel) -> Features:
+        """Return the features for training rows q (N, n)."""
+        return QuadraticFeatures.of_range(q)
+
+
+@named("pose")
+class ShapeModel(FeatureModel):
+    """A linear function of q and of the shape of a chain, on which loads act."""
+
+    def features(self, q: Tensor, mechanical: ForwardModel) -> Features:
+        """Return the features for training rows q (N, n)."""
         if isinstance(mechanical, ArcChain):
             return PoseFeatures.of_range(q, mechanical)
         raise TypeError(
@@ -273,19 +282,7 @@ class HiddenLayer(FeatureModel):
         )
 
 
-class _ReadOut(ErrorModel):
-    """The readout that was learned from all markers, for the chain of one of them."""
-
-    def __init__(self, model: FeatureModel, fit: ReadoutFit, tip: ArcChain) -> None:
-        self._model = model
-        self._fit = fit._replace(readout=fit.readout.up_to(tip))
-
-    def fit(self, residuals: Residuals) -> FittedError:
-        """Return the readout with the guard for the residuals of the marker."""
-        return self._model._fitted(self._fit, residuals)
-
-
-class RegressorModel(ErrorModel):
+class RegressorModel(TipModel):
     """A scikit-learn regressor of the residual at the tip.
 
     Parameters
@@ -294,45 +291,45 @@ class RegressorModel(ErrorModel):
         It is cloned.
     """
 
-    def __init__(self, regressor: object) -> None:
+    couplings = ("parallel",)
+    for_poses = True
+    needs_mechanical = False
+    holds_out = False  # whether `_noise` is that of held-out rows
+
+    def __init__(self, regressor: BaseEstimator) -> None:
         self.regressor = regressor
 
-    def fit(self, residuals: Residuals) -> FittedError:
+    def fit_tip(self, rows: Rows, spec: Spec) -> FittedError:
         """Return the fitted regressor; without motion of the rows there is nothing to learn."""
-        directions = residuals.directions
-        if residuals.mechanical is not None and not directions.moved.size:
-            return replace(NoCorrection().fit(residuals), settled=self)
+        directions = rows.directions
+        if spec.mechanical is not None and not directions.moved.size:
+            return _nothing(self, rows)
         # A regressor sees only what the rows moved; random weights slope in all directions.
-        rows = replace(residuals.rows, y=residuals.error)
         if directions.still.size:
             matrix, offset = directions.projection()
             rows = replace(rows, X=(rows.X @ matrix + offset).astype(rows.X.dtype))
         regressor = self._fitted(rows)
-        network = error_module(regressor, rows.q)
-        module = _on_moved_directions(network, directions)
-        corrections = _guarded(TipCorrection(module), module, residuals)
-        noise = self._noise(regressor, network, rows) if residuals.left_out else nan
-        return FittedError(regressor, corrections, self._settled(regressor), noise)
+        module = error_module(regressor, rows.q)
+        noise = self._noise(regressor, module, rows) if spec.held_out else nan
+        correction = TipCorrection(_on_moved_directions(module, directions))
+        return FittedError(
+            regressor,
+            [[(1.0, correction)]],
+            self._settled(regressor),
+            noise,
+            held_out=self.holds_out,
+        )
 
     def _fitted(self, rows: Rows) -> Any:
-        regressor: Any = clone(self.regressor)
-        if not has_fit_parameter(regressor, "sample_weight"):
-            rows = rows.repeated()
-        options = {}
-        if rows.weights is not None:
-            options["sample_weight"] = rows.weights
-        if rows.groups is not None and has_fit_parameter(regressor, "groups"):
-            options["groups"] = rows.groups
-        with TURNS.filters if isinstance(regressor, KernelRidge) else nullcontext():
-            return regressor.fit(rows.X, rows.y, **options)
+        return _fitted(self.regressor, rows)
 
-    def _settled(self, regressor: object) -> ErrorModel:
+    def _settled(self, regressor: Any) -> ErrorModel:
         return self
 
-    def _noise(self, regressor: object, module: ForwardModel, rows: Rows) -> float:
+    def _noise(self, regressor: Any, module: ForwardModel, rows: Rows) -> float:
         """Return the spread of training errors; regressors may overfit, so it has a least share."""
         rows = rows.thinned(_MOST)
-        before = rows.tips
+        before = _residual(rows)
         with torch.no_grad():
             after = before - module(rows.q).numpy()
         least = _LEAST * np.sqrt(np.var(before, axis=0).mean())
@@ -342,20 +339,23 @@ class RegressorModel(ErrorModel):
 class NetworkModel(RegressorModel):
     """An extreme learning machine of the residual at the tip."""
 
+    holds_out = True
+
     def _noise(self, regressor: Any, module: ForwardModel, rows: Rows) -> float:
         """Return the spread of leave-one-out errors."""
         rows = rows.thinned(_MOST)
         network = regressor.module_
         with torch.no_grad():
-            after = rows.tips - network(rows.q).numpy()
+            after = _residual(rows) - network(rows.q).numpy()
             leverage = rows.counts * network.leverage(rows.q).numpy()
-        return _spread(
-            after / (1.0 - leverage.clip(max=_LARGEST_LEVERAGE))[:, None], rows.counts
-        )
+        remaining = 1.0 - leverage.clip(max=_LARGEST_LEVERAGE)
+        return _spread(after / remaining[:, None], rows.counts)
 
 
 class NetworkModelCV(RegressorModel):
     """An extreme learning machine that chooses its own settings."""
+
+    holds_out = True
 
     def _fitted(self, rows: Rows) -> Any:
         network = super()._fitted(rows)
@@ -370,21 +370,29 @@ class NetworkModelCV(RegressorModel):
         return float(np.sqrt(np.nanmean(np.square(regressor.left_out_errors_))))
 
 
+@named("kernel")
 class KernelModel(RegressorModel):
     """Kernel ridge with the width and the penalty of least held-out error."""
 
     def __init__(self) -> None:
-        super().__init__(None)
+        super().__init__(KernelRidge())
 
     def _fitted(self, rows: Rows) -> Any:
-        tuned = tuned_kernel(rows.X, rows.y, rows.counts, rows.groups)
-        return RegressorModel(tuned)._fitted(rows)
+        tuned = tuned_kernel(rows.X, rows.residual, rows.counts, rows.groups)
+        return _fitted(tuned, rows)
 
-    def _settled(self, regressor: object) -> ErrorModel:
+    def _settled(self, regressor: Any) -> ErrorModel:
         return RegressorModel(clone(regressor))
 
 
-class WeightedModels(ErrorModel):
+class FittedBlend(NamedTuple):
+    """Several fitted error models; the result is the weighted mean of their hybrids."""
+
+    weights: tuple[float, ...]
+    error_models: tuple[Any, ...]
+
+
+class Blend(ErrorModel):
     """The weighted mean of several error models.
 
     Parameters
@@ -399,89 +407,45 @@ class WeightedModels(ErrorModel):
         self.weights = tuple(weights)
         self.models = tuple(models)
 
-    def fit(self, residuals: Residuals) -> FittedError:
-        """Return all models fitted to the same residuals."""
-        fits = [model.fit(residuals) for model in self.models]
-        corrections = []
+    def fit(self, rows: Rows, spec: Spec) -> FittedError:
+        """Return all models fitted to the same rows."""
+        fits = [model.fit(rows, spec) for model in self.models]
+        corrections: list[Weighted] = [[] for _ in fits[0].corrections]
         for weight, fitted in zip(self.weights, fits, strict=True):
-            corrections += [
-                (weight * part, correction) for part, correction in fitted.corrections
-            ]
-        blend = Blend(self.weights, tuple(fitted.result for fitted in fits))
-        return FittedError(blend, tuple(corrections), self)
-
-    def for_markers(
-        self, residuals: Residuals, tips: Sequence[Any]
-    ) -> list[ErrorModel]:
-        """Return the weighted mean for every marker."""
-        by_model = [model.for_markers(residuals, tips) for model in self.models]
-        return [
-            WeightedModels(self.weights, models)
-            for models in zip(*by_model, strict=True)
-        ]
+            for blended, of_model in zip(corrections, fitted.corrections, strict=True):
+                blended += [
+                    (weight * part, correction) for part, correction in of_model
+                ]
+        results = tuple(fitted.result for fitted in fits)
+        return FittedError(FittedBlend(self.weights, results), corrections, self)
 
 
-class PerMarker(ErrorModel):
-    """One error model for each marker.
-
-    Parameters
-    ----------
-    models : sequence of ErrorModel
-        In the order of the markers.
-    """
-
-    def __init__(self, models: Sequence[ErrorModel]) -> None:
-        self.models = tuple(models)
-
-    def fit(self, residuals: Residuals) -> FittedError:
-        """Raise: markers are fitted one by one."""
-        raise TypeError(
-            "an error model for each marker cannot be fitted to one of them"
-        )
-
-    def for_markers(
-        self, residuals: Residuals, tips: Sequence[Any]
-    ) -> list[ErrorModel]:
-        """Return the error model of every marker; serial ones have the same settings for all."""
-        first = self.models[0]
-        if isinstance(first, FeatureModel) and first.coupling == "serial":
-            return first.for_markers(residuals, tips)
-        return [*self.models]
-
-
-def error_model_of(
-    setting: BaseEstimator | str | None,
-    coupling: str,
-    seed: int | np.random.RandomState | None,
+def network_model(
+    setting: ELMRegressor | ELMRegressorCV, coupling: str, random_state: Seed
 ) -> ErrorModel:
-    """Return the error model for the settings of a HybridForwardModel, which are checked already.
-
-    Parameters
-    ----------
-    setting : estimator, str or None
-        `error_model`, except "auto".
-    coupling : {"parallel", "serial"}
-        Where it acts.
-    seed : int, RandomState or None
-        Seed of networks without one.
-    """
-    if setting == "drop":
-        return NoCorrection()
-    if setting == "kernel":
-        return KernelModel()
-    if isinstance(setting, str) and setting in FEATURES:
-        return NamedFeatures(setting, coupling)
-    if setting is None or setting == "elm":
-        setting = ELMRegressor()
-    if not isinstance(setting, (ELMRegressor, ELMRegressorCV)):
-        return RegressorModel(setting)
-    network: Any = clone(setting)
+    """Return the error model of a network, with this seed if it has none."""
+    network = clone(setting)
     if network.random_state is None:
-        network.set_params(random_state=seed)
+        network.set_params(random_state=random_state)
     if coupling == "serial":
         return HiddenLayer(network)
-    kind = NetworkModel if isinstance(network, ELMRegressor) else NetworkModelCV
-    return kind(network)
+    if isinstance(network, ELMRegressorCV):
+        return NetworkModelCV(network)
+    return NetworkModel(network)
+
+
+def _fitted(regressor: BaseEstimator, rows: Rows) -> Any:
+    """Return a copy of the regressor fitted to the residuals, with the weights that it takes."""
+    regressor = clone(regressor)
+    if not has_fit_parameter(regressor, "sample_weight"):
+        rows = rows.repeated()
+    options = {}
+    if rows.weights is not None:
+        options["sample_weight"] = rows.weights
+    if rows.groups is not None and has_fit_parameter(regressor, "groups"):
+        options["groups"] = rows.groups
+    with TURNS.filters if isinstance(regressor, KernelRidge) else nullcontext():
+        return regressor.fit(rows.X, rows.residual, **options)
 
 
 def _on_moved_directions(module: ForwardModel, directions: Directions) -> ForwardModel:
@@ -492,19 +456,9 @@ def _on_moved_directions(module: ForwardModel, directions: Directions) -> Forwar
     return Projected(module, torch.from_numpy(matrix), torch.from_numpy(offset))
 
 
-def _guarded(
-    correction: TipCorrection, module: ForwardModel, residuals: Residuals
-) -> tuple[tuple[float, TipCorrection], ...]:
-    """Return the correction with its guard; without a mechanical model nothing would remain."""
-    if residuals.mechanical is not None:
-        q = residuals.rows.q
-        alone = HybridModule(residuals.mechanical, [correction], q.new_ones(1))
-        with torch.no_grad():
-            values = alone.error_part(q)
-        correction.guard = fit_guard(
-            residuals.guard, values, module, q, residuals.rows.counts
-        )
-    return ((1.0, correction),)
+def _residual(rows: Rows) -> NDArray:
+    """Return the residuals as a matrix (N, m) [m]."""
+    return rows.residual.reshape(len(rows), -1)
 
 
 def _spread(residual: NDArray, counts: NDArray) -> float:

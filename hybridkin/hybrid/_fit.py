@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple, cast
 
 import numpy as np
@@ -11,58 +10,27 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hybridkin._core.arrays import countable
-from hybridkin._core.directions import Directions, moved_directions
-from hybridkin._core.model import ForwardModel, PoseModel
+from hybridkin._core.model import PoseModel
 from hybridkin._core.units import motion_message
-from hybridkin.calibration.calibrate import CalibrationResult, fit_geometry, refitted
-from hybridkin.calibration.choice import GeometryChoice, choose_geometry, unmoved
+from hybridkin.calibration.choice import unmoved
 from hybridkin.calibration.measured import points
-from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
-from hybridkin.hybrid._drift import too_far
-from hybridkin.hybrid._error_models import ErrorModel, FittedError, PerMarker, Residuals
-from hybridkin.hybrid._guards import GroupDistance, Plane
+from hybridkin.hybrid._guards import GroupDistance, Plane, fit_guard
 from hybridkin.hybrid._module import Hybrid, HybridModule
 from hybridkin.hybrid._rows import Rows, rare_marker
-from hybridkin.hybrid._wrapped import Stacked, WithPose, pose_errors
+from hybridkin.hybrid._spec import FittedError, Spec, Weighted, residuals
+from hybridkin.hybrid._wrapped import Stacked, WithPose
 
 _NEVER = 1e-9  # part of an actuator in the moved directions, if it never moves
 _COUNTS = 1e12  # largest ratio of weights; a smaller weight is lost in a float64 sum
 
 
-@dataclass(frozen=True)
-class Spec:
-    """Specification of a fit: the resolved settings of a HybridForwardModel."""
-
-    mechanical: ForwardModel | None
-    error_model: ErrorModel | None = None  # None: not chosen yet, see `select`
-    calibrate: tuple[str, ...] | str = ()  # geometry to calibrate, or "auto"
-    guard: str | None = "leverage"
-    output: str = "position"
-    random_state: int | np.random.RandomState | None = None
-    geometry: GeometryChoice | None = None  # how `calibrate` was chosen
-    calibration: CalibrationResult | None = None  # how `mechanical` was calibrated
-    messages: tuple[str, ...] = ()  # warnings of that choice and calibration
-    left_out: bool = True  # whether held-out residuals are computed as well
-    commanded: Directions | None = (
-        None  # of the commands, with backlash between them and rows
-    )
-
-    @property
-    def learns(self) -> bool:
-        """Whether anything is learned beside the calibration."""
-        return self.error_model is None or self.error_model.learns
-
-
 class FittedHybrid(NamedTuple):
-    """Result of a fit; its warnings are in `messages` and were not issued."""
+    """Result of a fit; its warnings are in the messages of `spec` and were not issued."""
 
-    mechanical: ForwardModel | None
-    calibration: CalibrationResult | None
+    spec: Spec  # with the calibrated mechanical model
     error: FittedError
     module: Hybrid
-    messages: tuple[str, ...]
 
     def predict(self, X: NDArray) -> NDArray:
         """Return the tips (N, m) at actuator vectors (N, n) [m]."""
@@ -78,63 +46,51 @@ def fit_hybrid(spec: Spec, rows: Rows) -> FittedHybrid:
     Parameters
     ----------
     spec : Spec
-        With an error model.
+        The settings.
     rows : Rows
         Different rows.
     """
-    spec = calibrated(spec, rows, rows.groups)
-    error = residuals(spec.mechanical, rows.q, rows.y, spec.output)
-    left = Residuals(rows, error, spec.mechanical, spec.guard, spec.left_out)
-    tips = spec.mechanical.tips() if isinstance(spec.mechanical, ArcChain) else []
-    if spec.mechanical is None and np.isnan(error).any():
-        tips = [None] * points(error).shape[1]
-    if len(tips) > 1:
-        return _fit_markers(spec, tips, left)
-    assert spec.error_model is not None
-    fitted = spec.error_model.fit(left)
-    corrections = [correction for _, correction in fitted.corrections]
+    spec = spec.calibrated(rows)
+    residual = residuals(spec.mechanical, rows.q, rows.y, spec.output)
+    rows = replace(rows, residual=residual)
+    error = spec.error_model.fit(rows, spec)
+    modules = []
+    markers = spec.by_marker(rows)
+    for (of_marker, marker), corrections in zip(
+        markers, error.corrections, strict=True
+    ):
+        modules.append(_module(marker, of_marker, corrections))
+    module = modules[0]
+    if len(modules) > 1:
+        module = Stacked(spec.mechanical, modules)
+    return FittedHybrid(spec, error, module)
+
+
+def _module(spec: Spec, rows: Rows, weighted: Weighted) -> HybridModule | WithPose:
+    """Return the hybrid of one tip, with guarded corrections and its domain."""
+    corrections = [correction for _, correction in weighted]
+    weights = rows.q.new_tensor([weight for weight, _ in weighted])
+    # Without a mechanical model nothing would remain.
+    guarded = bool(corrections) and None not in (spec.mechanical, spec.guard)
+    if guarded:
+        for correction in corrections:
+            alone = HybridModule(spec.mechanical, [correction], weights.new_ones(1))
+            with torch.no_grad():
+                values = alone.error_part(rows.q)
+            correction.guard = fit_guard(
+                spec.guard, values, correction.module, rows.q, rows.counts
+            )
+    directions = rows.directions
     tested = plane = None
-    directions = left.directions
-    if spec.learns or not directions.moved.size:
-        guarded = any(correction.guard is not None for correction in corrections)
+    if spec.error_model.learns or not directions.moved.size:
         # Backlash moves actuators off the plane of their commands, but only by its width.
         plane = Plane.of_log(spec.mechanical, rows.q, spec.commanded or directions)
         groups = rows.groups if guarded else None
         tested = GroupDistance.of_log(rows.q, groups, directions, plane)
-    weights = rows.q.new_tensor([weight for weight, _ in fitted.corrections])
     if spec.output == "pose":
         mechanical = cast(PoseModel, spec.mechanical)
-        module = WithPose.of(mechanical, corrections, weights, tested, plane)
-    else:
-        module = HybridModule(
-            spec.mechanical, corrections, weights, None, tested, plane
-        )
-    return FittedHybrid(
-        spec.mechanical, spec.calibration, fitted, module, spec.messages
-    )
-
-
-def _fit_markers(
-    spec: Spec, tips: Sequence[ArcChain | None], left: Residuals
-) -> FittedHybrid:
-    """Return the hybrid of several markers, each fitted to the rows in which it was measured."""
-    assert spec.error_model is not None
-    models = spec.error_model.for_markers(left, tips)
-    fits = []
-    for k, (tip, model) in enumerate(zip(tips, models, strict=True)):
-        marker = replace(spec, mechanical=tip, error_model=model)
-        fits.append(fit_hybrid(marker, left.rows.marker(k)))
-    module = Stacked(spec.mechanical, [fit.module for fit in fits])
-    results = tuple(fit.error.result for fit in fits)
-    fitted = FittedError(
-        None if results[0] is None else results,
-        (),
-        PerMarker([fit.error.settled for fit in fits]),
-        float(np.sqrt(np.mean([fit.error.noise**2 for fit in fits]))),
-    )
-    return FittedHybrid(
-        spec.mechanical, spec.calibration, fitted, module, spec.messages
-    )
+        return WithPose.of(mechanical, corrections, weights, tested, plane)
+    return HybridModule(spec.mechanical, corrections, weights, None, tested, plane)
 
 
 def few_rows(rows: Rows, spec: Spec, coverage: float | None) -> list[str]:
@@ -143,7 +99,7 @@ def few_rows(rows: Rows, spec: Spec, coverage: float | None) -> list[str]:
     The rms of 20 held-out errors has a relative standard error of about one sixth.
     """
     n_rows, n = rows.X.shape
-    learned = spec.learns
+    learned = spec.error_model.learns
     least = 1 + bool(learned or spec.calibrate) + (coverage is not None)
     if n_rows < least:
         raise ValueError(
@@ -162,104 +118,20 @@ def few_rows(rows: Rows, spec: Spec, coverage: float | None) -> list[str]:
         raise rare_marker(int(measured.argmin()))
     if not learned:
         return []
-    moved = moved_directions(rows.X).moved
+    messages = []
+    moved = rows.directions.moved
     # Tendons that are commanded in balance leave some directions out, which is usual.
     usual = 2 * moved.shape[1] >= n and (np.linalg.norm(moved, axis=1) > _NEVER).all()
-    still = () if usual else unmoved(spec.mechanical, rows.q)
-    if n_rows >= max(20, 2 * (n + 1)):
-        return [*still]
-    return [
-        *still,
-        f"`X` holds {n_rows} different rows of {n} actuators, too few to rely on: an affine "
-        f"function alone has {n + 1} coefficients for each output, and held-out errors of so few "
-        f"rows do not predict the error on new ones. Record at least {10 * (n + 1)}, in several "
-        "motions.",
-    ]
-
-
-def with_geometry_chosen(
-    spec: Spec, rows: Rows, geometry: GeometryChoice | None = None
-) -> Spec:
-    """Return the specification with the parameters to calibrate, chosen on the rows or given.
-
-    For a list and error_model="auto", the choice is between a plain chain and elastic tendons.
-    """
-    if not spec.calibrate or (
-        spec.error_model is not None and spec.calibrate != "auto"
-    ):
-        return spec
-    if geometry is None:
-        geometry = choose_geometry(
-            cast(Chain, spec.mechanical),
-            rows.q,
-            _positions(spec, rows),
-            groups=rows.groups,
-            weights=rows.weights,
-            outside=spec.learns,
-            parameters=None if spec.calibrate == "auto" else spec.calibrate,
+    if not usual:
+        messages += unmoved(spec.mechanical, rows.q)
+    if n_rows < max(20, 2 * (n + 1)):
+        messages.append(
+            f"`X` holds {n_rows} different rows of {n} actuators, too few to rely on: an affine "
+            f"function alone has {n + 1} coefficients for each output, and held-out errors of so "
+            f"few rows do not predict the error on new ones. Record at least {10 * (n + 1)}, in "
+            "several motions."
         )
-    return replace(
-        spec,
-        mechanical=geometry.chain,
-        calibrate=geometry.parameters,
-        geometry=geometry,
-        messages=geometry.messages,
-    )
-
-
-def calibrated(spec: Spec, rows: Rows, groups: NDArray | None = None) -> Spec:
-    """Return the specification with the model calibrated; its `cv_rmse` holds out `groups`."""
-    if not spec.calibrate:
-        return spec
-    if spec.calibrate == "auto":
-        return calibrated(with_geometry_chosen(spec, rows), rows, groups)
-    start = None if spec.geometry is None else spec.geometry.start
-    x = _positions(spec, rows)
-    if start is not None and not spec.left_out:
-        chain = refitted(start, rows.q, x, torch.from_numpy(rows.counts))
-        return replace(spec, mechanical=chain, calibrate=())
-    result, messages = fit_geometry(
-        cast(Chain, spec.mechanical),
-        rows.q,
-        x,
-        spec.calibrate,
-        groups=groups,
-        sample_weight=rows.weights,
-        start=start,
-    )
-    messages = (*spec.messages, *messages)
-    return replace(
-        spec,
-        mechanical=result.chain,
-        calibrate=(),
-        calibration=result,
-        messages=messages,
-    )
-
-
-def _positions(spec: Spec, rows: Rows) -> Tensor:
-    """Return the tip positions (N, 3) of rows, which may be poses [m]."""
-    return torch.from_numpy(rows.tips[:, :3] if spec.output == "pose" else rows.tips)
-
-
-def residuals(
-    mechanical: ForwardModel | None, q: Tensor, y: NDArray, output: str
-) -> NDArray:
-    """Return the residual, measured minus mechanical model, in the form that is learned [m]."""
-    if mechanical is None:
-        return y
-    if output == "pose":
-        return pose_errors(cast(PoseModel, mechanical), q, y)
-    with torch.no_grad():
-        tips = mechanical(q).numpy()
-    if not countable(tips).all():
-        raise too_far()
-    if tips.shape != (y.shape if y.ndim == 2 else (len(y), 1)):
-        raise ValueError(
-            f"`y` must have {tips.shape[1]} columns, as many as `mechanical_model` gives, got "
-            f"shape {y.shape}."
-        )
-    return y - tips.reshape(y.shape)
+    return messages
 
 
 def known_tips(chain: Chain, rows: Rows) -> tuple[Tensor, Tensor]:
@@ -269,12 +141,12 @@ def known_tips(chain: Chain, rows: Rows) -> tuple[Tensor, Tensor]:
     return torch.where(tips.isnan(), predicted, tips), predicted
 
 
-def fit_messages(fitted: FittedHybrid, rows: Rows) -> tuple[str, ...]:
+def fit_messages(spec: Spec, rows: Rows) -> tuple[str, ...]:
     """Return the warnings of a fit: of its calibration, or of rows for an uncalibrated chain."""
-    chain = fitted.mechanical
-    if fitted.calibration is not None or not isinstance(chain, Chain):
-        return fitted.messages
+    chain = spec.mechanical
+    if spec.calibration is not None or not isinstance(chain, Chain):
+        return spec.messages
     motion = motion_message("y", *known_tips(chain, rows), float(chain.reach))
-    messages = [*fitted.messages, *chain.check_actuators(rows.q, "X")]
+    messages = [*spec.messages, *chain.check_actuators(rows.q, "X")]
     doubts = chain.contradiction(rows.q, "X"), motion
     return (*messages, *(message for message in doubts if message is not None))

@@ -7,12 +7,6 @@ from typing import Any
 import numpy as np
 
 from hybridkin._core.html import numbers
-from hybridkin.hybrid._readout_fit import ReadoutFit
-from hybridkin.learning.elm import ELMRegressor
-from hybridkin.learning.elm_cv import ELMRegressorCV
-
-# Their errors are those of held-out rows.
-_HELD_OUT = (ReadoutFit, ELMRegressor, ELMRegressorCV)
 
 
 def fitted_rows(model: Any) -> dict[str, object]:
@@ -69,19 +63,12 @@ def _error_model(model: Any) -> str:
             if weight > 0.0:
                 parts.append(f"{weight:.2f} {name}")
         return f'{" + ".join(parts)} (chosen by "auto")'
-    fitted = _first_error_model(model)
-    name = type(fitted).__name__
+    name = model._learned.kind
     if isinstance(model.error_model, str):
         name = f'"{model.error_model}"'
-    if isinstance(fitted, ReadoutFit) and np.isinf(fitted.alphas).all():
+    if model._learned.rejected:
         return f"{name}, {model.coupling}, rejected by the held-out error"
     return f"{name}, {model.coupling}"
-
-
-def _first_error_model(model: Any) -> object:
-    """Return the fitted error model, that of the first marker if there are several."""
-    fitted = model.error_model_
-    return fitted[0] if type(fitted) is tuple else fitted
 
 
 def _error(model: Any) -> dict[str, str]:
@@ -93,7 +80,7 @@ def _error(model: Any) -> dict[str, str]:
         )
         return {"held-out error": f"mean {_mm(results['expected_distance'])}, {alone}"}
     words = f"standard deviation of a coordinate {_mm(model._noise)}"
-    if isinstance(_first_error_model(model), _HELD_OUT):
+    if model._learned.held_out:
         return {"held-out error": words}
     return {"training error": words}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybridkin.calibration.play_search import search_width
 from hybridkin.chains.play import PlayOperator
-from hybridkin.hybrid._fit import Spec, calibrated, residuals
 from hybridkin.hybrid._rows import Rows
+from hybridkin.hybrid._spec import Spec, residuals
 from hybridkin.learning.elm_cv import ELMRegressorCV
 
 _LEAST = 0.0025  # first width, relative to the stroke
@@ -36,7 +37,7 @@ def play_of(
         return None, []
     ranges = np.ptp(rows.X, axis=0)
     if isinstance(play, str):
-        chosen = choose_play(calibrated(spec, rows), rows)
+        chosen = choose_play(spec.calibrated(replace(rows, groups=None)), rows)
         if chosen is None or chosen.width < 0.95 * ranges.max():
             return chosen, []
         return chosen, [

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from hybridkin.calibration.measured import distances, folds
 from hybridkin.hybrid._drift import too_far
-from hybridkin.hybrid._fit import Spec, fit_hybrid, with_geometry_chosen
+from hybridkin.hybrid._fit import fit_hybrid
 from hybridkin.hybrid._rows import Rows
-from hybridkin.hybrid._selection import select
+from hybridkin.hybrid._spec import Spec
 
 _ROUNDING = 1e-9  # rounding error of shares
 
@@ -38,8 +38,8 @@ class Radius(NamedTuple):
 
 def conformal_radius(
     spec: Spec, rows: Rows, coverage: float
-) -> tuple[Radius, str | None]:
-    """Return the radius that covers a share `coverage` of held-out tips, and a warning or None.
+) -> tuple[Radius, list[str]]:
+    """Return the radius that covers a share `coverage` of held-out tips, and warnings.
 
     Whole groups are held out in five folds, and everything, calibration included, is fitted again
     without them. Without groups every row is a group. The errors in the domain of these fits give
@@ -50,7 +50,7 @@ def conformal_radius(
     Lee, Barber & Willett, Distribution-free inference with hierarchical data (2023), the rank by
     groups; Vovk, Annals of Mathematics and AI 74 (2015), the pooling over folds.
     """
-    spec = replace(spec, left_out=False)
+    spec = replace(spec, held_out=False)
     X = rows.X
     y = rows.tips
     groups = rows.groups
@@ -62,10 +62,7 @@ def conformal_radius(
         part = rows.take(train)
         if part.groups is not None and len(np.unique(part.groups)) == 1:
             part = replace(part, groups=None)  # of a single motion, rows are held out
-        chosen = spec
-        if spec.error_model is None:
-            chosen = select(with_geometry_chosen(spec, part), part)[0]
-        module = fit_hybrid(chosen, part).module
+        module = fit_hybrid(spec, part).module
         q = torch.from_numpy(X[test].astype(np.float64))
         with torch.no_grad():
             inside[test] = module.in_domain(q).numpy()
@@ -77,12 +74,12 @@ def conformal_radius(
     radius = _quantile(errors[inside], of, rows.counts[inside], coverage)
     estimate = Radius(radius, coverage, len(y))
     if estimate.inside < inf:
-        return estimate, None
-    return estimate, (
+        return estimate, []
+    return estimate, [
         f"`coverage` {coverage:g} needs at least {estimate.least_groups} groups (rows, if there "
         "are no groups) inside the domain of the error model when they are held out, got "
         f"{len(names)}: the radius is infinite. Record more motions, or lower `coverage`."
-    )
+    ]
 
 
 def _quantile(

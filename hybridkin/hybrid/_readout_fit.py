@@ -16,7 +16,7 @@ from torch import Tensor
 from hybridkin._core.arrays import identity
 from hybridkin._core.model import ForwardModel
 from hybridkin._core.plan import Plan
-from hybridkin._core.stored import Restore, Stored
+from hybridkin._core.stored import Stored
 from hybridkin.calibration.measured import points
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.hybrid import _linearised
@@ -53,38 +53,6 @@ class ReadoutFit(NamedTuple):
         inf  # variance of tips over that of actuators; infinity: tips only
     )
     rmse: float = nan  # weighted root mean square length of `residual` [m]
-
-    def stored(self) -> Stored:
-        """Return the description of the fit; JSON has no infinity, so penalties are strings."""
-        return Stored.of(
-            "readout_fit",
-            {"residual": self.residual},
-            {"readout": self.readout.stored()},
-            alphas=[*map(str, self.alphas)],
-            scores=[
-                [*map(str, alphas), score] for alphas, score in self.scores.items()
-            ],
-            gradient=self.gradient,
-            noise_ratio=str(self.noise_ratio),
-            rmse=self.rmse,
-        )
-
-    @classmethod
-    def from_stored(cls, stored: Stored, restore: Restore) -> ReadoutFit:
-        """Return the fit from its description; `restore` returns its readout."""
-        first, second = map(float, stored.list_of(str, "alphas"))
-        return cls(
-            restore(stored.part("readout")),
-            (first, second),
-            stored.array("residual", "Nm", finite=False),
-            {
-                (float(a), float(b)): float(c)
-                for a, b, c in stored.list_of(list, "scores")
-            },
-            stored.value("gradient", float),
-            float(stored.value("noise_ratio", str)),
-            stored.value("rmse", float) if "rmse" in stored.settings else nan,
-        )
 
 
 _Tips = Callable[[Tensor], tuple[Tensor, Tensor]]

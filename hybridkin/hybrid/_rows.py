@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -10,6 +11,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from typing_extensions import Self
 
+from hybridkin._core.digests import row_digests
+from hybridkin._core.directions import Directions, moved_directions
 from hybridkin._core.distinct import at_place, distinct_rows
 
 
@@ -18,12 +21,13 @@ class Rows:
     """Measured rows, as they were given or with equal rows merged, see `distinct`."""
 
     X: NDArray  # (N, n) actuator vectors, float64 or float32
-    y: NDArray  # (N, m) or (N,) [m]
+    y: NDArray  # (N, m) or (N,) tips [m]
     weights: NDArray | None = None  # (N,), number of times each row counts
     groups: NDArray | None = None  # (N,), motion of every row
-    place: NDArray | None = (
-        None  # (M,), the row here of each of the M given rows; -1: none
-    )
+    # (M,), the row here of each of the M given rows; -1: none
+    place: NDArray | None = None
+    # Shaped like y: measured minus mechanical model [m], in a fit
+    residual: NDArray | None = None
 
     def __len__(self) -> int:
         return len(self.X)
@@ -43,26 +47,36 @@ class Rows:
         """Number of times each row counts, (N,)."""
         return np.ones(len(self.X)) if self.weights is None else self.weights
 
+    @cached_property
+    def directions(self) -> Directions:
+        """The directions of q that the rows move."""
+        return moved_directions(self.X)
+
+    def digests(self) -> NDArray:
+        """Return a number for each row, by which it is recognised."""
+        return np.unique(row_digests(self.X, self.tips))
+
     def take(self, rows: NDArray) -> Self:
         """Return some of the rows."""
-        weights = None if self.weights is None else self.weights[rows]
-        groups = None if self.groups is None else self.groups[rows]
         return replace(
             self,
             X=self.X[rows],
             y=self.y[rows],
-            weights=weights,
-            groups=groups,
+            weights=_some(self.weights, rows),
+            groups=_some(self.groups, rows),
             place=None,
+            residual=_some(self.residual, rows),
         )
 
     def marker(self, k: int) -> Self:
         """Return the rows in which marker k was measured, with only its positions as tips."""
-        tips = self.tips[:, 3 * k : 3 * k + 3]
+        columns = slice(3 * k, 3 * k + 3)
+        tips = self.tips[:, columns]
+        residual = None if self.residual is None else self.residual[:, columns]
         measured = np.flatnonzero(~np.isnan(tips[:, 0]))
         if not len(measured):
             raise rare_marker(k)
-        return replace(self, y=tips).take(measured)
+        return replace(self, y=tips, residual=residual).take(measured)
 
     def distinct(self) -> Self:
         """Return the different rows with the number of times each counts."""
@@ -92,6 +106,10 @@ class Rows:
     def as_given(self, values: NDArray) -> NDArray:
         """Return values (N, ...) of these rows for the given rows (M, ...); NaN for weight 0."""
         return values if self.place is None else at_place(values, self.place)
+
+
+def _some(values: NDArray | None, rows: NDArray) -> NDArray | None:
+    return None if values is None else values[rows]
 
 
 def rare_marker(k: int) -> ValueError:

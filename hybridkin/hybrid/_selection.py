@@ -3,30 +3,32 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.linear_model import LinearRegression
+from typing_extensions import Self
 
 from hybridkin.calibration.choice import Errors
 from hybridkin.calibration.measured import distance, inner_and_outer
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.hybrid._error_models import (
-    ErrorModel,
+    Blend,
     KernelModel,
-    NamedFeatures,
+    LinearModel,
     NetworkModelCV,
     NoCorrection,
+    QuadraticModel,
     RegressorModel,
-    WeightedModels,
+    ShapeModel,
 )
-from hybridkin.hybrid._fit import Spec, calibrated, fit_hybrid
+from hybridkin.hybrid._fit import FittedHybrid, fit_hybrid
 from hybridkin.hybrid._kernel import folds_of
-from hybridkin.hybrid._module import Hybrid
 from hybridkin.hybrid._rows import Rows
+from hybridkin.hybrid._spec import ErrorModel, FittedError, Seed, Spec
 from hybridkin.learning.elm_cv import ELMRegressorCV
 
 _PICKS = 10  # picks of a blend; each is a weight of 0.1
@@ -34,128 +36,175 @@ _EQUAL = 1e-8  # scores this close are equal: readouts end at 1e-9 of their grad
 _OUTSIDE = 0.1  # share of the outer rows in the score of a blend
 _MOST = 2000  # rows for kernel ridge, whose cost grows with the cube of their number
 # With fewer, penalties that were chosen on all rows suit them.
-_FEW_MOTIONS, _FEW_ROWS = (
-    40,
-    100,
-)
+_FEW_MOTIONS = 40
+_FEW_ROWS = 100
 _ANEW = 3  # folds, without each of which penalties are then chosen once more
+_MEAN_LENGTH = 1.596  # mean length of a standard normal vector with three coordinates
 
 
-def select(
-    spec: Spec,
-    rows: Rows,
-    progress: Callable[[int, int], None] | None = None,
-) -> tuple[Spec, dict[str, Any], dict[str, Hybrid]]:
-    """Return the specification with the error model of least held-out error, or a blend.
+class Part(NamedTuple):
+    """Rows of a log to fit to, with the mechanical model calibrated on them, and test rows."""
+
+    spec: Spec
+    rows: Rows
+    train: NDArray
+    test: NDArray
+
+
+class Auto(ErrorModel):
+    """The blend of error models with the least error on held-out groups, or rows.
 
     Every candidate is fitted to all rows, which fixes its penalties. Then it is fitted to all folds
     but one, and to the inner rows, each time with the mechanical model calibrated on the same rows.
     The predictions for the held-out and the outer rows give the weights of the blend. It can be a
-    single candidate. With few motions its penalties are then chosen once more without each of three
-    folds: penalties that suit the held-out rows would make the error to expect too small.
+    single candidate.
 
     Parameters
     ----------
-    spec : Spec
-        With the geometry chosen, but not yet calibrated.
-    rows : Rows
-        Different rows.
-    progress : callable, optional
-        Called with (done, total) before every candidate.
-
-    Returns
-    -------
-    spec : Spec
-        Calibrated, with its parts.
-    results : dict
-        Errors of all candidates, see `HybridForwardModel.cv_results_`.
-    modules : dict of str to Hybrid
-        Every candidate, fitted to all rows.
+    random_state : int, RandomState or None
+        Seed of the network.
     """
-    y = rows.tips
-    counts = rows.counts
-    folds = folds_of(rows.X, rows.groups)
-    fold_of = np.empty(len(y), dtype=int)
-    for k, (_, test) in enumerate(folds):
-        fold_of[test] = k
-    weighed = replace(rows, groups=None)
-    # A single held-out motion has similar ones in training; folds of motions are a harder test.
-    by_fold = replace(rows, groups=None if rows.groups is None else fold_of)
-    splits = [*folds, inner_and_outer(rows.X)]
-    parts = [weighed.take(train) for train, _ in splits]
-    alone = [calibrated(replace(spec, left_out=False), part) for part in parts]
-    geometry = spec.geometry
-    spec = calibrated(spec, rows)
-    candidates = _candidates(spec)
-    if len(y) > _MOST:
-        candidates.popitem()  # the kernel
-    settled: list[ErrorModel] = []
-    modules: dict[str, Hybrid] = {}
-    tests = np.concatenate([test for _, test in splits])
-    predicted = np.empty((len(candidates), len(tests), y.shape[1]))
-    for i, (name, candidate) in enumerate(candidates.items()):
-        if progress is not None:
-            progress(i, len(candidates))
-        fitted = fit_hybrid(replace(spec, error_model=candidate), by_fold)
-        modules[name] = fitted.module
-        settled.append(fitted.error.settled)
-        held_out = []
-        for fold_spec, training_rows, (_, test) in zip(
-            alone, parts, splits, strict=True
-        ):
-            fold_fit = fit_hybrid(
-                replace(fold_spec, error_model=settled[-1]), training_rows
+
+    chooses = True
+    needs_mechanical = False
+
+    def __init__(self, random_state: Seed) -> None:
+        self.random_state = random_state
+
+    @classmethod
+    def of(cls, coupling: str, random_state: Seed) -> Self:
+        """Return the error model for these settings of a HybridForwardModel."""
+        return cls(random_state)
+
+    def fit(self, rows: Rows, spec: Spec) -> FittedError:
+        """Return the blend, fitted to all rows, and the comparison of the candidates."""
+        folds = folds_of(rows.X, rows.groups)
+        fold_of = np.empty(len(rows), dtype=int)
+        for k, (_, test) in enumerate(folds):
+            fold_of[test] = k
+        parts = []
+        for train, test in [*folds, inner_and_outer(rows.X)]:
+            # A single held-out motion has similar ones in training; folds are a harder test.
+            training_rows = replace(rows, groups=None).take(train)
+            recalibrated = spec.recalibrated(training_rows)
+            parts.append(Part(recalibrated, training_rows, train, test))
+        by_fold = replace(rows, groups=None if rows.groups is None else fold_of)
+        candidates = self._candidates(spec, len(rows))
+        fits: dict[str, FittedHybrid] = {}
+        predictions = []
+        for name, candidate in candidates.items():
+            if spec.progress is not None:
+                spec.progress(len(fits), len(candidates))
+            fits[name] = fit_hybrid(replace(spec, error_model=candidate), by_fold)
+            settled = fits[name].error.settled
+            predictions.append(_predictions(settled, parts, rows))
+        outer = parts[-1].test
+        held_out = HeldOut.of(np.array(predictions), rows, fold_of, outer)
+        weights, comparison = chosen_blend([*candidates], held_out, rows)
+        if spec.held_out and weights[0] < 1.0 and _is_small(rows):
+            unsettled = blend_of(candidates.values(), weights)
+            blended = np.tensordot(weights, held_out.predicted, 1)[: len(rows)]
+            comparison["expected_distance"] *= _optimism(
+                unsettled, parts[:-1], by_fold, blended
             )
-            held_out.append(fold_fit.predict(rows.X[test]))
-        predicted[i] = np.concatenate(held_out)
-    # Held-out rows first, in the order of the log; then the outer ones.
-    order = np.concatenate([np.argsort(tests[: len(y)]), np.arange(len(y), len(tests))])
-    held_out_rows = _HeldOut.of(predicted[:, order], rows, fold_of, splits[-1][1])
-    weights, results = _chosen([*candidates], held_out_rows, rows)
-    few = len(y) < _FEW_ROWS
-    if rows.groups is not None:
-        few = len(np.unique(rows.groups)) < _FEW_MOTIONS
-    if spec.left_out and few and len(folds) > 2 and weights[0] < 1.0:
-        without_penalties = _blend(candidates.values(), weights)
-        blended = np.tensordot(weights, held_out_rows.predicted, 1)
-        before = after = 0.0
-        for one, (train, test) in zip(alone[:_ANEW], folds, strict=False):
-            anew = fit_hybrid(
-                replace(one, error_model=without_penalties), by_fold.take(train)
-            )
-            before += counts[test] @ distance(blended[test], y[test])
-            after += counts[test] @ distance(anew.predict(rows.X[test]), y[test])
-        results["expected_distance"] *= float(after / before)
-    if geometry is None:
-        name = "nothing"
-        errors = {}
-    else:
-        name = geometry.name
-        errors = geometry.errors
-    first_errors = {
-        name: Errors(
-            *(float(results[key][0]) for key in ("mean_distance", "io_distance"))
+        _describe_geometry(comparison, spec)
+        settled = [fitted.error.settled for fitted in fits.values()]
+        return replace(
+            blend_of(settled, weights).fit(rows, spec),
+            noise=comparison["expected_distance"] / _MEAN_LENGTH,
+            held_out=True,
+            comparison=comparison,
+            candidates={name: fitted.module for name, fitted in fits.items()},
         )
-    }
-    results["parameters"] = name
-    results["mechanical_model"] = {
-        n: one.known() for n, one in (errors or first_errors).items()
-    }
-    return replace(spec, error_model=_blend(settled, weights)), results, modules
+
+    def _candidates(self, spec: Spec, n_rows: int) -> dict[str, ErrorModel]:
+        """Return the error models by name; of equal candidates the first, simplest one wins."""
+        network = ELMRegressorCV(
+            250, max_hidden=1000, random_state=copy.deepcopy(self.random_state)
+        )
+        candidates: dict[str, ErrorModel] = {}
+        at_tip = ""
+        if spec.mechanical is None:
+            candidates["linear"] = RegressorModel(LinearRegression())
+        else:
+            candidates["mechanical"] = NoCorrection()
+            candidates["parallel linear"] = LinearModel("parallel")
+            at_tip = "parallel "
+            kinds = {"linear": LinearModel, "quadratic": QuadraticModel}
+            if isinstance(spec.mechanical, ArcChain):
+                kinds["pose"] = ShapeModel
+            for coupling in ("serial", "parallel"):
+                for name, kind in kinds.items():
+                    candidates[f"{coupling} {name}"] = kind(coupling)
+        candidates[f"{at_tip}ELM"] = NetworkModelCV(network)
+        if n_rows <= _MOST:
+            candidates[f"{at_tip}kernel"] = KernelModel()
+        return candidates
 
 
-def _blend(models: Iterable[ErrorModel], shares: NDArray) -> ErrorModel:
+def _predictions(model: ErrorModel, parts: list[Part], rows: Rows) -> NDArray:
+    """Return predictions (N + M, m) of the held-out rows in their order, then of the outer ones."""
+    held_out = np.empty_like(rows.tips)
+    predicted = held_out
+    for part in parts:
+        fitted = fit_hybrid(replace(part.spec, error_model=model), part.rows)
+        predicted = fitted.predict(rows.X[part.test])
+        if part is not parts[-1]:
+            held_out[part.test] = predicted
+    return np.concatenate([held_out, predicted])
+
+
+def _is_small(rows: Rows) -> bool:
+    """Return whether penalties chosen on all rows suit held-out ones, and folds can be refitted."""
+    if rows.groups is None:
+        return 2 < len(rows) < _FEW_ROWS
+    return 2 < len(np.unique(rows.groups)) < _FEW_MOTIONS
+
+
+def _optimism(
+    model: ErrorModel, folds: list[Part], rows: Rows, blended: NDArray
+) -> float:
+    """Return the ratio of held-out errors with penalties chosen without a fold, to those with it.
+
+    Penalties that suit the held-out rows would make the error to expect too small.
+    """
+    before = after = 0.0
+    for fold in folds[:_ANEW]:
+        test = rows.take(fold.test)
+        anew = fit_hybrid(replace(fold.spec, error_model=model), rows.take(fold.train))
+        before += test.counts @ distance(blended[fold.test], test.tips)
+        after += test.counts @ distance(anew.predict(test.X), test.tips)
+    return float(after / before)
+
+
+def _describe_geometry(comparison: dict[str, Any], spec: Spec) -> None:
+    """Add the chosen parameters of the mechanical model, and the errors of all sets of them."""
+    name = "nothing"
+    errors = {}
+    if spec.geometry is not None:
+        name = spec.geometry.name
+        errors = spec.geometry.errors
+    if not errors:
+        held_out = float(comparison["mean_distance"][0])
+        errors = {name: Errors(held_out, float(comparison["io_distance"][0]))}
+    comparison["parameters"] = name
+    comparison["mechanical_model"] = {
+        of_set: both.known() for of_set, both in errors.items()
+    }
+
+
+def blend_of(models: Iterable[ErrorModel], weights: NDArray) -> ErrorModel:
     """Return the models of positive weight as one."""
-    weights = []
+    positive = []
     chosen = []
-    for model, weight in zip(models, shares.tolist(), strict=True):
+    for model, weight in zip(models, weights.tolist(), strict=True):
         if weight > 0.0:
-            weights.append(weight)
+            positive.append(weight)
             chosen.append(model)
-    return chosen[0] if len(chosen) == 1 else WeightedModels(weights, chosen)
+    return chosen[0] if len(chosen) == 1 else Blend(positive, chosen)
 
 
-class _HeldOut(NamedTuple):
+class HeldOut(NamedTuple):
     """Predictions of all candidates for the N held-out rows, then for the outer rows."""
 
     predicted: NDArray  # (K, N + M, m)
@@ -168,19 +217,19 @@ class _HeldOut(NamedTuple):
     @classmethod
     def of(
         cls, predicted: NDArray, rows: Rows, fold_of: NDArray, outer: NDArray
-    ) -> _HeldOut:
+    ) -> HeldOut:
         """Return both kinds of rows, weighted by the errors of the first candidate, f_mech."""
-        n = len(rows.X)
-        at = np.concatenate([np.arange(len(rows.X)), outer])
-        y = rows.tips[at]
-        counts = rows.counts[at]
+        n = len(rows)
+        places = np.concatenate([np.arange(n), outer])
+        y = rows.tips[places]
+        counts = rows.counts[places]
         weights = counts.copy()
         for part, share in ((slice(0, n), 1.0 - _OUTSIDE), (slice(n, None), _OUTSIDE)):
             total = counts[part] @ distance(predicted[0, part], y[part])
             weights[part] *= share / max(total, np.finfo(float).eps)
-        return cls(predicted, y, weights, counts, fold_of[at], n)
+        return cls(predicted, y, weights, counts, fold_of[places], n)
 
-    def shares(self, rows: NDArray) -> NDArray:
+    def blend_weights(self, rows: NDArray) -> NDArray:
         """Return the weights (K,) of the candidates, multiples of 0.1 that sum to one.
 
         Ten times, the candidate that lowers the score most is added; repetition is allowed.
@@ -203,42 +252,40 @@ class _HeldOut(NamedTuple):
         return picks / _PICKS
 
 
-def _chosen(
-    names: list[str], found: _HeldOut, rows: Rows
+def chosen_blend(
+    names: list[str], held_out: HeldOut, rows: Rows
 ) -> tuple[NDArray, dict[str, Any]]:
     """Return the weights of the candidates, and the errors of all candidates and their blend.
 
     If the gain of the blend over the mechanical model, paired by motion or fold, is within its
     standard error, the mechanical model is chosen.
     """
-    n = found.n
-    counts = found.counts
+    n = held_out.n
+    counts = held_out.counts
     # On each fold the blend is scored with weights chosen without that fold.
-    blend = np.empty_like(found.y)
-    for fold in np.unique(found.fold):
-        test = found.fold == fold
-        blend[test] = np.tensordot(found.shares(~test), found.predicted[:, test], 1)
-    distances = np.array([distance(x, found.y) for x in (*found.predicted, blend)])
-    held_out = distances[:, :n]
-    outer = distances[:, n:]
-    by_fold = _means_by(found.fold[:n], held_out, counts[:n])
-    weights = found.shares(np.ones(len(blend), dtype=bool))
-    if rows.groups is None:
-        units = by_fold
-    else:
-        units = _means_by(rows.groups, held_out, counts[:n])
-    gains = units[0] - units[-1]
+    blend = np.empty_like(held_out.y)
+    for fold in np.unique(held_out.fold):
+        test = held_out.fold == fold
+        weights = held_out.blend_weights(~test)
+        blend[test] = np.tensordot(weights, held_out.predicted[:, test], 1)
+    predicted = (*held_out.predicted, blend)
+    distances = np.array([distance(x, held_out.y) for x in predicted])
+    of_held_out = distances[:, :n]
+    by_fold = _means_by(held_out.fold[:n], of_held_out, counts[:n])
+    by_motion = by_fold
+    if rows.groups is not None:
+        by_motion = _means_by(rows.groups, of_held_out, counts[:n])
+    gains = by_motion[0] - by_motion[-1]
+    weights = held_out.blend_weights(np.ones(len(blend), dtype=bool))
     if gains.mean() <= gains.std(ddof=1) / np.sqrt(len(gains)):
         weights = np.eye(len(weights))[0]
-    means = np.average(held_out, axis=1, weights=counts[:n])
+    means = np.average(of_held_out, axis=1, weights=counts[:n])
     return weights, {
         "candidate": [*names, "blend"],
         "mean_distance": means,
         "expected_distance": float(means[0 if weights[0] == 1.0 else -1]),
         "std_distance": by_fold.std(axis=1, ddof=1),
-        "fold_distance": by_fold,
-        "io_distance": np.average(outer, axis=1, weights=counts[n:]),
-        "rank": means.argsort().argsort() + 1,
+        "io_distance": np.average(distances[:, n:], axis=1, weights=counts[n:]),
         "chosen": "blend" if (weights < 1.0).all() else names[int(weights.argmax())],
         "weights": dict(zip(names, weights.tolist(), strict=True)),
     }
@@ -246,33 +293,8 @@ def _chosen(
 
 def _means_by(labels: NDArray, distances: NDArray, counts: NDArray) -> NDArray:
     """Return the mean distances (K, L) of K models for each of L row labels."""
-    parts = [labels == label for label in np.unique(labels)]
-    return np.array(
-        [np.average(distances[:, k], axis=1, weights=counts[k]) for k in parts]
-    ).T
-
-
-def _candidates(spec: Spec) -> dict[str, ErrorModel]:
-    """Return the error models by name; of equal candidates the first, simplest one wins."""
-    network = ELMRegressorCV(
-        250, max_hidden=1000, random_state=copy.deepcopy(spec.random_state)
-    )
-    if spec.mechanical is None:
-        return {
-            "linear": RegressorModel(LinearRegression()),
-            "ELM": NetworkModelCV(network),
-            "kernel": KernelModel(),
-        }
-    features = ["linear", "quadratic"]
-    if isinstance(spec.mechanical, ArcChain):
-        features.append("pose")
-    candidates: dict[str, ErrorModel] = {
-        "mechanical": NoCorrection(),
-        "parallel linear": NamedFeatures("linear", "parallel"),
-    }
-    for coupling in ("serial", "parallel"):
-        for name in features:
-            candidates[f"{coupling} {name}"] = NamedFeatures(name, coupling)
-    candidates["parallel ELM"] = NetworkModelCV(network)
-    candidates["parallel kernel"] = KernelModel()
-    return candidates
+    means = []
+    for label in np.unique(labels):
+        k = labels == label
+        means.append(np.average(distances[:, k], axis=1, weights=counts[k]))
+    return np.array(means).T

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from math import inf
 from typing import Any
 
@@ -28,21 +27,15 @@ from hybridkin.chains import constant_curvature, elastic_tendons, rigid  # noqa:
 from hybridkin.chains.play import PlayOperator
 from hybridkin.hybrid._adapt import Change
 from hybridkin.hybrid._drift import Drift
-from hybridkin.hybrid._error_models import Blend
 from hybridkin.hybrid._radius import Radius
 from hybridkin.hybrid._range import TrainingRange
-from hybridkin.hybrid._readout_fit import ReadoutFit
-from hybridkin.hybrid._settings import check_settings
+from hybridkin.hybrid._spec import Learned
 from hybridkin.hybrid._wrapped import WithPose, in_columns
 from hybridkin.hybrid.estimator import HybridForwardModel
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.elm_cv import ELMRegressorCV
 
-# Fitted error models with their own description, and other regressors that a hybrid accepts.
-_FITS = {
-    "elm_regressor": ELMRegressor.from_stored,
-    "readout_fit": ReadoutFit.from_stored,
-}
+# Regressors that a file may name as the setting `error_model`.
 _REGRESSORS = {
     cls.__name__: cls
     for cls in (ELMRegressor, ELMRegressorCV, KernelRidge, LinearRegression)
@@ -88,14 +81,16 @@ def stored_hybrid(model: HybridForwardModel) -> Stored:
         {
             "module": model.fitted_module_.stored(),
             "nominal": None if nominal is None else as_forward_model(nominal).stored(),
-            "error_model": _stored_error(model.error_model_),
         },
         params=params,
-        error_model=_setting(model.error_model, model.error_model_),
+        error_model=_setting(model.error_model),
         n_features_in=model.n_features_in_,
         feature_names_in=vars(model).get("feature_names_in_", []),
         single_output=model._single_output,
         noise=model._noise,
+        learned=model._learned.kind,
+        rejected=model._learned.rejected,
+        held_out=model._learned.held_out,
     )
 
 
@@ -110,13 +105,14 @@ def hybrid_of(stored: Stored, training: object) -> HybridForwardModel:
         model.mechanical_model = restorer()(stored.part("nominal"))
     setting = stored.value("error_model", (str, dict, None))
     model.error_model = _estimator(setting) if isinstance(setting, dict) else setting
-    check_settings(model)
+    model._checked_error_model()
     model.fitted_module_ = restore(stored.part("module"))
     if isinstance(model.fitted_module_, WithPose) != (model.output == "pose"):
         raise ValueError(
             f"`output` {model.output!r} does not fit {stored.part('module').kind!r}"
         )
-    model.error_model_ = _restored_error(stored.parts.get("error_model"), restore, n)
+    model.error_model_ = None
+    model._learned = _learned(stored)
     restore_columns(model, stored, n)
     model._single_output = stored.value("single_output", bool)
     model.change_ = Change(stored.array("shift", (n,)), stored.array("motion", (4, 4)))
@@ -179,12 +175,7 @@ def _restored_drift(stored: Stored, empty: Drift) -> Drift:
 def training_of(model: HybridForwardModel) -> dict[str, Any]:
     """Return the results of the training of a fitted hybrid as JSON values, errors in metres."""
     results: dict[str, Any] = {}
-    error = model.error_model_
-    if isinstance(error, Blend):
-        error = error.error_models[0]
     results["rows"] = len(model._fitted_rows)
-    if isinstance(error, ReadoutFit):
-        results["left_out_rmse"] = error.rmse
     if (calibration := model.calibration_) is not None:
         results["calibration"] = {
             "rmse": calibration.rmse,
@@ -196,31 +187,29 @@ def training_of(model: HybridForwardModel) -> dict[str, Any]:
     return plain(results)
 
 
-def _setting(asked: object, fitted: object) -> Any:
-    """Return the setting `error_model` as JSON, or the fitted error model if that is not JSON."""
-    if asked is None or isinstance(asked, str):
-        return asked
-    if type(asked).__name__ in _REGRESSORS:
-        try:
-            return json.loads(json.dumps(_described(asked), allow_nan=False))
-        except (TypeError, ValueError):
-            pass  # a splitter, for example
-    if isinstance(fitted, ELMRegressorCV):
-        return _described(fitted.best_estimator_)
-    if isinstance(fitted, ReadoutFit):
-        features = fitted.readout.features.stored()
-        if "activation" in features.settings:
-            params = {
-                "n_hidden": len(features.arrays["input_bias"]),
-                **features.settings,
-            }
-            return {"class": "ELMRegressorCV", "params": params}
-    raise TypeError(f"`error_model` {asked!r} could only be stored as code.")
+def _learned(stored: Stored) -> Learned:
+    if "learned" not in stored.settings:  # of a first file of this format
+        part = stored.parts.get("error_model")
+        return Learned(None if part is None else part.kind)
+    return Learned(
+        stored.value("learned", (str, None)),
+        stored.value("rejected", bool),
+        stored.value("held_out", bool),
+    )
 
 
-def _described(estimator: Any) -> dict[str, Any]:
-    """Return the class and the parameters of an estimator."""
-    return {"class": type(estimator).__name__, "params": params_of(estimator)}
+def _setting(error_model: object) -> Any:
+    """Return the setting `error_model` as JSON; entries that JSON lacks, such as a splitter, go."""
+    if error_model is None or isinstance(error_model, str):
+        return error_model
+    name = type(error_model).__name__
+    if name not in _REGRESSORS:
+        raise TypeError(f"`error_model` {error_model!r} could only be stored as code.")
+    params = {}
+    for key, value in params_of(error_model).items():
+        if value is None or isinstance(value, (str, bool, int, float, list)):
+            params[key] = value
+    return {"class": name, "params": params}
 
 
 def _estimator(setting: dict[str, Any]) -> Any:
@@ -232,53 +221,6 @@ def _estimator(setting: dict[str, Any]) -> Any:
     estimator = estimator_of(_REGRESSORS[name], entries.value("params", dict))
     estimator._validate_params()
     return estimator
-
-
-def _stored_error(error: object) -> Stored | None:
-    """Return the description of a fitted error model, None if there is none."""
-    if error is None or isinstance(error, (ReadoutFit, ELMRegressor, ELMRegressorCV)):
-        return None if error is None else error.stored()
-    if type(error) is tuple:  # one for each marker
-        return Stored.of(
-            "list", parts={str(k): _stored_error(one) for k, one in enumerate(error)}
-        )
-    if isinstance(error, Blend):
-        models = {
-            str(k): _stored_error(one) for k, one in enumerate(error.error_models)
-        }
-        return Stored.of("blend", parts=models, weights=error.weights)
-    learned = {
-        name: np.asarray(value)
-        for name, value in vars(error).items()
-        if name[-1] == "_"
-    }
-    arrays = {name: value for name, value in learned.items() if value.dtype.kind == "f"}
-    return Stored.of("regressor", arrays, **_described(error))
-
-
-def _restored_error(stored: Stored | None, restore: Restore, n: int) -> Any:
-    """Return the fitted error model from its description, for n actuators."""
-    if stored is None:
-        return None
-    if stored.kind == "list":
-        return tuple(
-            _restored_error(part, restore, n) for part in stored.parts.values()
-        )
-    if stored.kind == "blend":
-        weights = tuple(stored.list_of(float, "weights"))
-        parts = [stored.parts.get(str(k)) for k in range(len(weights))]
-        return Blend(
-            weights, tuple(_restored_error(part, restore, n) for part in parts)
-        )
-    if stored.kind in _FITS:
-        return _FITS[stored.kind](stored, restore)
-    error = _estimator(stored.settings)
-    vars(error).update(
-        {name: stored.array(name) for name in stored.arrays}, n_features_in_=n
-    )
-    if error.predict(np.ones((1, n))).ndim > 2:
-        raise ValueError("the arrays of the error model do not fit together")
-    return error
 
 
 def _array(value: object) -> Any:

@@ -16,11 +16,15 @@ from torch import nn
 
 from hybridkin._core.arrays import labels, number, table
 from hybridkin._core.digests import row_digests
-from hybridkin._core.directions import moved_directions
-from hybridkin._core.model import as_forward_model
+from hybridkin._core.model import PoseModel, as_forward_model
 from hybridkin.calibration.choice import GeometryChoice
-from hybridkin.calibration.measured import check_finite, check_unscaled
+from hybridkin.calibration.measured import (
+    check_finite,
+    check_unscaled,
+    with_missing_markers,
+)
 from hybridkin.chains.chain import Chain
+from hybridkin.chains.markers import MarkedChain
 from hybridkin.chains.play import PlayState
 from hybridkin.hybrid._adapt import (
     PARAMETERS,
@@ -29,27 +33,16 @@ from hybridkin.hybrid._adapt import (
     likeliest_change,
 )
 from hybridkin.hybrid._drift import Drift
-from hybridkin.hybrid._error_models import error_model_of
-from hybridkin.hybrid._fit import (
-    Spec,
-    few_rows,
-    fit_hybrid,
-    fit_messages,
-    residuals,
-    with_geometry_chosen,
-)
-from hybridkin.hybrid._module import Hybrid
+from hybridkin.hybrid._fit import few_rows, fit_hybrid, fit_messages
 from hybridkin.hybrid._play import play_of
 from hybridkin.hybrid._predictor import HybridPredictor
 from hybridkin.hybrid._radius import Radius, conformal_radius
 from hybridkin.hybrid._range import TrainingRange
 from hybridkin.hybrid._rows import Rows
-from hybridkin.hybrid._selection import select
-from hybridkin.hybrid._settings import check_settings, missing_markers
+from hybridkin.hybrid._settings import CONSTRAINTS, error_model_of
+from hybridkin.hybrid._spec import ErrorModel, Spec, residuals
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.hidden_layer import check_rows
-
-_MEAN_LENGTH = 1.596  # mean length of a standard normal vector with three coordinates
 
 
 class HybridForwardModel(HybridPredictor):
@@ -129,10 +122,11 @@ class HybridForwardModel(HybridPredictor):
     change_ : Change
         What `adapt` has found: the ``shift`` of the actuator zeros (n,) [unit of q], and the
         ``motion`` of the base (4, 4); zero and the identity after a fit.
-    error_model_ : estimator, ReadoutFit, Blend or None
-        The fitted error model. A blend has ``weights`` and ``error_models``. With serial coupling
-        or named features it holds the chosen ``alphas`` and the ``residual`` of every row from a
-        fit without that row or its group [m].
+    error_model_ : estimator, ReadoutFit, FittedBlend, tuple or None
+        The fitted error model; a tuple has one for each marker. A blend has ``weights`` and
+        ``error_models``. With serial coupling or named features it holds the chosen ``alphas`` and
+        the ``residual`` of every row from a fit without that row or its group [m]. A model from a
+        file has none.
     cv_results_ : dict or None
         For error_model="auto". By candidate, the last of which is the blend: the mean distance on
         held-out rows and its standard deviation over the folds [m], and ``io_distance``, the mean
@@ -174,6 +168,7 @@ class HybridForwardModel(HybridPredictor):
     (2, 3)
     """
 
+    _parameter_constraints = CONSTRAINTS
     n_features_in_: int
     feature_names_in_: NDArray
 
@@ -267,26 +262,26 @@ class HybridForwardModel(HybridPredictor):
         held_out: bool = True,
     ) -> list[str]:
         """Fit, see `fit_quietly`, and return the messages of all warnings."""
-        check_settings(self)
+        error_model = self._checked_error_model()
         log = self._checked_rows(X, y, sample_weight, groups)
-        settings = replace(self._spec(log), left_out=held_out)
         rows = log.distinct()
+        settings = replace(self._spec(error_model, log), held_out=held_out)
         messages = few_rows(rows, settings, self.coverage)
-        self._fitted_rows = np.unique(row_digests(rows.X, rows.tips))
-        spec = with_geometry_chosen(settings, rows, geometry)
+        self._fitted_rows = rows.digests()
+        spec = settings.with_geometry_chosen(rows, geometry)
         self.play_, of_play = play_of(self.play, spec, log.in_runs())
         messages += of_play
         self._play_state: PlayState | None = None
         if self.play_ is not None:
-            spec = replace(spec, commanded=moved_directions(rows.X))
+            settings = replace(settings, commanded=rows.directions)
+            spec = replace(spec, commanded=rows.directions)
             rows = replace(log, X=self._effective(log.X, log.groups)).distinct()
-        self.cv_results_: dict[str, Any] | None = None
-        self.candidates_: dict[str, Hybrid] | None = None
-        if spec.error_model is None:
-            spec, self.cv_results_, self.candidates_ = select(spec, rows, progress)
-        fitted = fit_hybrid(spec, rows)
-        self.calibration_ = fitted.calibration
+        fitted = fit_hybrid(replace(spec, progress=progress), rows)
+        self.calibration_ = fitted.spec.calibration
         self.error_model_ = fitted.error.result
+        self._learned = fitted.error.learned
+        self.cv_results_ = fitted.error.comparison
+        self.candidates_ = fitted.error.candidates
         self.fitted_module_ = fitted.module
         self.change_ = Change.none(rows.X.shape[1])
         self._single_output = rows.y.ndim == 1
@@ -294,15 +289,11 @@ class HybridForwardModel(HybridPredictor):
         self._drift = Drift.of_range(rows.q, rows.tips.shape[1])
         self._follow_robot()
         self._noise = fitted.error.noise
-        if self.cv_results_ is not None:
-            self._noise = float(self.cv_results_["expected_distance"]) / _MEAN_LENGTH
         self.radius_: Radius | None = None
         if self.coverage is not None:
-            self.radius_, message = conformal_radius(
-                replace(settings, commanded=spec.commanded), rows, self.coverage
-            )
-            messages += [] if message is None else [message]
-        return [*dict.fromkeys([*messages, *fit_messages(fitted, rows)])]
+            self.radius_, of_radius = conformal_radius(settings, rows, self.coverage)
+            messages += of_radius
+        return [*dict.fromkeys([*messages, *fit_messages(fitted.spec, rows)])]
 
     def partial_fit(
         self,
@@ -437,13 +428,56 @@ class HybridForwardModel(HybridPredictor):
         self._follow_robot()
         return self
 
+    def _checked_error_model(self) -> ErrorModel:
+        """Return the error model of the settings; raise if they are not allowed."""
+        self._validate_params()
+        mechanical = self.mechanical_model
+        error_model = error_model_of(self.error_model, self.coupling, self.random_state)
+        if self.output == "pose":
+            self._check_pose_settings(error_model)
+        inside = self.coupling == "serial" and error_model.learns
+        if mechanical is None and (inside or error_model.needs_mechanical):
+            raise ValueError(
+                f"`mechanical_model` must be given with coupling={self.coupling!r} and "
+                f"error_model={self.error_model!r}, which correct a mechanical model. "
+                "To learn without one, give an estimator as `error_model`."
+            )
+        names = self.calibrate is not None and not isinstance(self.calibrate, str)
+        if names and [*self.calibrate] and not isinstance(mechanical, Chain):
+            raise TypeError(
+                f"`mechanical_model` must be a chain to `calibrate` {self.calibrate!r}, got "
+                f"{type(mechanical).__name__}, which has no geometry."
+            )
+        return error_model
+
+    def _check_pose_settings(self, error_model: ErrorModel) -> None:
+        if not isinstance(self.mechanical_model, PoseModel):
+            raise TypeError(
+                "`mechanical_model` must be a PoseModel with pose_and_jacobian(q) for "
+                f"output='pose'; all chains are. Got {type(self.mechanical_model).__name__}; for "
+                "positions use output='position'."
+            )
+        inside = self.coupling == "serial" and error_model.learns
+        if inside or not error_model.for_poses:
+            raise ValueError(
+                "`coupling` must be 'parallel' and `error_model` a regressor, None, 'elm', "
+                f"'kernel' or 'drop' with output='pose', got {self.coupling!r} and "
+                f"{self.error_model!r}; use ELMRegressorCV(), which chooses its penalties, or "
+                "output='position'."
+            )
+        if self.coverage is not None:
+            raise ValueError(
+                f"`coverage` must be None with output='pose', got {self.coverage!r}: the radius "
+                "is for tip positions. Fit a model with output='position' to y[:, :3]."
+            )
+
     def _checked_rows(
         self, X: Any, y: Any, weights: ArrayLike | None, groups: Any, reset: bool = True
     ) -> Rows:
         """Return the measured rows, checked."""
         X = table(X, "X")
         y = table(y, "y")
-        missing = missing_markers(self, y)
+        missing = self._missing_markers(y)
         y = y if y is None else np.where(missing, 0.0, y)
         check_finite(X=X, y=y)
         X, y, weights = check_rows(self, X, y, weights, reset)
@@ -455,34 +489,32 @@ class HybridForwardModel(HybridPredictor):
             groups = labels(groups, len(X))
         return Rows(X, y, cast("NDArray | None", weights), groups)
 
-    def _spec(self, rows: Rows) -> Spec:
+    def _missing_markers(self, y: Any) -> NDArray[np.bool_]:
+        """Return which entries of y (N, 3 K) are missing markers; each row must keep a marker."""
+        mechanical = self.mechanical_model
+        allowed = mechanical is None or isinstance(mechanical, MarkedChain)
+        if not allowed or self.output == "pose" or np.ndim(y) != 2 or y.shape[1] % 3:
+            return np.zeros(np.shape(y), dtype=bool)
+        return np.isnan(with_missing_markers(y, "y"))
+
+    def _spec(self, error_model: ErrorModel, rows: Rows) -> Spec:
         """Return the settings as a specification, with a copy of the mechanical model."""
-        mechanical = copy.deepcopy(self.mechanical_model)
+        if self.mechanical_model is None:
+            return Spec(None, error_model, (), self.guard, self.output)
+        mechanical = as_forward_model(copy.deepcopy(self.mechanical_model))
         names = ()
-        if mechanical is not None:
-            mechanical = as_forward_model(mechanical)
         if isinstance(mechanical, Chain):
             check_unscaled("X", rows.X, "actuator vectors [m or rad]")
             check_unscaled("y", rows.tips, "tip positions [m]")
             mechanical.check_actuators(rows.q, "X")
-            parameters = self.calibrate
-            if parameters is None:
-                parameters = "auto" if self.error_model == "auto" else ()
-            if isinstance(parameters, str):
-                if parameters == "default":
-                    names = mechanical.default_parameters
-                else:
-                    names = parameters
-            else:
-                names = tuple(parameters)
-        error_model = None
-        if self.error_model != "auto":
-            error_model = error_model_of(
-                self.error_model, self.coupling, self.random_state
-            )
-        return Spec(
-            mechanical, error_model, names, self.guard, self.output, self.random_state
-        )
+            names = self.calibrate
+            if names is None:
+                names = "auto" if error_model.chooses else ()
+            elif names == "default":
+                names = mechanical.default_parameters
+            elif names != "auto":
+                names = tuple(names)
+        return Spec(mechanical, error_model, names, self.guard, self.output)
 
 
 def fit_quietly(

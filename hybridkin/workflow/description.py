@@ -142,9 +142,7 @@ class ErrorModelEntry:
         if auto is not None:
             calibrated = calibrated or [auto.taken]
             return cls(auto.in_short, None, model.guard, calibrated)
-        kind = "none"
-        if model.error_model_ is not None:
-            kind = type(model.error_model_).__name__
+        kind = model._learned.kind or "none"
         return cls(kind, model.coupling, model.guard, calibrated)
 
 

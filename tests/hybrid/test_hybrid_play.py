@@ -14,9 +14,10 @@ from hybridkin import (
     fit_play,
     robots,
 )
-from hybridkin.hybrid._fit import Spec
+from hybridkin.hybrid._error_models import NoCorrection
 from hybridkin.hybrid._play import choose_play
 from hybridkin.hybrid._rows import Rows
+from hybridkin.hybrid._spec import Spec
 
 WIDTH = 0.02
 CHAIN = robots.bionic_handling_assistant()
@@ -55,9 +56,9 @@ def test_the_width_is_found_where_a_marker_is_missing(log):
     x += 2e-4 * np.random.default_rng(1).standard_normal(x.shape)
     x[::3, :3] = np.nan
     rows = Rows(q, x, groups=groups)
-    assert abs(choose_play(Spec(chain), rows).width - WIDTH) < 0.1 * WIDTH
+    assert abs(choose_play(Spec(chain, NoCorrection()), rows).width - WIDTH) < 0.1 * WIDTH
     nowhere = Rows(q, np.where(np.arange(6) < 3, np.nan, x), groups=groups)
-    assert choose_play(Spec(chain), nowhere) is None
+    assert choose_play(Spec(chain, NoCorrection()), nowhere) is None
     fitted = fit_play(chain, q, x, groups, widths=[0.5 * WIDTH, WIDTH], parameters=("radii",))
     assert fitted.width == WIDTH
 
@@ -143,7 +144,7 @@ def test_measurements_go_on_where_the_last_ones_ended(log):
 def test_clear_errors(log):
     q, x, groups = log
     for play in (-1.0, "some", [0.01, 0.02]):
-        with pytest.raises(ValueError, match="width"):
+        with pytest.raises(ValueError, match="play|width"):
             HybridForwardModel(CHAIN, "drop", play=play).fit(q, x)
     with pytest.warns(UserWarning, match="less than the range"):
         HybridForwardModel(CHAIN, "drop", play=0.5).fit(q, x)

@@ -1,0 +1,228 @@
+"""The specification of a fit: mechanical model, calibration, and the interface of error models."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from math import nan
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from typing_extensions import Self
+
+from hybridkin._core.arrays import countable
+from hybridkin._core.directions import Directions
+from hybridkin._core.model import ForwardModel, PoseModel
+from hybridkin.calibration.calibrate import CalibrationResult, fit_geometry, refitted
+from hybridkin.calibration.choice import GeometryChoice, choose_geometry
+from hybridkin.chains.arc_chain import ArcChain
+from hybridkin.chains.chain import Chain
+from hybridkin.hybrid._drift import too_far
+from hybridkin.hybrid._module import Hybrid, TipCorrection
+from hybridkin.hybrid._rows import Rows
+from hybridkin.hybrid._wrapped import pose_errors
+
+Seed = int | np.random.RandomState | None
+Weighted = list[tuple[float, TipCorrection]]  # weights and corrections, without guards
+
+
+class ErrorModel(ABC):
+    """A way to learn the residual, measured minus mechanical model."""
+
+    learns = True
+    chooses = False  # whether it compares models, elastic tendons among them
+    couplings: tuple[str, ...] = ("parallel", "serial")
+    for_poses = False  # whether it learns the six numbers of a pose
+    needs_mechanical = True
+
+    @classmethod
+    def of(cls, coupling: str, random_state: Seed) -> Self:
+        """Return the error model for these settings of a HybridForwardModel."""
+        return cls()
+
+    @abstractmethod
+    def fit(self, rows: Rows, spec: Spec) -> FittedError:
+        """Return the error model fitted to rows with their residuals; it does not change itself.
+
+        Parameters
+        ----------
+        rows : Rows
+            Different rows, with the residuals of the mechanical model.
+        spec : Spec
+            The calibrated mechanical model, and whether errors of held-out rows are needed.
+        """
+
+
+class Learned(NamedTuple):
+    """What a description says of a fitted error model."""
+
+    kind: str | None  # class of the fitted error model, None without one
+    rejected: bool = False  # whether held-out errors were least without a correction
+    # Whether the noise is that of held-out rows, not of the training rows.
+    held_out: bool = True
+
+
+@dataclass(frozen=True)
+class FittedError:
+    """A fitted error model.
+
+    Attributes
+    ----------
+    result : estimator, ReadoutFit, FittedBlend, tuple or None
+        What `HybridForwardModel.error_model_` shows; a tuple holds one for each marker.
+    corrections : list of list of (float, TipCorrection)
+        Weights and corrections of every marker.
+    settled : ErrorModel
+        The error model with the settings that were chosen, for fits to other rows.
+    noise : float
+        Standard deviation of one coordinate of the residual that remains [m]. NaN: not computed.
+    rejected : bool
+        Whether the errors on held-out rows were least without a correction.
+    held_out : bool
+        Whether `noise` is that of held-out rows, not of the training rows.
+    comparison : dict or None
+        Of "auto": `HybridForwardModel.cv_results_`.
+    candidates : dict of str to Hybrid, or None
+        Of "auto": every candidate, fitted to all rows.
+    """
+
+    result: Any
+    corrections: list[Weighted]
+    settled: ErrorModel
+    noise: float = nan
+    rejected: bool = False
+    held_out: bool = False
+    comparison: dict[str, Any] | None = None
+    candidates: dict[str, Hybrid] | None = None
+
+    @property
+    def learned(self) -> Learned:
+        """What a description says of it."""
+        kind = self.result[0] if type(self.result) is tuple else self.result
+        name = None if kind is None else type(kind).__name__
+        return Learned(name, self.rejected, self.held_out)
+
+
+@dataclass(frozen=True)
+class Spec:
+    """Specification of a fit: the resolved settings of a HybridForwardModel."""
+
+    mechanical: ForwardModel | None
+    error_model: ErrorModel
+    calibrate: tuple[str, ...] | str = ()  # geometry to calibrate, or "auto"
+    guard: str | None = "leverage"
+    output: str = "position"
+    geometry: GeometryChoice | None = None  # how `calibrate` was chosen
+    calibration: CalibrationResult | None = None  # how `mechanical` was calibrated
+    messages: tuple[str, ...] = ()  # warnings of that choice and calibration
+    held_out: bool = True  # whether errors of held-out rows are computed
+    # Of the commands, with backlash between them and the rows.
+    commanded: Directions | None = None
+    progress: Callable[[int, int], None] | None = None  # gets (done, total)
+
+    def with_geometry_chosen(
+        self, rows: Rows, geometry: GeometryChoice | None = None
+    ) -> Spec:
+        """Return the specification with the parameters to calibrate, chosen on the rows or given.
+
+        For a list and an error model that chooses, a plain chain is compared with elastic tendons.
+        """
+        automatic = self.calibrate == "auto"
+        if not self.calibrate or not (automatic or self.error_model.chooses):
+            return self
+        if geometry is None:
+            geometry = choose_geometry(
+                cast(Chain, self.mechanical),
+                rows.q,
+                self.positions(rows),
+                groups=rows.groups,
+                weights=rows.weights,
+                outside=self.error_model.learns,
+                parameters=None if automatic else self.calibrate,
+            )
+        return replace(
+            self,
+            mechanical=geometry.chain,
+            calibrate=geometry.parameters,
+            geometry=geometry,
+            messages=geometry.messages,
+        )
+
+    def calibrated(self, rows: Rows) -> Spec:
+        """Return the specification with the model calibrated; its `cv_rmse` holds out groups."""
+        spec = self
+        if spec.geometry is None:
+            spec = self.with_geometry_chosen(rows)
+        if not spec.calibrate:
+            return spec
+        if spec.geometry is not None and not spec.held_out:
+            return replace(spec.recalibrated(rows), calibrate=())
+        result, messages = fit_geometry(
+            cast(Chain, spec.mechanical),
+            rows.q,
+            spec.positions(rows),
+            spec.calibrate,
+            # A comparison of models computes errors of held-out rows itself.
+            groups=None if spec.error_model.chooses else rows.groups,
+            sample_weight=rows.weights,
+            start=None if spec.geometry is None else spec.geometry.start,
+        )
+        return replace(
+            spec,
+            mechanical=result.chain,
+            calibrate=(),
+            calibration=result,
+            messages=(*spec.messages, *messages),
+        )
+
+    def recalibrated(self, rows: Rows) -> Spec:
+        """Return the specification calibrated to other rows, without errors of held-out rows."""
+        spec = replace(self, held_out=False)
+        if self.geometry is None or self.geometry.start is None:
+            return spec
+        counts = torch.from_numpy(rows.counts)
+        chain = refitted(self.geometry.start, rows.q, self.positions(rows), counts)
+        return replace(spec, mechanical=chain)
+
+    def positions(self, rows: Rows) -> Tensor:
+        """Return the tip positions (N, 3) of rows, which may be poses [m]."""
+        pose = self.output == "pose"
+        return torch.from_numpy(rows.tips[:, :3] if pose else rows.tips)
+
+    def by_marker(self, rows: Rows) -> list[tuple[Rows, Spec]]:
+        """Return the rows and the specification of every marker; a single tip is one marker."""
+        tips = [self.mechanical]
+        if isinstance(self.mechanical, ArcChain):
+            tips = self.mechanical.tips()
+        elif self.mechanical is None and np.isnan(rows.tips).any():
+            tips = [None] * (rows.tips.shape[1] // 3)
+        if len(tips) == 1:
+            return [(rows, self)]
+        return [
+            (rows.marker(k), replace(self, mechanical=tip))
+            for k, tip in enumerate(tips)
+        ]
+
+
+def residuals(
+    mechanical: ForwardModel | None, q: Tensor, y: NDArray, output: str
+) -> NDArray:
+    """Return the residual, measured minus mechanical model, in the form that is learned [m]."""
+    if mechanical is None:
+        return y
+    if output == "pose":
+        return pose_errors(cast(PoseModel, mechanical), q, y)
+    with torch.no_grad():
+        tips = mechanical(q).numpy()
+    if not countable(tips).all():
+        raise too_far()
+    if tips.shape != (y.shape if y.ndim == 2 else (len(y), 1)):
+        raise ValueError(
+            f"`y` must have {tips.shape[1]} columns, as many as `mechanical_model` gives, got "
+            f"shape {y.shape}."
+        )
+    return y - tips.reshape(y.shape)
