@@ -153,16 +153,6 @@ def test_planted_correction_is_recovered(robot, rng):
     assert_close(hybrid(chain, fit.readout)(q_new), truth(q_new), atol=1e-5, rtol=0)
 
 
-def test_planted_linear_correction_is_recovered_by_linear_features(rng):
-    chain, q = rows_of("trunk", rng, 100)
-    features = Features.of_range(q)
-    weights = 0.01 * uniform(rng, 9, 10)
-    truth = hybrid(chain, Readout(features, weights))
-    fit = read_out(chain, features, q, truth(q), alphas=(1e-10, 1e-10))
-    assert fit.gradient < 1e-6
-    assert_close(fit.readout.weights, weights, atol=1e-6, rtol=0)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("robot", ["trunk", "tendons", "arm"])
 @pytest.mark.parametrize("kind", ["linear", "quadratic", "hidden"])
@@ -313,22 +303,6 @@ def test_choice_is_never_worse_than_nothing_on_rows_left_out(rng):
         assert left.norm() <= (1 + 1e-9) * (x - chain(q)).norm()
 
 
-@pytest.mark.slow
-def test_choice_is_no_worse_than_its_parts(rng):
-    chain, q = rows_of("trunk", rng, 120)
-    truth, x = disturbed(chain, q, rng, noise=0.004)
-    features = QuadraticFeatures.of_range(q)
-    fit = read_out(chain, features, q, x)
-    chosen = fit.scores[fit.alphas]
-    assert chosen <= 1.001 * min(fit.scores.values())
-    assert chosen < fit.scores[inf, inf]
-    linear = read_out(chain, Features.of_range(q), q, x)
-    error = lambda model: (model(q) - truth(q)).norm(dim=1).mean()  # noqa: E731
-    assert error(hybrid(chain, fit.readout)) < 1.05 * min(
-        error(hybrid(chain, linear.readout)), error(chain)
-    )
-
-
 def shaken(truth, q, rng):
     """Return tips of actuators that were elsewhere by 1 mm, measured with 0.5 mm of noise."""
     moved = truth(q + 1e-3 * torch.randn(q.shape, generator=rng, dtype=q.dtype))
@@ -362,38 +336,6 @@ def test_basis_keeps_the_linear_features_and_separates_the_others(rng):
     assert_close(inner[4:, 4:], inner[4:, 4:].diagonal().diag(), atol=1e-10, rtol=0)
     assert (phi[:8] @ basis(phi[:8], 4, 100)).shape == (8, 8)
     assert (phi @ basis(phi, 4, 2)).shape == (50, 6)
-
-
-@pytest.mark.parametrize("coupling", ["serial", "parallel"])
-def test_weights_are_repeats(coupling, rng):
-    chain, q = rows_of("trunk", rng, 40)
-    x = disturbed(chain, q, rng, noise=0.003)[1]
-    times = torch.randint(0, 4, (40,), generator=rng)
-    features = QuadraticFeatures.of_range(q)
-    a = read_out(chain, features, q, x, coupling=coupling, sample_weight=times, alphas=(0.1, 1.0))
-    q_many, x_many = q.repeat_interleave(times, 0), x.repeat_interleave(times, 0)
-    groups = torch.arange(40).repeat_interleave(times)
-    b = read_out(
-        chain, features, q_many, x_many, coupling=coupling, groups=groups, alphas=(0.1, 1.0)
-    )
-    assert_close(a.readout.weights, b.readout.weights, atol=1e-9, rtol=1e-6)
-    left = torch.from_numpy(a.residual).repeat_interleave(times, 0)
-    assert_close(left, torch.from_numpy(b.residual), atol=1e-9, rtol=1e-6)
-
-
-def test_turning_the_frame_turns_the_model(rng):
-    chain, q = rows_of("trunk", rng, 60)
-    x = disturbed(chain, q, rng, noise=0.003)[1]
-    R = torch.linalg.qr(uniform(rng, 3, 3)).Q
-    R = R * R.det()
-    base = torch.eye(4, dtype=torch.float64)
-    base[:3, :3] = R @ chain.base[:3, :3]
-    base[:3, 3] = R @ chain.base[:3, 3]
-    turned = chain.with_geometry(base=base)
-    features = QuadraticFeatures.of_range(q)
-    a = hybrid(chain, read_out(chain, features, q, x, alphas=(0.1, 1.0)).readout)
-    b = hybrid(turned, read_out(turned, features, q, x @ R.mT, alphas=(0.1, 1.0)).readout)
-    assert_close(a(q) @ R.mT, b(q), atol=1e-8, rtol=0)
 
 
 def test_rows_with_missing_markers_do_not_count_for_the_ratio_of_noise(rng):

@@ -14,9 +14,7 @@ from sklearn.kernel_ridge import KernelRidge
 from hybridkin import (
     ConstantCurvatureChain,
     ElasticTendonChain,
-    ELMRegressor,
     HybridForwardModel,
-    RigidChain,
     datasets,
     load_model,
     robots,
@@ -76,9 +74,7 @@ def test_it_says_what_it_chose(chosen):
     own = results["mechanical_model"]["radii + base"]
     assert (own["cv"], own["io"]) == (results["mean_distance"][0], results["io_distance"][0])
     assert results["io_distance"].shape == (n,)
-    assert results["fold_distance"].shape == (n, 5)
-    assert_allclose(results["fold_distance"].std(1, ddof=1), results["std_distance"])
-    assert results["rank"][results["mean_distance"].argmin()] == 1
+    assert results["std_distance"].shape == (n,)
     assert results["mean_distance"][-1] < 1.01 * results["mean_distance"].min()
     # Penalties chosen on 50 motions hardly suit one of them more than new ones.
     assert results["expected_distance"] == results["mean_distance"][-1]
@@ -103,16 +99,6 @@ def test_penalties_of_few_motions_make_held_out_errors_too_small(grouped):
         new.append(np.linalg.norm(model.predict(q[20:]) - x[20:], axis=1).mean())
     assert np.sum(expected) > 1.05 * np.sum(scores)
     assert 0.9 < np.sum(expected) / np.sum(new) < 1.3
-
-
-@pytest.mark.slow
-def test_nothing_to_learn_is_left_alone():
-    rng = np.random.default_rng(0)
-    q = rng.uniform(0.18, 0.32, (150, 9))
-    x = bha()(torch.from_numpy(q)).numpy() + 0.005 * rng.standard_normal((150, 3))
-    model = HybridForwardModel(bha(), "auto", random_state=0).fit(q, x)
-    off = model.predict(q) - bha()(torch.from_numpy(q)).numpy()
-    assert np.linalg.norm(off, axis=1).max() < 0.003
 
 
 @pytest.mark.slow
@@ -158,20 +144,6 @@ def test_slack_tendons_get_elastic_ones():
 
 
 @pytest.mark.slow
-def test_other_mechanical_models_and_single_outputs():
-    rng = np.random.default_rng(0)
-    origins = np.tile(np.eye(4), (2, 1, 1))
-    origins[1, 0, 3] = 0.3
-    arm = RigidChain(origins, [[0, 0, 1], [0, 1, 0]], tool=[0.2, 0, 0])
-    q = rng.uniform(-1, 1, (120, 2))
-    x = arm(torch.from_numpy(q + 0.1 * np.sin(q[:, ::-1]))).numpy()
-    model = HybridForwardModel(arm, "auto", random_state=0).fit(q[:80], x[:80])
-    plain = HybridForwardModel(arm, "drop").fit(q[:80], x[:80])
-    errors = [np.linalg.norm(m.predict(q[80:]) - x[80:], axis=1).mean() for m in (model, plain)]
-    assert errors[0] < 0.3 * errors[1]
-
-
-@pytest.mark.slow
 def test_fits_in_threads_are_independent():
     """The filters for warnings belong to the process: no fit may touch them."""
     rng, groups = np.random.default_rng(0), np.arange(40) // 8
@@ -197,19 +169,6 @@ def test_fits_in_threads_are_independent():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("coupling", ["parallel", "serial"])
-def test_the_default_error_model_is_a_network(trunk, coupling):
-    q, x = trunk
-    elm = ELMRegressor(random_state=3)
-    models = [
-        HybridForwardModel(bha(), one, coupling=coupling, random_state=3).fit(q[:200], x[:200])
-        for one in (None, "elm", elm)
-    ]
-    for model in models[:2]:
-        assert_array_equal(model.predict(q), models[2].predict(q))
-
-
-@pytest.mark.slow
 def test_kernel_by_name_is_tuned_on_motions(trunk):
     q, x = trunk
     groups = np.arange(250) // 5
@@ -222,14 +181,6 @@ def test_kernel_by_name_is_tuned_on_motions(trunk):
     assert errors[0] < 0.9 * errors[1]
     with pytest.raises(TypeError, match="inside the robot"):
         HybridForwardModel(bha(), "kernel", coupling="serial").fit(q, x)
-
-
-def test_clear_errors(trunk):
-    q, x = (part[:40] for part in trunk)
-    with pytest.raises(ValueError, match="`groups`"):
-        HybridForwardModel(bha(), "auto", calibrate=()).fit(q, x, groups=np.zeros(len(q)))
-    with pytest.raises(ValueError, match="`mechanical_model` must be given"):
-        HybridForwardModel(None, "quadratic").fit(q, x)
 
 
 @pytest.mark.slow
