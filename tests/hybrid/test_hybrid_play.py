@@ -144,7 +144,7 @@ def test_measurements_go_on_where_the_last_ones_ended(log):
 def test_clear_errors(log):
     q, x, groups = log
     for play in (-1.0, "some", [0.01, 0.02]):
-        with pytest.raises(ValueError, match="play|width"):
+        with pytest.raises(ValueError, match=r"play|width"):
             HybridForwardModel(CHAIN, "drop", play=play).fit(q, x)
     with pytest.warns(UserWarning, match="less than the range"):
         HybridForwardModel(CHAIN, "drop", play=0.5).fit(q, x)
