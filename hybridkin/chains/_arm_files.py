@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypedDict
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from hybridkin._core.arrays import Numbers, Transform
 
@@ -40,7 +40,7 @@ class Joint(NamedTuple):
 
     origin: NDArray
     kind: str = "fixed"
-    axis: ArrayLike = (0.0, 0.0, 1.0)
+    axis: NDArray = np.array([0.0, 0.0, 1.0])
     actuator: Hashable = None  # joints of the same actuator move together
     name: str = ""  # of the actuator
     limits: tuple[float, float, float] = UNLIMITED  # of the actuator: low, high, speed

@@ -31,10 +31,9 @@ _MOST = 64  # segments of a robot, actuators of a segment
 # of positive numbers, and of all; others are mistakes
 _LEAST = 1e-18
 _LARGEST = 1e9
-_DOTS = 600  # between two commas; the time for a key grows with the square of its dots
-_BYTES = (
-    30_000  # of a file; the time to read hostile TOML grows with the square of its size
-)
+# The time to read hostile TOML grows with the squares of these.
+_DOTS = 600  # between two commas
+_BYTES = 30_000  # of a file
 _Test = Callable[[Any], bool]
 
 
@@ -149,19 +148,15 @@ def read_tables(path: Path) -> dict[str, Any]:
 
 
 def _check(table: Mapping[str, Any], kind: str, where: str) -> None:
-    rows = [
-        (keys.split(), (words, fits))
-        for name, keys, words, fits in _ROWS
-        if name == kind
-    ]
-    needs = {key: need for keys, need in rows for key in keys}
+    needs: dict[str, tuple[str, _Test]] = {}
+    for name, keys, words, fits in _ROWS:
+        if name == kind:
+            needs |= dict.fromkeys(keys.split(), (words, fits))
     for key, value in table.items():
         if key not in needs:
-            close = difflib.get_close_matches(key, needs, n=1)
-            if close:
+            hint = f"known: {sorted(needs)}."
+            if close := difflib.get_close_matches(key, needs, n=1):
                 hint = f"did you mean `{close[0]}`?"
-            else:
-                hint = f"known: {sorted(needs)}."
             raise ValueError(f"`{key:.40}` in {where} is not known; {hint}")
         words, fits = needs[key]
         if not fits(value):
@@ -172,18 +167,12 @@ def _check(table: Mapping[str, Any], kind: str, where: str) -> None:
 def chain_of(tables: Mapping[str, Any]) -> ConstantCurvatureChain | ElasticTendonChain:
     """Return the chain of a description with segments."""
     elastic = tables.get("model", _PLAIN) == _ELASTIC
-    segments: list[dict[str, Any]] = []
+    # Without a unit in [log], angles are in radians and others are unknown.
     unit = tables.get("log", {"q_unit": "rad"}).get("q_unit", "1")
+    segments: list[dict[str, Any]] = []
     for i, table in enumerate(tables["segment"]):
-        unused = [] if elastic else [key for key in _STIFFNESS if key in table]
-        if unused:
-            raise ValueError(
-                f"`{unused[0]}` in [[segment]] is not a key of model {_PLAIN!r}; remove it, or "
-                f'set model = "{_ELASTIC}".'
-            )
-        segments += [
-            _segment(table, f"[[segment]] {i + 1}", elastic, unit)
-        ] * table.get("repeat", 1)
+        segment = _segment(table, f"[[segment]] {i + 1}", elastic, unit)
+        segments += [segment] * table.get("repeat", 1)
     if len(segments) > _MOST:
         raise ValueError(
             f"[[segment]] must describe at most {_MOST} segments in all, got "
@@ -192,31 +181,43 @@ def chain_of(tables: Mapping[str, Any]) -> ConstantCurvatureChain | ElasticTendo
     arguments: dict[str, Any] = {
         key: [segment[key] for segment in segments] for key in segments[0]
     }
-    for key in ("gains", *(("length", *_STIFFNESS) if elastic else ())):
-        missing = [i + 1 for i, value in enumerate(arguments[key]) if value is None]
-        needed = key == "length"
-        if missing and (needed or len(missing) < len(segments)):
-            raise ValueError(
-                f"`{key}` must be in every [[segment]]{'' if needed else ' or in none'}, but is "
-                f"missing for segment {missing[0]}."
-            )
-        arguments[key] = None if missing else arguments[key]
-    arguments |= {
-        "lengths": arguments.pop("length"),
-        "base": _base(tables.get("base", {})),
-    }
-    arguments["gains"] = arguments["gains"] or 1.0
-    arguments |= {"routing": tables["routing"]} if "routing" in tables else {}
+    for key in ("gains", *_STIFFNESS):
+        if key in arguments:
+            arguments[key] = _all_or_none(arguments[key], key)
+    if arguments["gains"] is None:
+        arguments["gains"] = 1.0
+    if elastic and None in arguments["lengths"]:
+        missing = arguments["lengths"].index(None) + 1
+        raise ValueError(
+            f"`length` must be in every [[segment]], but is missing for segment {missing}."
+        )
     stages = arguments.pop("stage")
     if "rotation" in stages[1:]:
         raise ValueError('`stage` "rotation" is only allowed in the first [[segment]].')
-    arguments |= {"stage": "rotation"} if stages[0] == "rotation" else {}
-    # For stages it has no effect.
+    if stages[0] == "rotation":
+        arguments["stage"] = "rotation"
+    # The radius of a stage has no effect.
     any_radius = next(filter(None, arguments["radii"]), 1.0)
     arguments["radii"] = [radius or any_radius for radius in arguments["radii"]]
+    arguments["base"] = _base(tables.get("base", {}))
+    if "routing" in tables:
+        arguments["routing"] = tables["routing"]
     if elastic:
         return ElasticTendonChain(**arguments)
     return ConstantCurvatureChain(**arguments)
+
+
+def _all_or_none(values: list[Any], key: str) -> list[Any] | None:
+    """Return the entries of a key that all segments have, or None if none has it."""
+    missing = [i + 1 for i, value in enumerate(values) if value is None]
+    if len(missing) == len(values):
+        return None
+    if missing:
+        raise ValueError(
+            f"`{key}` must be in every [[segment]] or in none, but is missing for segment "
+            f"{missing[0]}."
+        )
+    return values
 
 
 def _segment(
@@ -230,6 +231,11 @@ def _segment(
         raise ValueError(
             f"`stage` in {where} can only be combined with `offset`, `zeros` and `gain`, and not "
             f"with model {_ELASTIC!r}."
+        )
+    if not elastic and {*_STIFFNESS} & {*table}:
+        raise ValueError(
+            f"`bending_stiffness` and `axial_stiffness` in {where} belong to another model; remove "
+            f'them, or set model = "{_ELASTIC}".'
         )
     if "radius" not in table and stage is None:
         raise ValueError(
@@ -250,29 +256,35 @@ def _segment(
     zeros = each(table, "zeros", where, n)
     if gains is not None and not elastic:  # in the unit of the log
         zeros *= UNITS.get(unit, 1.0)
-    return {
+    arguments = {
         "radii": table.get("radius"),
         "stage": stage,
-        "length": table.get("length"),
+        "lengths": table.get("length"),
         "offsets": table.get("offset", 0.0),
-        "n_actuators": len(angles),
+        "n_actuators": n,
         "angles": angles,
         "rest_bends": np.radians(table.get("rest_bend_deg", [0.0, 0.0])),
-        "tendon_zeros" if elastic else "actuator_zeros": zeros,
         "gains": gains,
-        **{key: table.get(key) for key in _STIFFNESS if elastic},
     }
+    if elastic:
+        arguments["tendon_zeros"] = zeros
+        arguments |= {key: table.get(key) for key in _STIFFNESS}
+    else:
+        arguments["actuator_zeros"] = zeros
+    return arguments
 
 
 def _gains(
     table: Mapping[str, Any], where: str, n: int, unit: str
 ) -> np.ndarray | None:
     """Return metres per unit of q (n,), for angles per radian; None if q is in metres."""
-    gains, spools = (each(table, key, where, n) for key in ("gain", "spool_radius"))
+    gains = each(table, "gain", where, n)
+    spools = each(table, "spool_radius", where, n)
     spun = spools.any()
-    if not (spun or gains.any()):
+    if not spun and not gains.any():
         return None
-    if unit in METRES or (spun and (unit not in ("deg", "rad") or gains.any())):
+    wrong_spool = spun and (unit not in ("deg", "rad") or gains.any())
+    if unit in METRES or wrong_spool:
         raise ValueError(
             f"`gain` or `spool_radius` in {where} needs a `q_unit` in [log] that is not a "
             f'length, `spool_radius` needs "deg" or "rad" and no `gain`, got {unit!r}.'

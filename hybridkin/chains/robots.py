@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -112,10 +111,11 @@ class LogFormat:
     @property
     def reading(self) -> dict[str, Any]:
         """The arguments of `datasets.load_log` for this format."""
-        unit = self.q_unit if self.q_unit in UNITS else "1"
-        return {k: v for k, v in vars(self).items() if k != "group_suffix"} | {
-            "q_unit": unit
-        }
+        arguments = dict(vars(self))
+        del arguments["group_suffix"]
+        if self.q_unit not in UNITS:
+            arguments["q_unit"] = "1"
+        return arguments
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,34 +137,40 @@ class Limits:
 
     def intersect(self, other: Limits) -> Limits:
         """Return the intersection of two limits; an entry that is None sets no limit."""
-        tighter_limits = {}
-        for name, mine in vars(self).items():
-            limits = [limit for limit in (mine, vars(other)[name]) if limit is not None]
-            tighter = np.maximum if name == "q_min" else np.minimum
-            tighter_limits[name] = functools.reduce(tighter, limits) if limits else None
-        return Limits(**tighter_limits)
+        return Limits(
+            _tighter(self.q_min, other.q_min, np.maximum),
+            _tighter(self.q_max, other.q_max, np.minimum),
+            _tighter(self.dq_max, other.dq_max, np.minimum),
+            _tighter(self.ddq_max, other.ddq_max, np.minimum),
+        )
 
     def scaled(self, factor: float | np.ndarray) -> Limits:
         """Return the limits in other units; a negative `factor` swaps low and high."""
-        ends = [
-            np.multiply(factor, side if value is None else value)
-            for value, side in ((self.q_min, -np.inf), (self.q_max, np.inf))
-        ]
-        low = np.minimum(*ends)
-        high = np.maximum(*ends)
+        low = np.multiply(factor, -np.inf if self.q_min is None else self.q_min)
+        high = np.multiply(factor, np.inf if self.q_max is None else self.q_max)
+        q_min = np.minimum(low, high)
+        q_max = np.maximum(low, high)
+        size = np.abs(factor)
         return Limits(
-            None if np.isinf(low).all() else low,
-            None if np.isinf(high).all() else high,
-            None if self.dq_max is None else np.multiply(np.abs(factor), self.dq_max),
-            None if self.ddq_max is None else np.multiply(np.abs(factor), self.ddq_max),
+            None if np.isinf(q_min).all() else q_min,
+            None if np.isinf(q_max).all() else q_max,
+            None if self.dq_max is None else size * self.dq_max,
+            None if self.ddq_max is None else size * self.ddq_max,
         )
 
     def narrowed(self, by: float | np.ndarray) -> Limits:
         """Return the limits with the range of every actuator reduced by `by` at both ends [m]."""
-        low = self.q_min
-        high = self.q_max
-        ends = None if low is None else low + by, None if high is None else high - by
-        return replace(self, q_min=ends[0], q_max=ends[1])
+        q_min = None if self.q_min is None else self.q_min + by
+        q_max = None if self.q_max is None else self.q_max - by
+        return replace(self, q_min=q_min, q_max=q_max)
+
+
+def _tighter(
+    ours: NDArray | None, theirs: NDArray | None, choose: np.ufunc
+) -> NDArray | None:
+    if ours is None or theirs is None:
+        return theirs if ours is None else ours
+    return choose(ours, theirs)
 
 
 @dataclass(frozen=True)
@@ -354,29 +360,32 @@ def _description(tables: Mapping[str, Any], stem: str) -> RobotDescription:
             "`segment` is missing; describe each segment in a [[segment]] table. For a model of "
             "data alone give [log] without `model`, `routing`, `calibrate` and `base`."
         )
-    log = _log_format(tables["log"], chain) if "log" in tables else None
-    markers = tables.get("log", {}).get("markers")
-    if log is not None and len(log.x) != 3 * len((chain and markers) or [0]):
-        raise ValueError(
-            f"`x` in [log] must hold 3 column names, or 3 for each of `markers`, got {log.x}."
-        )
-    if markers and chain is not None:
-        chain = chain.with_markers([(k, at, beside) for k, at, *beside in markers])
-    names = () if chain is None else tables.get("calibrate", "auto")
-    geometry_names = () if chain is None else (*chain.geometry(), *ALIASES)
-    if names == "default" and chain is not None:
-        names = chain.default_parameters
-    if names != "auto" and (
-        not {*names} <= {*geometry_names} or len({*names}) < len(names)
-    ):
-        raise ValueError(
-            f"`calibrate` must name different entries of {geometry_names}, or be "
-            f'"auto" or "default", got {names}.'
-        )
-    if not isinstance(names, str):
-        names = tuple(names)
+    if chain is not None and tables.get("log", {}).get("markers"):
+        places = tables["log"]["markers"]
+        chain = chain.with_markers([(k, at, beside) for k, at, *beside in places])
+    log = None
+    if "log" in tables:
+        log = _log_format(tables["log"], chain)
+    names: tuple[str, ...] | str = ()
+    if chain is not None:
+        names = _calibrated(tables.get("calibrate", "auto"), chain)
     robot = RobotDescription(tables.get("name", stem), chain, names, log)
     return replace(robot, limits=_limits(tables.get("limits", {}), robot))
+
+
+def _calibrated(names: list[str] | str, chain: ArcChain) -> tuple[str, ...] | str:
+    """Return the parameters of the chain to fit to data, or "auto"."""
+    if names == "auto":
+        return "auto"
+    if names == "default":
+        return chain.default_parameters
+    known = (*chain.geometry(), *ALIASES)
+    if not {*names} <= {*known} or len({*names}) < len(names):
+        raise ValueError(
+            f'`calibrate` must name different entries of {known}, or be "auto" or "default", '
+            f"got {names}."
+        )
+    return tuple(names)
 
 
 def _log_format(table: Mapping[str, Any], chain: ArcChain | None) -> LogFormat:
@@ -389,30 +398,31 @@ def _log_format(table: Mapping[str, Any], chain: ArcChain | None) -> LogFormat:
             f"`q` in [log] must name {chain.n_actuators} columns, one for each actuator of the "
             f"[[segment]] tables, got {len(table['q'])}: {table['q']}."
         )
-    columns = [
-        *table["q"],
-        *table["x"],
-        *(table[key] for key in _COLUMNS if key in table),
-    ]
-    if doubled := sorted({name for name in columns if columns.count(name) > 1}):
+    n_outputs = 3 if chain is None else chain.n_outputs
+    if len(table["x"]) != n_outputs:
         raise ValueError(
-            f"[log] must name every column once, got {doubled} repeatedly."
+            f"`x` in [log] must hold 3 column names, or 3 for each of `markers`, got {table['x']}."
         )
-    given: dict[str, Any] = {
-        k: tuple(v) if isinstance(v, list) else v for k, v in table.items()
-    }
-    given.pop("markers", None)
-    gained = chain is not None and not chain.in_metres
-    unit = given.setdefault("q_unit", "1" if gained else "m")
+    columns = [*table["q"], *table["x"]]
+    columns += [table[key] for key in _COLUMNS if key in table]
+    if len({*columns}) < len(columns):
+        raise ValueError(f"[log] must name every column once, got {columns}.")
+    settings = dict(table)
+    settings.pop("markers", None)
+    for key, value in settings.items():
+        if isinstance(value, list):
+            settings[key] = tuple(value)
+    in_metres = chain is None or chain.in_metres
+    unit = settings.setdefault("q_unit", "m" if in_metres else "1")
     units = [*UNITS] if chain is None else [*METRES]
-    if not gained and unit not in units:
+    if in_metres and unit not in units:
         raise ValueError(
             f'`q_unit` in [log] must be one of {units}; for motors "deg" or "rad", with a '
             "`spool_radius` [m] in every [[segment]]; for pressures or other units any name, with "
             f"a `gain` [m per unit] instead; got {unit!r}."
         )
     each(table, "q_sign", "[log]", len(table["q"]))
-    return LogFormat(**given)
+    return LogFormat(**settings)
 
 
 def _limits(table: Mapping[str, Any], robot: RobotDescription) -> Limits:
@@ -428,11 +438,9 @@ def _limits(table: Mapping[str, Any], robot: RobotDescription) -> Limits:
         why = "without [[segment]]" if robot.chain is None else "with gains"
     if values and unit != need:
         raise ValueError(f'`unit` in [limits] must be "{need}" {why}, got "{unit}".')
-    limits = Limits(
-        **{key: each(values, key, "[limits]", robot.n_actuators) for key in values}
-    )
-    low = limits.q_min
-    high = limits.q_max
-    if low is not None and high is not None and (low > high).any():
-        raise ValueError("`q_min` in [limits] must not exceed `q_max`; swap them.")
+    arrays = {key: each(values, key, "[limits]", robot.n_actuators) for key in values}
+    limits = Limits(**arrays)
+    if limits.q_min is not None and limits.q_max is not None:
+        if (limits.q_min > limits.q_max).any():
+            raise ValueError("`q_min` in [limits] must not exceed `q_max`; swap them.")
     return limits if log is None or unit == "m" else limits.scaled(log.q_factor)

@@ -330,7 +330,8 @@ class ELMRegressor(FittedNetwork):
                 self._refuse(name.rstrip("_"))
         if self.module_.activation != other.module_.activation:
             self._refuse("activation")
-        if self.output_weights_.shape != other.output_weights_.shape:
+        shape = self.module_.output_weights.shape
+        if shape != other.module_.output_weights.shape:
             self._refuse("shape of output_weights_ (`direct_link`, columns of `y`)")
         return self._solve(merge(self._stats, other._stats), self.module_)
 

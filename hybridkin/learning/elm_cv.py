@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from itertools import product
 from numbers import Integral
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from sklearn.base import _fit_context
@@ -366,8 +366,8 @@ def _relevance(best, search):
     """
     model = ELMRegressor(**best.params)
     model.fit(search.X, search.targets, search.sample_weight)
-    center = model.input_center_
-    scale = model.input_scale_ * best.relevance
+    center = model.module_.input_center.numpy(force=True)
+    scale = model.module_.input_scale.numpy(force=True) * best.relevance
     total = 0.0
     squares = 0.0
     for batch in gen_batches(len(search.X), _ROWS_OF_JACOBIANS):
@@ -404,7 +404,7 @@ def _splits(cv, groups, n_rows, place):
     if not _is_listed(cv):
         place = np.arange(n_rows)
     rows = np.arange(len(place))
-    splitter = check_cv(cv)  # pyright: ignore[reportArgumentType]
+    splitter: Any = check_cv(cv)  # pyright: ignore[reportArgumentType]
     with TURNS.filters:
         all_splits = [*splitter.split(rows, rows, groups)]
     splits = []

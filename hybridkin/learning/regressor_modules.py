@@ -49,7 +49,7 @@ def error_module(regressor: Regressor, q: Tensor) -> ForwardModel:
     """
     if isinstance(regressor, Fitted):
         return as_forward_model(regressor)
-    steps = [regressor]
+    steps: list[Any] = [regressor]
     if isinstance(regressor, Pipeline):
         steps = [*regressor.named_steps.values()]
     # u = (q - center) / scale of all scalers in front
@@ -61,8 +61,8 @@ def error_module(regressor: Regressor, q: Tensor) -> ForwardModel:
         scale = scale * slope
     readout = steps[-1]
     if len(steps) == 1 and isinstance(readout, _LINEAR):
-        coef = np.atleast_2d(readout.coef_) / scale
-        return AffineModule(coef, readout.intercept_ - coef @ center)
+        coef, intercept = _line(readout)
+        return AffineModule(coef / scale, intercept - coef / scale @ center)
     if len(steps) == 1 and type(readout) is KernelRidge and readout.kernel == "rbf":
         return _kernel_module(readout, center, scale)
     if (
@@ -70,12 +70,17 @@ def error_module(regressor: Regressor, q: Tensor) -> ForwardModel:
         and isinstance(steps[0], PolynomialFeatures)
         and isinstance(readout, _LINEAR)
     ):
-        coef = np.atleast_2d(readout.coef_)
+        coef, intercept = _line(readout)
         # The intercept is a monomial.
         powers = np.pad(steps[0].powers_, ((1, 0), (0, 0)))
-        constant = np.broadcast_to(readout.intercept_, len(coef))
-        return PolynomialModule(powers, np.vstack([constant, coef.T]), center, scale)
+        return PolynomialModule(powers, np.vstack([intercept, coef.T]), center, scale)
     return RegressorModule(regressor, q)
+
+
+def _line(fitted: Any) -> tuple[NDArray, NDArray]:
+    """Return coefficients (m, n) and intercept (m,) of a linear regressor."""
+    coef = np.atleast_2d(fitted.coef_)
+    return coef, np.broadcast_to(fitted.intercept_, len(coef))
 
 
 def _is_affine(step: object) -> bool:
@@ -84,20 +89,16 @@ def _is_affine(step: object) -> bool:
     return isinstance(step, StandardScaler)
 
 
-def _affine(
-    scaler: StandardScaler | MinMaxScaler,
-) -> tuple[NDArray | float, NDArray | float]:
+def _affine(scaler: Any) -> tuple[NDArray, NDArray]:
     """Return center and scale of a fitted scaler, u = (q - center) / scale."""
-    if isinstance(scaler, MinMaxScaler):
+    if hasattr(scaler, "min_"):  # a MinMaxScaler
         return -scaler.min_ / scaler.scale_, 1.0 / scaler.scale_
-    center = scaler.mean_ if scaler.with_mean else 0.0
-    scale = scaler.scale_ if scaler.with_std else 1.0
+    center = scaler.mean_ if scaler.with_mean else np.array(0.0)
+    scale = scaler.scale_ if scaler.with_std else np.array(1.0)
     return center, scale
 
 
-def _kernel_module(
-    fitted: KernelRidge, center: NDArray, scale: NDArray
-) -> KernelModule:
+def _kernel_module(fitted: Any, center: NDArray, scale: NDArray) -> KernelModule:
     rows = fitted.X_fit_
     gamma = fitted.gamma
     if gamma is None:

@@ -254,36 +254,6 @@ def test_elastic_tendons_by_default(write):
     assert robot.calibrate == ("base",)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (('model = "elastic-tendon"', ""), "`bending_stiffness` in .* not a key of model"),
-        (("length = 0.05\n", ""), "`length` must be in every .* missing for segment 3"),
-        (("axial_stiffness = 4\n", ""), "`axial_stiffness` must be in every"),
-        (("bending_stiffness = 1e-6\n", ""), "`bending_stiffness` must be in every"),
-        (
-            ("axial_stiffness = 4", "axial_stiffness = 'soft'"),
-            "`axial_stiffness` in .* a positive number",
-        ),
-        (("axial_stiffness = 4", "axial_stifness = 4"), "did you mean `axial_stiffness`"),
-        (
-            ("axial_stiffness = 4", "axial_stiffness = -4"),
-            "`axial_stiffness` in .* positive number",
-        ),
-        (("zeros = [0.001, 0, -0.002]", "zeros = [0.001]"), "`zeros` in .* must hold 3"),
-        (
-            ('"elastic-tendon"', '"elastic"'),
-            "`model` in the file must be one of .*'elastic-tendon'",
-        ),
-        (("[[segment]]", "routing = 'tip'\n[[segment]]"), "`routing` in the file must be one of"),
-    ],
-)
-def test_bad_elastic_descriptions_name_the_key(write, change, message):
-    assert change[0] in ELASTIC
-    with pytest.raises(ValueError, match=message):
-        robots.read_description(write(ELASTIC.replace(*change, 1)))
-
-
 def test_defaults_are_chambers_named_after_the_file(write):
     robot = robots.read_description(write("[[segment]]\nradius = 0.1\n"))
     assert robot.name == "robot"
@@ -292,71 +262,6 @@ def test_defaults_are_chambers_named_after_the_file(write):
     assert robot.calibrate == "auto"
     by_list = robots.read_description(write("calibrate = 'default'\n[[segment]]\nradius = 0.1\n"))
     assert by_list.calibrate == ("radii", "base")
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("name = 'a'", "`segment` is missing"),
-        ("segment = 3", r"`segment` in the file must hold tables, .* \[\[segment\]\], got 3"),
-        ("name = ", "this is not a TOML file"),
-        ("[[segment]]\nlength = 1.0", "`radius` is missing in .*segment.* 1"),
-        ("[[segment]]\nradius = 0.1\nlenght = 0.2", "`lenght` in .* did you mean `length`"),
-        ("[[segment]]\nradius = '0.1'", "`radius` in .* must be a positive number"),
-        ("[[segment]]\nradius = -0.1", "`radius` in .* must be a positive number"),
-        ("[[segment]]\nangles_deg = [0, 180]", "`radius` is missing"),
-        ("[[segment]]\nradius = 0.1\nrest_bend_deg = [1]", "`rest_bend_deg` in .* 1 must hold 2"),
-        ("[[segment]]\nradius = 0.1\nrest_bend_deg = 90", "`rest_bend_deg` in .* must hold 2"),
-        ("[[segment]]\nradius = 0.1\nzeros = [0, 0]", "`zeros` in .*segment.* 1 must hold 3"),
-        ("[[segment]]\nradius = 0.1\nzeros = ['0', '0', '0']", "`zeros` in .* must hold numbers"),
-        ("[[segment]]\nradius = 0.1\nzeros = [0, [0], 0]", "`zeros` in .* must hold numbers"),
-        ("[[segment]]\nradius = 0.1\nzeros = [0, nan, 0]", "`zeros` in .* must hold numbers"),
-        ("[[segment]]\nradius = 0.1\n[base]\nposition = 'here'", "`position` in .* must hold 3"),
-        (
-            "model = 'elastic-tendon'\n[[segment]]\nradius = 0.1",
-            "`length` must be in every .* missing for segment 1",
-        ),
-        (
-            "[[segment]]\nradius = 1\nangles_deg = [0, 90, 200]\nangle_deg = 1\nactuators = 3",
-            "`actuators` cannot be combined with `angles_deg` in",
-        ),
-        ("[[segment]]\nstage = 'slide'", "`stage` in .* must be one of"),
-        ("[[segment]]\nstage = 'rotation'\nlength = 1", "combined with `offset`, `zeros`"),
-        (
-            "model = 'elastic-tendon'\n[[segment]]\nstage = 'rotation'",
-            "not with model",
-        ),
-        ("[[segment]]\nradius = 1\n[[segment]]\nstage = 'rotation'", "in the first"),
-        ("model = 'rigid'\n[[segment]]\nradius = 0.1", "`model` in the file must be"),
-        (
-            "calibrate = 'radii'\n[[segment]]\nradius = 0.1",
-            "`calibrate` in the file must be a list",
-        ),
-        ("[[segment]]\nradius = 0.1\n[base]\nposition = [1]", "`position` in .base. must hold 3"),
-        (
-            "[[segment]]\nradius = 0.1\n[log]\nq = ['a']\nx = ['x', 'y', 'z']",
-            "`q` in .log. must name 3",
-        ),
-        (
-            "[[segment]]\nradius = 0.1\n[log]\nq = ['a','b','c']\nx = ['x','y','z']\nq_unit = 'ft'",
-            "`q_unit` in .log. must be one of",
-        ),
-        (
-            "[[segment]]\nradius = 0.1\n[log]\nq = ['a','b','c']\nx = ['x','y','z']\ngroups = 3",
-            "`groups` in .log. must be text",
-        ),
-        ("[[segment]]\nradius = 0.1\n[limits]\nq_mni = 1", "did you mean `q_min`"),
-        ("[[segment]]\nradius = 0.1\n[limits]\nq_min = [1, 2]", "`q_min` in .* must hold 3"),
-        ("[[segment]]\nradius = 0.1\n[limits]\nq_min = 2\nq_max = 1", "must not exceed `q_max`"),
-        (
-            "[[segment]]\nradius = 0.1\n[limits]\ndq_max = 0",
-            "`dq_max` .* must be positive",
-        ),
-    ],
-)
-def test_bad_descriptions_name_the_key(write, text, message):
-    with pytest.raises(ValueError, match=message):
-        robots.read_description(write(text))
 
 
 def test_missing_file(tmp_path):
@@ -369,66 +274,72 @@ SPOOL, GAIN = SEGMENT + "spool_radius = 0.006\n", SEGMENT + "gain = 2e-5\n"
 LOG = "[log]\nq = ['a', 'b', 'c']\nx = ['x', 'y', 'z']\n"
 
 
+ELASTIC_SEGMENT = "model = 'elastic-tendon'\n" + SEGMENT
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (SEGMENT + "clockwise = 'false'", "`clockwise` in .* 1 must be true or false, got 'false'"),
-        (SEGMENT + "actuators = 2.5", "`actuators` in .* a whole number from 1 to 64, got 2.5"),
-        (SEGMENT + "actuators = 0", "`actuators` in .* a whole number from 1 to 64, got 0"),
-        (SEGMENT + "repeat = 1.9", "`repeat` in .* a whole number .* got 1.9"),
-        (SEGMENT + "repeat = 0", "`repeat` in .* a whole number .* got 0"),
-        (SEGMENT + "repeat = true", "`repeat` in .* a whole number .* got True"),
-        (SEGMENT + "repeat = inf", "`repeat` in .* a whole number .* got inf"),
-        (SEGMENT + "repeat = 1e12", "`repeat` in .* a whole number .* got 1000000000000"),
-        (SEGMENT + "repeat = 1000000", "`repeat` in .* a whole number .* got 1000000"),
-        ((SEGMENT + "repeat = 64\n") * 2, "at most 64 segments in all, got 128; check `repeat`"),
-        (SEGMENT + "angles_deg = [0, 120, nan]", "`angles_deg` in .* must hold numbers"),
-        (SEGMENT + "angles_deg = [[0, 120, 240]]", "`angles_deg` in .* must hold numbers"),
-        (SEGMENT + "angle_deg = inf", "`angle_deg` in .* must be a number, got inf"),
-        (SEGMENT + "offset = 1e300", "`offset` in .* must be a number"),
-        (SEGMENT.replace("0.1", "nan"), "`radius` in .* must be a positive number, got nan"),
-        (SEGMENT.replace("0.1", "true"), "`radius` in .* must be a positive number, got True"),
-        (SEGMENT.replace("0.1", "1" + 400 * "0"), "`radius` in .* must be a positive number"),
-        (SEGMENT + SEGMENT.replace("0.1", "1e-9"), "`radii` must be within a factor of 1000"),
-        (SEGMENT + "bending_stifness = 1", "did you mean `bending_stiffness`"),
-        ("calibrate = ['nope']\n" + SEGMENT, "`calibrate` must name different entries of .'radii'"),
-        ("calibrate = ['base', 'base']\n" + SEGMENT, "`calibrate` must name different entries of"),
-        ("calibrate = [1]\n" + SEGMENT, "`calibrate` in the file must be a list of names"),
-        ("name = 5\n" + SEGMENT, "`name` in the file must be text, got 5"),
-        ("model = ['a']\n" + SEGMENT, "`model` in the file must be one of"),
-        ("base = 3\n" + SEGMENT, "`base` in the file must be a table of keys, got 3"),
-        ("segment = [1, 2]", "`segment` in the file must hold tables"),
-        ("[segment]\nradius = 0.1", r"under the heading \[\[segment\]\]"),
-        (SEGMENT + LOG.replace("'b'", "'a'"), r"every column once, got \['a'\]"),
-        (SEGMENT + LOG.replace("'b'", "'x'"), r"every column once, got \['x'\]"),
-        (SEGMENT + LOG + "time = 'a'", r"every column once, got \['a'\]"),
-        (SEGMENT + LOG.replace("'a'", "1"), "`q` in .log. must hold names of columns"),
-        (SEGMENT + "[log]\nq = ['a', 'b', 'c']", "`q` or `x` is missing in .log."),
-        (SEGMENT + LOG + "groups = ''", "`groups` in .log. must be text"),
-        (SEGMENT + LOG + "q_sign = true", "`q_sign` in .log. must be 1 or -1"),
-        (SEGMENT + LOG + "q_sign = [1, -1]", "`q_sign` in .log. must hold 3 numbers"),
-        (SEGMENT + LOG + "q_unit = ['mm']", "`q_unit` in .log. must be text"),
-        (SEGMENT + LOG + "q_unit = 'deg'", "`q_unit` in .log. must be one of .* `spool_radius`"),
-        (SPOOL + LOG, '`spool_radius` needs "deg" or "rad" and no `gain`, got \'1\''),
-        (SPOOL + "gain = 1e-5\n" + LOG + "q_unit = 'deg'", "and no `gain`, got 'deg'"),
-        (GAIN + LOG + "q_unit = 'mm'", "a `q_unit` in .log. that is not a length, .* got 'mm'"),
-        (SEGMENT + "gain = 0.0", r"`gain` in \[\[segment\]\] 1 must be positive"),
-        (SEGMENT + "gain = [1, 2]", r"`gain` in \[\[segment\]\] 1 must hold 3 numbers"),
-        (GAIN + SEGMENT, r"`gains` must be in every \[\[segment\]\] or in none"),
-        (GAIN + LOG + "[limits]\nq_min = 0", 'must be "log" with gains, got "m"'),
-        (SEGMENT + "[limits]\nq_min = nan", "`q_min` in .limits. must be a number"),
-        (SEGMENT + "[limits]\nq_min = 0\nunit = 'log'", 'must be "m" without .log., got "log"'),
-        (LOG + "[limits]\nq_min = 0", 'must be "log" without ..segment.., got "m"'),
+        # what is missing, unknown or twice
+        ("name = 'a'", "`segment` is missing"),
         (LOG + "[base]", "`segment` is missing"),
-        (LOG.replace("z'", "'").replace(", '']", "]"), "`x` in .log. must hold 3 column names"),
-        ("x = " + 2000 * "[" + 2000 * "]", "this is not a TOML file: maximum recursion depth"),
-        ("x = " + 5000 * "1", "this is not a TOML file: .* digits"),
-        ("name." + 500 * "x." + "x = 1", "`name` in the file must be text, got {'x': {'x'"),
+        ("name = ", "not a TOML file"),
+        ("[[segment]]\nlength = 1.0", "`radius` is missing"),
+        ("[[segment]]\nradius = 0.1\nlenght = 0.2", "did you mean `length`"),
+        (ELASTIC_SEGMENT.replace("length = 1\n", ""), "`length` .* missing for segment 1"),
+        (ELASTIC_SEGMENT + "axial_stiffness = 4\n" + SEGMENT, "`axial_stiffness` .* for segment 2"),
+        (GAIN + SEGMENT, "`gains` must be in every"),
+        (SEGMENT + "[log]\nq = ['a', 'b', 'c']", "`q` or `x` is missing in .log."),
+        (SEGMENT + LOG.replace("'b'", "'x'"), "every column once"),
+        (SEGMENT + LOG + "time = 'a'", "every column once"),
+        # types and ranges
+        ("[segment]\nradius = 0.1", "`segment`"),
+        ("base = 3\n" + SEGMENT, "`base`"),
+        ("name = 5\n" + SEGMENT, "`name`"),
+        ("model = 'rigid'\n" + SEGMENT, "`model`"),
+        ("routing = 'tip'\n" + SEGMENT, "`routing`"),
+        ("calibrate = 'radii'\n" + SEGMENT, "`calibrate`"),
+        ("calibrate = ['base', 'base']\n" + SEGMENT, "`calibrate`"),
+        (SEGMENT.replace("0.1", "'0.1'"), "`radius`"),
+        (SEGMENT.replace("0.1", "nan"), "`radius`"),
+        (SEGMENT.replace("0.1", "true"), "`radius`"),
+        (SEGMENT.replace("0.1", "1" + 400 * "0"), "`radius`"),
+        (SEGMENT + SEGMENT.replace("0.1", "1e-9"), "`radii`"),
+        (SEGMENT + "clockwise = 'false'", "`clockwise`"),
+        (SEGMENT + "actuators = 2.5", "`actuators`"),
+        (SEGMENT + "repeat = true", "`repeat`"),
+        (SEGMENT + "repeat = 1000000", "`repeat`"),
+        ((SEGMENT + "repeat = 64\n") * 2, "at most 64 segments in all, got 128"),
+        (SEGMENT + "angles_deg = [[0, 120, 240]]", "`angles_deg`"),
+        (SEGMENT + "angles_deg = [0, 90, 200]\nactuators = 3", "cannot be combined"),
+        (SEGMENT + "rest_bend_deg = 90", "`rest_bend_deg`"),
+        (SEGMENT + "zeros = [0, 0]", "`zeros` .* must hold 3"),
+        (SEGMENT + "zeros = [0, nan, 0]", "`zeros`"),
+        (SEGMENT + "[base]\nposition = [1]", "`position`"),
+        (SEGMENT + "gain = 0.0", "`gain`"),
+        # what does not fit together
+        (SEGMENT + "axial_stiffness = 4", "`axial_stiffness` .* another model"),
+        ("[[segment]]\nstage = 'rotation'\nlength = 1", "can only be combined"),
+        (ELASTIC_SEGMENT + "[[segment]]\nstage = 'rotation'", "not with model"),
+        (SEGMENT + "[[segment]]\nstage = 'rotation'", "in the first"),
+        (SEGMENT + LOG.replace(", 'c'", ""), "`q` in .log. must name 3"),
+        (LOG.replace("z'", "'").replace(", '']", "]"), "`x` in .log. must hold 3"),
+        (SEGMENT + LOG + "q_sign = [1, -1]", "`q_sign`"),
+        (SEGMENT + LOG + "q_unit = 'deg'", "`q_unit` .* `spool_radius`"),
+        (SPOOL + "gain = 1e-5\n" + LOG + "q_unit = 'deg'", "no `gain`"),
+        (GAIN + LOG + "q_unit = 'mm'", "not a length"),
+        (SEGMENT + "[limits]\nq_min = 2\nq_max = 1", "must not exceed `q_max`"),
+        (SEGMENT + "[limits]\ndq_max = 0", "`dq_max`"),
+        (GAIN + LOG + "[limits]\nq_min = 0", '`unit` in .limits. must be "log"'),
+        (SEGMENT + "[limits]\nq_min = 0\nunit = 'log'", 'must be "m" without .log.'),
+        # what would take long to read
+        ("x = " + 2000 * "[" + 2000 * "]", "not a TOML file"),
+        ("x = " + 5000 * "1", "not a TOML file"),
         ("#" * 30_001, "at most 30000 bytes"),
-        (".".join(["a"] * 9_000) + " = 1", "a key has more than 600 dots"),
+        (".".join(["a"] * 9_000) + " = 1", "more than 600 dots"),
     ],
 )
-def test_every_value_is_checked(write, text, message):
+def test_bad_descriptions_name_the_key(write, text, message):
     with pytest.raises(ValueError, match=message):
         robots.read_description(write(text))
 
