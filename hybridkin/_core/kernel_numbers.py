@@ -26,6 +26,8 @@ KINDS = (
     "moved",
     "shifted",
     "projected",
+    "stacked",
+    "with_pose",
 )
 ACTIVATIONS = ("logistic", "tanh", "sin", "gaussian")
 
@@ -35,6 +37,7 @@ HK_MAX_S = 16  # segments
 HK_MAX_M = 64  # outputs of a regressor, or inner coordinates
 HK_MAX_F = 2048  # features whose leverage is taken
 HK_MAX_P = 1024  # powers of the inputs of a polynomial
+HK_MAX_R = 24  # rows of a task of inverse kinematics
 HK_GROUP = 8  # hidden units, or columns of a leverage, stored together
 
 # Features of a readout that are not those of a network.
@@ -53,13 +56,17 @@ HK_BOX_STEEPNESS = 100.0  # of the distance outside a box, per squared width of 
 
 # A step of inverse kinematics.
 IK_LIMITED, IK_POSTURE, IK_WEIGHTS, IK_ACCELERATES, IK_PULLS = 1, 2, 4, 8, 16  # flags
+IK_POSE = 32  # the task is a pose, and not a vector of coordinates
 IK_HEALTHY = 0.02  # sigma_min / sigma_max above which no damping is needed
 IK_NEWTON = 60  # Newton steps in a box; a handful is usual
+IK_SWEEPS = 30  # of Jacobi's method for eigenvalues; six are usual
 IK_PROXIMAL = 2  # rounds that remove the effect of the least damping
 IK_NORMALS = 6  # most normals of the plane of a log
 IK_BALANCE = (
     30.0  # weight of a motion that leaves the plane, relative to that of the tip
 )
+IK_PROJECTIONS = 8  # of a step that would leave the half-spaces of the tip
+IK_EXCESS = 1.5  # factor on the way back into them
 IK_CORRECTIONS = 3  # corrections of a step whose tip must move as promised
 IK_SLACK = 0.02  # a tendon that moves the tip less, relative to the most, is slack
 IK_SLIP = (
@@ -78,13 +85,12 @@ IK_LAST = 3  # period of the step before [s], 0 for none
 IK_SIGMA_MIN = 4
 IK_DAMPING = 5
 IK_DISTANCE = 6  # length of the error
-IK_TARGET = 7
-IK_FEED = 10  # motion of the target in this period
-IK_TIP = 13  # measured
-IK_OFFSET = 16  # last measured tip minus model
-IK_X = 19
-IK_ERROR = 22
-IK_Q = 25  # then step, q before, whether it was held (n each), and J (3 n)
+IK_STOPPED = 7  # whether half-spaces changed the motion of the tip
+# Then target, motion of the target in this period, measured tip, last measured tip minus model, x
+# and error; q, step, q before, whether it was held (n each); and J. Points of a task of m rows have
+# m numbers, poses 16; motions and errors m.
+IK_TARGET = 8
+IK_POSE_NUMBERS = 16
 IK_HAS_TARGET = 1
 IK_HAS_FEED = 2
 IK_HAS_TIP = 4

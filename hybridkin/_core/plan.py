@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,6 +14,7 @@ from hybridkin._core.kernel_numbers import (
     HK_MAX_M,
     HK_MAX_N,
     HK_MAX_P,
+    HK_MAX_R,
     HK_MAX_S,
     KINDS,
 )
@@ -27,6 +28,7 @@ MOST = {
     "outputs": HK_MAX_M,
     "features": HK_MAX_F,
     "powers": HK_MAX_P,
+    "rows of a task": HK_MAX_R,
 }
 _OWN = 4  # entries of a node before its own: kind, lengths of input and output, place of numbers
 
@@ -94,6 +96,17 @@ class Plan:
         if model is None or model.layout.write_plan is None:
             raise NoKernel(f"a part of the kind {stored.kind!r} has no kernel")
         return model.layout.write_plan(self, stored)
+
+    def stack(self, models: Iterable[Stored]) -> int:
+        """Write models side by side, and return their place; a single one stands alone."""
+        places = [self.node_of(model) for model in models]
+        if len(places) == 1:
+            return places[0]
+        if any(self.kind(place) in ("stacked", "moved", "shifted") for place in places):
+            raise NoKernel("models side by side must not hold several or another one")
+        lengths = [self.lengths(place) for place in places]
+        m = sum(m for _, m in lengths)
+        return self.node("stacked", lengths[0][0], m, [], len(places), *places)
 
     def node(
         self,

@@ -52,16 +52,23 @@ def frame_numbers(plan: Plan, stored: Stored, reach: float) -> tuple[NDArray, ND
     offsets = stored.array("offsets")
     markers = stored.value("markers", list)
     tip_at, x, y, z = markers[0]
-    if len(markers) > 1 or x or y:
-        raise NoKernel(
-            "several markers, or a marker beside the backbone, have no kernel"
-        )
+    if x or y:
+        raise NoKernel("a marker beside the backbone has no kernel")
     plan.limit("segments", len(offsets))
     m = math.ceil(tip_at)
     parts = np.append(np.ones(m - 1), tip_at - m + 1)
     rigid = offsets[:m] * (parts == 1)
     rigid[-1] += z
     return np.concatenate([base[:3, :3].ravel(), base[:3, 3], [reach], rigid]), parts
+
+
+def each_marker(stored: Stored) -> list[Stored]:
+    """Return the descriptions of the chains of all markers, one for each."""
+    tips = []
+    for marker in stored.value("markers", list):
+        settings = {**stored.settings, "markers": [marker]}
+        tips.append(replace(stored, settings=settings))
+    return tips
 
 
 def write_whole_chain(plan: Plan, stored: Stored) -> int:

@@ -20,7 +20,7 @@ from hybridkin._core.stored import Layout, Stored
 from hybridkin.chains._arcs import turned_by_first
 from hybridkin.chains._checks import filled, float_dtype
 from hybridkin.chains._paths import bend_counts, free_arcs
-from hybridkin.chains.arc_chain import STRUCTURE, ArcChain, Change, frame_numbers
+from hybridkin.chains.arc_chain import STRUCTURE, ArcChain, Change, each_marker, frame_numbers
 
 __all__ = ["ConstantCurvatureChain"]
 
@@ -30,6 +30,9 @@ _NOTICED = 0.1  # share of the radius: the reading of a bend of 0.1 rad
 
 def _write_plan(plan: Plan, stored: Stored) -> int:
     """Write the node of a chain: its frame, and the linear map from q to its arcs."""
+    tips = each_marker(stored)
+    if len(tips) > 1:
+        return plan.stack(tips)
     if stored.value("stage", (str, None)) is not None:
         raise NoKernel("a chain on a rotation stage has no kernel")
     radii = stored.array("radii")

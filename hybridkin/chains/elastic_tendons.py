@@ -15,7 +15,7 @@ from hybridkin._core.plan import Plan
 from hybridkin._core.stored import Layout, Stored
 from hybridkin.chains import _slack
 from hybridkin.chains._checks import filled, float_dtype
-from hybridkin.chains.arc_chain import STRUCTURE, ArcChain, Change, frame_numbers
+from hybridkin.chains.arc_chain import STRUCTURE, ArcChain, Change, each_marker, frame_numbers
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
 
 __all__ = ["ElasticTendonChain"]
@@ -34,6 +34,9 @@ _TABLE = 12  # largest number of tendons for which all responses are stored
 
 def _write_plan(plan: Plan, stored: Stored) -> int:
     """Write the node of a chain: its frame, then numbers of its segments and of its tendons."""
+    tips = each_marker(stored)
+    if len(tips) > 1:
+        return plan.stack(tips)
     lengths = stored.array("lengths")
     rest_bends = stored.array("rest_bends")
     bending = stored.array("bending_stiffness")

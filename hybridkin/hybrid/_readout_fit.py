@@ -60,7 +60,8 @@ _Tips = Callable[[Tensor], tuple[Tensor, Tensor]]
 
 def _tips(model: ForwardModel) -> _Tips:
     """Return `from_coordinates_and_jacobian`, for arcs from the compiled core if available."""
-    if not isinstance(model, ArcChain) or program_of(model) is None:
+    single = isinstance(model, ArcChain) and len(model.markers) == 1
+    if not single or program_of(model) is None:
         return model.from_coordinates_and_jacobian
     m = ceil(model.tip_at)
     offsets = model.offsets[:m].numpy(force=True).copy()

@@ -18,8 +18,6 @@ from hybridkin._core.kernel_numbers import (
     IK_AT_REST,
     IK_DAMPING,
     IK_DISTANCE,
-    IK_ERROR,
-    IK_FEED,
     IK_FROM_REST,
     IK_HAS_FEED,
     IK_HAS_TARGET,
@@ -31,20 +29,18 @@ from hybridkin._core.kernel_numbers import (
     IK_MODE,
     IK_MUST_SEE,
     IK_PERIOD,
-    IK_Q,
     IK_REACHED,
     IK_SIGMA_MIN,
+    IK_STOPPED,
     IK_TARGET,
-    IK_TIP,
     IK_TO_DOMAIN,
     IK_TO_POSTURE,
-    IK_X,
 )
 from hybridkin._core.plan import NoKernel, Plan
 from hybridkin.ik._search import Found, Point, Search
 from hybridkin.ik._settings import StepSettings
 from hybridkin.ik._step import StepRows
-from hybridkin.ik.tasks import PositionTask, Task, Tolerance
+from hybridkin.ik.tasks import Task, Tolerance
 from hybridkin.native.library import (
     Call,
     Program,
@@ -68,28 +64,38 @@ class Tick(NamedTuple):
     step: StepRows
 
 
-def core_of(settings: StepSettings, search: bool = False) -> Core | None:
+def core_of(settings: StepSettings) -> Core | None:
     """Return the core of settings, or None if a part of the task has no kernel.
 
-    Poses have kernels for the search only. The core is kept with the settings, and made again if
-    the model has changed.
+    The core is kept with the settings, and made again if a model has changed.
     """
-    program = vars(settings).get("_program")
-    model = program_of(settings.task.models[0])
-    if program is None or program[0] is not model:
-        try:
-            program = model, None if model is None else Core(settings, model), ""
-        except (NoKernel, TypeError) as error:
-            program = model, None, str(error)
-        object.__setattr__(settings, "_program", program)
-    return program[1] if search or settings.task.parts == (3,) else None
+    kept = vars(settings).get("_core")
+    programs = [program_of(model) for model in settings.task.models]
+    if kept is None or kept[0] != programs:
+        kept = programs, *_core_or_reason(settings, programs)
+        object.__setattr__(settings, "_core", kept)
+    return kept[1]
+
+
+def _core_or_reason(
+    settings: StepSettings, programs: list[Program | None]
+) -> tuple[Core | None, str]:
+    compiled = [program for program in programs if program is not None]
+    if len(compiled) < len(programs):
+        return None, ""
+    try:
+        return Core(settings, compiled), ""
+    except (NoKernel, TypeError) as error:
+        return None, str(error)
 
 
 def why_torch(settings: StepSettings) -> str:
-    """Return why settings that `core_of` has seen have no core for a step."""
-    reason = vars(settings)["_program"][2] or "only positions have a kernel of a step"
-    model = backend(settings.task.models[0])
-    return reason if model == "compiled" else model.removeprefix("torch: ")
+    """Return why settings that `core_of` has seen have no core."""
+    reason = vars(settings)["_core"][2]
+    if reason:
+        return reason
+    reasons = [backend(model) for model in settings.task.models]
+    return next(r for r in reasons if r != "compiled").removeprefix("torch: ")
 
 
 class Core:
@@ -99,41 +105,41 @@ class Core:
     ----------
     settings : StepSettings
         Task, limits, posture and rates.
-    model : Program
-        The model of the task.
+    models : list of Program
+        The models of the task.
 
     Attributes
     ----------
     settings : StepSettings
         The settings, with a task evaluated by the core.
-    n : int
-        Number of actuators.
+    n, m, width : int
+        Numbers of actuators, of rows of the task, and of numbers in a target.
     """
 
-    def __init__(self, settings: StepSettings, model: Program) -> None:
+    def __init__(self, settings: StepSettings, models: list[Program]) -> None:
         self.plan = Plan(settings.stored())
-        self._made_of = (settings, model)
-        self.n = self.plan.n_inputs
-        self.program = model
-        self.settings = settings
-        self.rows = sum(settings.task.parts)
-        if self.rows == 3:
-            self.settings = dataclasses.replace(
-                settings, task=_CoreTask(settings.task, model)
-            )
+        self._made_of = (settings, models)
+        self.n, self.m = self.plan.lengths(self.plan.root)
+        self.width = math.prod(settings.task.shape)
         self._call = Call(self.plan, opened_library())
+        self.settings = dataclasses.replace(
+            settings, task=_CoreTask(settings.task, self, models)
+        )
         self._idle: list[Follower] = []  # one for every thread that has used `step`
-        n = self.n
-        self._places = {
-            "dq": slice(IK_Q + n, IK_Q + 2 * n),
-            "x": slice(IK_X, IK_ERROR),
+        places = places_of(self.n, self.m, self.width)
+        x = places["x"]
+        if len(settings.task.shape) > 1:
+            x = np.arange(x.start, x.stop).reshape(settings.task.shape)
+        self._fields = {
+            "dq": places["dq"],
+            "x": x,
             "error": (IK_DISTANCE, ...),
             "sigma_min": (IK_SIGMA_MIN, ...),
             "damping": (IK_DAMPING, ...),
-            "saturated": slice(IK_Q + 3 * n, IK_Q + 4 * n),
+            "saturated": places["held"],
         }
 
-    def __reduce__(self) -> tuple[type[Core], tuple[StepSettings, Program]]:
+    def __reduce__(self) -> tuple[type[Core], tuple[StepSettings, list[Program]]]:
         return Core, self._made_of
 
     def step(
@@ -148,7 +154,7 @@ class Core:
             follower = Follower(self, None, IK_MUST_SEE + IK_FROM_REST)
         follower.q[...] = q
         if follower.tick(target, dx, tip):
-            result = (follower.state.copy(), self._places)
+            result = (follower.state.copy(), self._fields)
         else:
             result = None
         self._idle.append(follower)
@@ -168,15 +174,23 @@ class Core:
         previous steps.
         """
         n = self.n
-        out = np.empty((len(q), n + 6))
+        out = np.empty((len(q), n + self.width + 3))
         held = np.empty((len(q), n), dtype=bool)
         arrays = [
             None if a is None else _plain(a) for a in (q, target, feed, tip, last)
         ]
         mode = ctypes.c_int32(IK_MUST_SEE | _mode(target, feed, tip))
         self._run("hk_ik_steps", len(q), [mode], [*arrays, out, held])
-        dq, x, numbers = torch.from_numpy(out).split([n, 3, 3], dim=1)
+        dq, x, numbers = torch.from_numpy(out).split([n, self.width, 3], dim=1)
+        x = x.unflatten(1, self.settings.task.shape)
         return dq, x, *numbers.unbind(1), torch.from_numpy(held)
+
+    def evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return x (N, ...) and J (N, m, n) of the task at q (N, n)."""
+        x = np.empty((len(q), *self.settings.task.shape))
+        J = np.empty((len(q), self.m, self.n))
+        self._run("hk_ik_look", len(q), [], [_plain(q), x, J])
+        return torch.from_numpy(x), torch.from_numpy(J)
 
     def search(self, tol: Tolerance, max_iter: int) -> Search:
         """Return the search for configurations that reach targets."""
@@ -188,27 +202,30 @@ class Core:
         """Return the result of `hk_ik_find` for starts q (N, n)."""
         n_rows = len(q)
         best = _plain(q).copy()
-        J = np.empty((n_rows, self.rows, self.n))
-        e = np.empty((n_rows, self.rows))
+        J = np.empty((n_rows, self.m, self.n))
+        e = np.empty((n_rows, self.m))
         outcome = np.empty(n_rows, dtype=np.int32)
         n_iter = np.empty(n_rows, dtype=np.int32)
-        metres, radians = (*tol, 0.0)[:2] if isinstance(tol, tuple) else (tol, 0.0)
-        tolerances = metres, radians * self.settings.task.units[-1]
-        numbers = [
-            *map(ctypes.c_int32, (mode, max_iter)),
-            *map(ctypes.c_double, tolerances),
-        ]
+        if isinstance(tol, tuple):
+            tolerances = np.multiply(tol, self.settings.task.units)
+            parts = len(tol)
+        else:
+            tolerances = np.array([tol])
+            parts = 0
+        numbers = [ctypes.c_int32(number) for number in (mode, max_iter, parts)]
+        numbers.append(ctypes.c_void_p(tolerances.ctypes.data))
         self._run(
             "hk_ik_find", n_rows, numbers, [_plain(target), best, J, e, outcome, n_iter]
         )
         error = torch.from_numpy(e)
         result = torch.from_numpy(outcome)
         iterations = torch.from_numpy(n_iter).long()
+        x = torch.full_like(target, math.nan)  # of other tasks than positions: not used
+        if target.shape == error.shape:
+            x = target - error
         return Found(
             torch.from_numpy(best),
-            target - error
-            if self.rows == 3
-            else torch.full_like(target, math.nan),  # not used
+            x,
             torch.from_numpy(J),
             error,
             target.clone(),
@@ -263,14 +280,21 @@ class Follower:
         self.core = core
         self._memory = memory
         self._least = mode
-        n = core.n
-        self.state = state = np.zeros(IK_Q + 7 * core.n) if state is None else state
+        places = places_of(core.n, core.m, core.width)
+        if state is None:
+            state = np.zeros(places["J"].stop)
+        self.state = state
         self.task = core.settings.task
         self._dt = state[IK_PERIOD] = core.settings.dt
         state[IK_MEMORY] = memory or 0.0
-        self.q = state[IK_Q : IK_Q + n]
+        self._parts = {name: state[place] for name, place in places.items()}
+        self.q = self._parts["q"]
         self._bytes = memoryview(state).cast("B")  # pyright: ignore[reportArgumentType]
-        self._inputs = {at: state[at : at + 3] for at in (IK_TARGET, IK_FEED, IK_TIP)}
+        self._inputs = [
+            _Input(self._bytes, places["target"], state, core.settings.task.shape),
+            _Input(self._bytes, places["feed"], state, (core.m,)),
+            _Input(self._bytes, places["tip"], state, core.settings.task.shape),
+        ]
         self._call = Call(core.plan, opened_library(), state.ctypes.data)  # ik_follower
         self._follow = opened_library().hk_ik_tick
         self._mode = -1
@@ -280,57 +304,43 @@ class Follower:
 
     def start(self, q: Tensor, dq: Tensor) -> None:
         """Set the initial configuration (1, n), and the step that led to it."""
-        state = self.state
-        n = self.core.n
-        state[IK_SIGMA_MIN:] = 0.0
-        state[[IK_SIGMA_MIN, IK_DISTANCE, *range(IK_ERROR, IK_Q)]] = math.nan
-        state[IK_X:IK_ERROR] = self.core.settings.evaluate(q)[0][0]
-        state[IK_LAST] = self._dt
-        state[IK_Q + n : IK_Q + 2 * n] = dq[0]
-        self.q[:] = state[IK_Q + 2 * n : IK_Q + 3 * n] = q[0]
+        parts = self._parts
+        for name in ("target", "feed", "tip", "offset", "held", "J"):
+            parts[name][:] = 0.0
+        self.state[[IK_SIGMA_MIN, IK_DISTANCE]] = parts["error"][:] = math.nan
+        self.state[[IK_DAMPING, IK_STOPPED]] = 0.0
+        parts["x"][:] = self.core.settings.evaluate(q)[0][0].flatten()
+        self.state[IK_LAST] = self._dt
+        parts["dq"][:] = dq[0]
+        parts["q"][:] = parts["before"][:] = q[0]
 
     def tick(self, target: object, dx: object, tip: object) -> bool:
         """Do a tick with plain arrays: the target, its velocity, the measured tip.
 
         Returns False, and does nothing, if one of them needs full checks.
         """
+        put_target, put_feed, put_tip = self._inputs
         mode = self._least | IK_HAS_TARGET
-        if not self._put(IK_TARGET, target):
+        if not put_target(target):
             return False
         if dx is not None:
-            if not self._put(IK_FEED, dx):
+            if not put_feed(dx):
                 return False
-            self._inputs[IK_FEED] *= self._dt
+            put_feed.numbers *= self._dt
             mode |= IK_HAS_FEED
         if tip is not None:
-            if not self._put(IK_TIP, tip):
+            if not put_tip(tip):
                 return False
             mode |= IK_HAS_TIP
         if mode != self._mode:
             self.state[IK_MODE] = self._mode = mode
-        self._follow(self._call.place)
-        return True
-
-    def _put(self, at: int, point: object) -> bool:
-        """Write a point into the state, if it is an array or a list of three numbers."""
-        if type(point) is np.ndarray:
-            if point.dtype is not _FLOAT64 or point.shape != (3,):
-                return False
-            self._inputs[at][...] = point
-            return True
-        if type(point) is not list and type(point) is not tuple:
-            return False
-        try:
-            _write_point(self._bytes, 8 * at, *point)
-        except (StructError, OverflowError):
-            return False
-        return True
+        return self._follow(self._call.place) > 0
 
     def advance(self, period: float | None, *inputs: Tensor | None) -> Tick:
         """Do a tick with checked rows: the target, its motion in the period, the measured tip."""
-        for place, rows in zip(self._inputs.values(), inputs, strict=True):
+        for place, rows in zip(self._inputs, inputs, strict=True):
             if rows is not None:
-                place[...] = rows.reshape(3).numpy()
+                place.numbers[...] = rows[0].numpy()
         mode = self._least | _mode(*inputs)
         self.state[IK_MODE] = self._mode = mode
         self.state[IK_PERIOD] = period or self._dt
@@ -345,28 +355,87 @@ class Follower:
 
     def last(self) -> Tick:
         """Return the results of the last tick."""
-        a = torch.from_numpy(self.state.copy())[None]
-        n = self.core.n
-        _, dq, before, held, J = a[:, IK_Q:].split([n, n, n, n, 3 * n], dim=1)
-        step = StepRows(dq, a[:, IK_SIGMA_MIN], a[:, IK_DAMPING], held > 0.0)
-        return Tick(
-            before, a[:, IK_X:IK_ERROR], J.view(1, 3, n), a[:, IK_ERROR:IK_Q], step
+        state = torch.from_numpy(self.state.copy())[None]
+        places = places_of(self.core.n, self.core.m, self.core.width)
+        parts = {name: state[:, place] for name, place in places.items()}
+        step = StepRows(
+            parts["dq"],
+            state[:, IK_SIGMA_MIN],
+            state[:, IK_DAMPING],
+            parts["held"] > 0.0,
+            state[:, IK_STOPPED] > 0.0,
         )
+        x = parts["x"].unflatten(1, self.task.shape)
+        J = parts["J"].unflatten(1, (self.core.m, self.core.n))
+        return Tick(parts["before"], x, J, parts["error"], step)
 
 
-class _CoreTask(PositionTask):
-    """A position task that is evaluated by the core."""
+class _Input:
+    """A place in the state for an array, or for a list of three numbers.
 
-    def __init__(self, task: Task, program: Program) -> None:
+    Parameters
+    ----------
+    memory : memoryview
+        The bytes of the state.
+    place : slice
+        The numbers in the state.
+    state : ndarray
+        The state.
+    shape : tuple of int
+        Shape of the array.
+    """
+
+    def __init__(
+        self, memory: memoryview, place: slice, state: NDArray, shape: tuple[int, ...]
+    ) -> None:
+        self._bytes = memory
+        self._at = 8 * place.start
+        self._shape = shape
+        self.numbers = state[place].reshape(shape)
+
+    def __call__(self, point: object) -> bool:
+        """Write a point, and return whether it has the type and shape that need no checks."""
+        if type(point) is np.ndarray:
+            if point.dtype is not _FLOAT64 or point.shape != self._shape:
+                return False
+            self.numbers[...] = point
+            return True
+        if self._shape != (3,) or (type(point) is not list and type(point) is not tuple):
+            return False
+        try:
+            _write_point(self._bytes, self._at, *point)
+        except (StructError, OverflowError):
+            return False
+        return True
+
+
+def places_of(n: int, m: int, width: int) -> dict[str, slice]:
+    """Return the places of the parts of the state: of n actuators, m rows and `width` numbers."""
+    lengths = {"target": width, "feed": m, "tip": width, "offset": m, "x": width}
+    lengths |= {"error": m, "q": n, "dq": n, "before": n, "held": n, "J": m * n}
+    places = {}
+    start = IK_TARGET
+    for name, length in lengths.items():
+        places[name] = slice(start, start + length)
+        start += length
+    return places
+
+
+class _CoreTask(Task):
+    """A task that is evaluated by the core."""
+
+    def __init__(self, task: Task, core: Core, programs: list[Program]) -> None:
         vars(self).update(vars(task))
-        self._program = program
-
-    def evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        x, J, _ = self._program.evaluate(_plain(q), jacobian=True)
-        return torch.from_numpy(x), torch.from_numpy(J)
+        self.check = task.check
+        self.difference = task.difference
+        self.distances = task.distances
+        self.evaluate = core.evaluate
+        self._programs = programs
 
     def domain_distance(self, q: Tensor) -> Tensor:
-        return torch.from_numpy(self._program.evaluate(_plain(q), distance=True)[2])
+        rows = _plain(q)
+        distances = [program.domain(rows)[0] for program in self._programs]
+        return torch.from_numpy(np.max(distances, axis=0))
 
 
 @dataclasses.dataclass(frozen=True)

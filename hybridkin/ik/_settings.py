@@ -25,6 +25,7 @@ from hybridkin._core.kernel_numbers import (
     IK_ACCELERATES,
     IK_LIMITED,
     IK_NORMALS,
+    IK_POSE,
     IK_POSTURE,
     IK_PULLS,
     IK_WEIGHTS,
@@ -33,7 +34,7 @@ from hybridkin._core.model import Portable
 from hybridkin._core.plan import NoKernel, Plan
 from hybridkin._core.stored import Layout, Stored
 from hybridkin.ik._half_spaces import HalfSpaces
-from hybridkin.ik.tasks import PoseTask, PositionTask, Task, Tolerance
+from hybridkin.ik.tasks import PointsTask, PoseTask, PositionTask, Task, Tolerance
 
 Array: TypeAlias = Numbers | Transform  # what a caller may pass
 Posture: TypeAlias = Callable[[Tensor], Tensor]
@@ -108,14 +109,12 @@ def _in_words(limits: Tensor) -> str:
 
 def _write_plan(plan: Plan, stored: Stored) -> int:
     """Write the node of a step: limits, posture and weights, rates, and the plane to keep to."""
-    model = plan.node_of(stored.part("model"))
-    n, m = plan.lengths(model)
-    if m != 3:
-        raise NoKernel(f"the kernel of a step needs tips of 3 coordinates, got {m}")
+    model = plan.stack(stored.parts.values())
+    n = plan.lengths(model)[0]
+    scale = stored.array("scale")
+    m = len(scale)
+    plan.limit("rows of a task", m)
     settings = stored.settings
-    radian = settings["radian"]
-    if radian and plan.kind(model) != "rigid":
-        raise NoKernel("the kernels for poses support rigid arms only")
     names = ("q_min", "q_max", "dq_max", "ddq_max", "posture")
     vectors = [stored.array(name, [n], finite=False) for name in names]
     weights = stored.array("weights", [n])
@@ -130,14 +129,19 @@ def _write_plan(plan: Plan, stored: Stored) -> int:
     # Steps of more than a second end at the posture.
     beta = 1.0 if settings["beta"] is None else settings["beta"]
     damping = -1.0 if settings["damping"] == "adaptive" else settings["damping"]
-    rates = [gain, beta, settings["dt"], damping, radian]
+    rates = [gain, beta, settings["dt"], damping]
+    spaces = stored.array("spaces")
+    plan.limit("actuators", spaces.shape[1])  # they share arrays of the kernels
     flags = IK_LIMITED * (settings["limits"] == "saturate")
     flags |= IK_POSTURE * settings["has_posture"]
     flags |= IK_WEIGHTS * bool((weights != 1.0).any())
     flags |= IK_ACCELERATES * settings["accelerates"]
     flags |= IK_PULLS * bool(pulls.any())
-    numbers = [*vectors, weights**-0.5, rates, periods, pulls, normals]
-    return plan.node("ik", n, 6 if radian else 3, numbers, model, flags, len(normals))
+    flags |= IK_POSE * settings["pose"]
+    plane_and_spaces = [normals, spaces, stored.array("offsets")]
+    numbers = [*vectors, weights**-0.5, rates, scale, periods, pulls, *plane_and_spaces]
+    sizes = len(normals), spaces.shape[1]
+    return plan.node("ik", n, m, numbers, model, flags, *sizes)
 
 
 @dataclass(frozen=True)
@@ -315,17 +319,14 @@ class StepSettings(Portable):
         Raises
         ------
         TypeError
-            If they could only be stored as code: tasks other than a `PositionTask` or a
-            `PoseTask`, a posture that is a function, or tip limits; or if n is not known.
+            If they could only be stored as code: a task of another class than those of
+            `hybridkin.tasks`, or a posture that is a function; or if n is not known.
         """
-        model = self.task.models[0]
         n = self.n_actuators
-        if type(self.task) not in (PositionTask, PoseTask):
+        if type(self.task) not in (PositionTask, PoseTask, PointsTask):
             raise TypeError(f"a {type(self.task).__name__} has no kernel")
         if callable(self.posture):
             raise TypeError("a posture that is a function has no kernel")
-        if self.tip_limits is not None:
-            raise TypeError("limits of the tip have no kernel")
         if n is None:
             raise TypeError(
                 "the number of actuators is unknown; give one limit for each"
@@ -345,6 +346,13 @@ class StepSettings(Portable):
             arrays["normals"] = np.zeros((n, 0))
         else:
             arrays["normals"] = as_array(self.plane[1])
+        arrays["scale"] = np.repeat(self.task.units, self.task.parts)
+        if self.tip_limits is None:
+            arrays["spaces"] = np.zeros((sum(self.task.parts), 0))
+            arrays["offsets"] = np.zeros(0)
+        else:
+            arrays["spaces"] = as_array(self.tip_limits.normals).T
+            arrays["offsets"] = as_array(self.tip_limits.offsets)
         names = (
             "beta",
             "gain",
@@ -355,10 +363,9 @@ class StepSettings(Portable):
             "accelerates",
         )
         settings = {name: getattr(self, name) for name in names}
-        settings["radian"] = self.task.units[1] if len(self.task.parts) > 1 else 0.0
-        return Stored.of(
-            self.layout.kind, arrays, {"model": model.stored()}, **settings
-        )
+        settings["pose"] = isinstance(self.task, PoseTask)
+        models = {str(k): part for k, part in enumerate(self.task.stored_models())}
+        return Stored.of(self.layout.kind, arrays, models, **settings)
 
     # The plane of q to keep to, where the log lies in one.
 

@@ -6,6 +6,7 @@ Equations (17) to (20) are those of the page "Theory" of the documentation.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -14,7 +15,9 @@ from torch import Tensor
 from hybridkin._core.kernel_numbers import (
     IK_BALANCE,
     IK_CORRECTIONS,
+    IK_EXCESS,
     IK_LEAST_PULL,
+    IK_PROJECTIONS,
     IK_PULL_RATIO,
     IK_SLACK,
     IK_SLIP,
@@ -30,11 +33,6 @@ from hybridkin.ik._gram import (
     solve_rows,
 )
 from hybridkin.ik._settings import StepSettings, stopping
-
-# For a step that would leave the tip limits: alternating projections, and how far each one goes
-# in multiples of the violation.
-_PROJECTIONS = 8
-_EXCESS = 1.5
 
 
 class StepRows(NamedTuple):
@@ -246,34 +244,68 @@ def _step_inside(
     """Return a step within the bounds after which, to first order, the tip is within its limits.
 
     The desired motion v is projected onto the half-spaces. If the bounds then move J dq out of
-    them, alternating projections look for a motion that meets both, with some excess, so that they
-    end. A remaining violation is removed by taking a fraction of the way from a safe step, one
-    that stays or returns, to this step.
+    them, a safe step is looked for, and the margins of the half-spaces that it does not reach are
+    widened up to it. Alternating projections look for a motion that meets margins and bounds, with
+    some excess, so that they end. A remaining violation is removed by taking a fraction of the way
+    from the safe step to this one.
     """
-    spaces = settings.tip_limits
-    assert spaces is not None
-    close = 32.0 * torch.finfo(v.dtype).eps  # [m]
-    wanted = v + spaces.way_in(margin - spaces.along(v))
+    limits = settings.tip_limits
+    close = 32.0 * torch.finfo(v.dtype).eps
+    assert limits is not None
+
+    def along(dq: Tensor) -> Tensor:
+        return limits.along(apply_rows(J, dq))
+
+    wanted = v + limits.way_in(margin - limits.along(v))
     step = limited_step(settings, J, wanted, z, *bounds)
-    over = spaces.along(apply_rows(J, step.dq)) - margin
-    for _ in range(_PROJECTIONS):
-        outside = (over > close).any(-1, keepdim=True)
-        if not outside.any():
-            break
-        back = apply_rows(J, step.dq) + _EXCESS * spaces.way_in(-over)
-        wanted = torch.where(outside, back, wanted)
-        step = limited_step(settings, J, wanted, z, *bounds)
-        over = spaces.along(apply_rows(J, step.dq)) - margin
-    else:
-        safe = limited_step(settings, J, spaces.way_in(margin), None, *bounds)
-        over_safe = spaces.along(apply_rows(J, safe.dq)) - margin
-        fraction = ((close - over_safe) / (over - over_safe)).clamp(0.0, 1.0)
-        fraction = torch.where(over > close, fraction, 1.0).amin(-1, keepdim=True)
-        part = torch.clamp(safe.dq + fraction * (step.dq - safe.dq), *bounds)
-        held = (part <= bounds[0]) | (part >= bounds[1])
-        dq = torch.where(fraction < 1.0, part, step.dq)
-        step = step._replace(dq=dq, saturated=held)
+    out = (along(step.dq) - margin > close).any(-1, keepdim=True)
+    if out.any():
+        safe = _safe_step(settings, margin, J, along, *bounds)
+        margin = torch.where(out, torch.maximum(margin, along(safe)), margin)
+        for _ in range(IK_PROJECTIONS):
+            over = along(step.dq) - margin
+            out = (over > close).any(-1, keepdim=True)
+            if not out.any():
+                break
+            back = apply_rows(J, step.dq) + IK_EXCESS * limits.way_in(-over)
+            wanted = torch.where(out, back, wanted)
+            step = limited_step(settings, J, wanted, z, *bounds)
+        share = _share(along(safe) - margin, along(step.dq) - margin)
+        dq = torch.clamp(safe + share * (step.dq - safe), *bounds)
+        dq = torch.where(share < 1.0, dq, step.dq)
+        held = (dq <= bounds[0]) | (dq >= bounds[1])
+        step = step._replace(
+            dq=dq, saturated=torch.where(share < 1.0, held, step.saturated)
+        )
     return step._replace(stopped=((wanted - v).abs() > close).any(-1))
+
+
+def _safe_step(
+    settings: StepSettings,
+    margin: Tensor,
+    J: Tensor,
+    along: Callable[[Tensor], Tensor],
+    *bounds: Tensor,
+) -> Tensor:
+    """Return steps (N, n) back into the half-spaces that lead farther out of none of them.
+
+    They go the shortest way, as far as the bounds allow. Where the bounds turn it out of another
+    half-space, only a share of it is taken; else a start outside several could get worse.
+    """
+    limits = settings.tip_limits
+    assert limits is not None
+    rest = torch.clamp(torch.zeros_like(bounds[0]), *bounds)
+    back = limited_step(settings, J, limits.way_in(margin), None, *bounds).dq
+    allowed = torch.maximum(margin, along(rest))
+    share = _share(along(rest) - allowed, along(back) - allowed)
+    return torch.clamp(rest + share * (back - rest), *bounds)
+
+
+def _share(least: Tensor, over: Tensor) -> Tensor:
+    """Return the shares (N, 1) of ways from `least` to `over` (N, k) that stay below zero."""
+    close = 32.0 * torch.finfo(over.dtype).eps
+    share = ((close - least) / (over - least)).clamp(0.0, 1.0)
+    return torch.where(over > close, share, 1.0).amin(-1, keepdim=True)
 
 
 # Tendons that can only pull.

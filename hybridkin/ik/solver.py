@@ -405,7 +405,7 @@ class InverseKinematics:
         start = torch.where(torch.isfinite(start), start, torch.nan)
         search = Search(settings, tolerance, max_iter)
         if as_numpy and start.dtype == torch.float64:
-            core = core_of(settings, search=True)
+            core = core_of(settings)
             if core is not None:
                 search = core.search(tolerance, max_iter)
                 settings = core.settings

@@ -13,9 +13,13 @@
 #include "ik_step.h"
 #include "ik_search.h"
 
-static HK_NOINLINE void ik_model(const ik_settings *ik, const real *q, real *x, real *J,
-                                 real *distance) {
-    hk_model(&ik->plan, ik->model, q, x, J, distance, ik->work);
+static HK_NOINLINE void ik_model(const ik_settings *ik, const real *q, real *x, real *J) {
+    real tip[3], turn[9];
+    if (IK_IS_POSE(ik)) {
+        hk_pose(&ik->plan, ik->model, q, tip, turn, J, NULL, ik->work);
+        ik_pose_of(tip, turn, x);
+    } else
+        hk_model(&ik->plan, ik->model, q, x, J, NULL, ik->work);
 }
 
 #if defined(_WIN32)
@@ -62,8 +66,13 @@ HK_API int64_t hk_work(const int32_t *code, int32_t at) {
     const int n = code[HK_MOST_N], S = code[HK_MOST_S], m = code[HK_MOST_M];
     const int model = HK_MODEL_WORK(n, S, m, code[HK_MOST_F], code[HK_MOST_P]);
     const int of_units = (m + m * n) * HK_LANES; /* see hkr_units */
-    const int around = code[at + HK_KIND] == HK_IK ? IK_SEARCH_WORK(n, S) : n + m + m * n;
-    return (int64_t)HK_LANES * (1 + around + model) + of_units;
+    int around = n + m + m * n, slots = 0;
+    if (code[at + HK_KIND] == HK_IK) {
+        around = IK_SEARCH_WORK(n);
+        slots = IK_SLOTS_WORK(n, code[at + HK_M], code[at + HK_MORE + 2]) +
+                IK_STATE_SIZE(n, IK_ROWS, IK_WIDTH);
+    }
+    return (int64_t)HK_LANES * (1 + around + model) + of_units + slots;
 }
 
 static void hk_block(const hk_plan *p, int at, V *work, const real *q, int rows, real *x, real *J,
@@ -116,46 +125,58 @@ static ik_settings ik_settings_in(const hk_call *call) {
     return ik_settings_of(call->code, call->data, (int)call->at, call->work);
 }
 
-HK_API void hk_ik_tick(const ik_follower *f) {
+/* A period, see `ik_tick`. */
+HK_API int32_t hk_ik_tick(const ik_follower *f) {
     const ik_settings ik = ik_settings_in(&f->call);
-    ik_tick(&ik, f->state);
+    return ik_tick(&ik, f->state);
 }
 
-/* Single ticks for rows of q (rows, n), targets, and with the mode their motions and measured tips
-   (rows, 3); `last` (rows, n) are the steps before. `out` (rows, n + 6) holds dq, x, |e|,
-   sigma_min, damping; held (rows, n). */
+static void ik_put(int64_t row, int width, const real *rows, real *to) {
+    for (int i = 0; rows && i < width; i++) to[i] = rows[width * row + i];
+}
+
+/* Single ticks for rows of q (rows, n), targets, and with the mode their motions (rows, m) and
+   measured tips; `last` (rows, n) are the steps before. `out` (rows, n + width + 3) holds dq, x,
+   |e|, sigma_min, damping; held (rows, n). */
 HK_API void hk_ik_steps(const hk_call *call, int64_t rows, int32_t mode, const real *q,
                         const real *target, const real *feed, const real *tip, const real *last,
                         real *out, unsigned char *held) {
-    const ik_settings ik = ik_settings_in(call);
-    const int n = ik.n;
-    real state[IK_STATE] = {mode, ik.dt};
-    for (int64_t r = 0; r < rows; r++, out += n + 6) {
-        for (int i = 0; i < 3; i++) {
-            state[IK_TARGET + i] = target[3 * r + i];
-            if (feed) state[IK_FEED + i] = feed[3 * r + i];
-            if (tip) state[IK_TIP + i] = tip[3 * r + i];
-        }
-        for (int j = 0; j < n; j++) {
-            state[IK_Q + j] = q[n * r + j];
-            state[IK_Q + n + j] = last ? last[n * r + j] : 0.0;
-        }
+    ik_settings ik = ik_settings_in(call);
+    const int n = ik.n, width = ik.width;
+    real *state = ik.work;
+    ik.work += IK_STATE_SIZE(n, ik.m, width);
+    const ik_state now = ik_state_of(&ik, state);
+    for (int i = 0; i < IK_STATE_SIZE(n, ik.m, width); i++) state[i] = R(0.0);
+    state[IK_MODE] = mode;
+    state[IK_PERIOD] = ik.dt;
+    for (int64_t r = 0; r < rows; r++, out += n + width + 3) {
+        ik_put(r, width, target, now.target);
+        ik_put(r, ik.m, feed, now.feed);
+        ik_put(r, width, tip, now.tip);
+        ik_put(r, n, q, now.q);
+        for (int j = 0; j < n; j++) now.dq[j] = last ? last[n * r + j] : R(0.0);
         ik_tick(&ik, state);
         for (int j = 0; j < n; j++) {
-            out[j] = state[IK_Q + n + j];
-            held[n * r + j] = state[IK_Q + 3 * n + j] > 0.0;
+            out[j] = now.dq[j];
+            held[n * r + j] = now.held[j] > R(0.0);
         }
-        for (int i = 0; i < 3; i++) out[n + i] = state[IK_X + i];
-        out[n + 3] = state[IK_DISTANCE];
-        out[n + 4] = state[IK_SIGMA_MIN];
-        out[n + 5] = state[IK_DAMPING];
+        for (int i = 0; i < width; i++) out[n + i] = now.x[i];
+        out[n + width] = state[IK_DISTANCE];
+        out[n + width + 1] = state[IK_SIGMA_MIN];
+        out[n + width + 2] = state[IK_DAMPING];
     }
 }
 
-/* The search, see ik_search.h. */
-HK_API void hk_ik_find(const hk_call *call, int64_t rows, int32_t mode, int32_t max_iter, real tol,
-                       real turn_tol, const real *target, real *q, real *J, real *e, int32_t *found,
-                       int32_t *n_iter) {
-    ik_search_t search = {ik_settings_in(call), mode, max_iter, tol, turn_tol};
+/* The task at rows q (rows, n): x (rows, width) and J (rows, m, n). */
+HK_API void hk_ik_look(const hk_call *call, int64_t rows, const real *q, real *x, real *J) {
+    const ik_settings ik = ik_settings_in(call);
+    ik_look_at(&ik, rows, q, x, J);
+}
+
+/* The search, see ik_search.h; with tolerances of the whole error (parts = 0), or of its parts. */
+HK_API void hk_ik_find(const hk_call *call, int64_t rows, int32_t mode, int32_t max_iter,
+                       int32_t parts, const real *tol, const real *target, real *q, real *J,
+                       real *e, int32_t *found, int32_t *n_iter) {
+    ik_search_t search = {ik_settings_in(call), mode, max_iter, parts, tol};
     ik_search(&search, rows, target, q, J, e, found, n_iter);
 }

@@ -3,15 +3,14 @@
    The worst case is two stages of 1 + IK_PROXIMAL solutions in the box, each of IK_NEWTON steps,
    each of at most 2 n + 1 sums over the n actuators in its line search; a handful is usual. */
 
-#ifdef HK_KINDS /* a controller steers positions */
-enum { IK_ROWS = 3 };
-#define IK_OF(m, f, ...) ((m) == 3 ? f(3, __VA_ARGS__) : f(m, __VA_ARGS__))
+#ifdef HK_KINDS /* code for one task */
+#define IK_OF(m, f, ...) ((m) == HK_MAX_R ? f(HK_MAX_R, __VA_ARGS__) : f(m, __VA_ARGS__))
 #else
-enum { IK_ROWS = 6 };
 #define IK_OF(m, f, ...)                                                                           \
     ((m) == 3 ? f(3, __VA_ARGS__) : (m) == 6 ? f(6, __VA_ARGS__) : f(m, __VA_ARGS__))
 #endif
 enum {
+    IK_ROWS = HK_MAX_R,
     IK_PAIRS = IK_ROWS * (IK_ROWS + 1) / 2,
     IK_MOST_ROWS = IK_ROWS + IK_NORMALS, /* with the normals of a plane */
     IK_MOST_PAIRS = IK_MOST_ROWS * (IK_MOST_ROWS + 1) / 2
@@ -128,6 +127,85 @@ HK_INLINE void ik_solve(int m, const ik_factors *f, const real *v, real *mu) {
     for (int i = m - 1; i >= 0; i--) {
         mu[i] = w[i] * f->inverse[i];
         for (int p = i + 1; p < m; p++) mu[i] -= f->l[p][i] * mu[p];
+    }
+}
+
+/* The eigenvalues of a symmetric matrix g (m, m), and its eigenvectors as columns. */
+typedef struct {
+    real square[IK_ROWS], vectors[IK_ROWS][IK_ROWS];
+} ik_eigen;
+
+/* Jacobi's method: turn two axes at a time until all products of two axes are rounding. */
+HK_INLINE void ik_eigen_of(int m, const real *g, ik_eigen *e) {
+    real a[IK_ROWS][IK_ROWS];
+    const real trace = ik_trace(m, g);
+    for (int k = 0, at = 0; k < m; k++)
+        for (int i = k; i < m; i++) {
+            a[i][k] = a[k][i] = g[at++];
+            e->vectors[i][k] = e->vectors[k][i] = i == k ? R(1.0) : R(0.0);
+        }
+    for (int sweep = 0, going = 1; sweep < IK_SWEEPS && going; sweep++) {
+        going = 0;
+        for (int k = 0; k < m; k++)
+            for (int i = k + 1; i < m; i++) {
+                if (!(ik_abs(a[i][k]) > R(0.25) * HK_EPS * trace)) continue;
+                const real ratio = R(0.5) * (a[i][i] - a[k][k]) / a[i][k];
+                const real root = HK_MATH(sqrt)(R(1.0) + ratio * ratio);
+                const real t = ratio < R(0.0) ? R(1.0) / (ratio - root) : R(1.0) / (ratio + root);
+                const real c = R(1.0) / HK_MATH(sqrt)(R(1.0) + t * t), s = t * c;
+                going = 1;
+                for (int j = 0; j < m; j++) {
+                    const real x = a[k][j], y = a[i][j];
+                    a[k][j] = c * x - s * y;
+                    a[i][j] = s * x + c * y;
+                }
+                for (int j = 0; j < m; j++) {
+                    const real x = a[j][k], y = a[j][i], v = e->vectors[k][j], w = e->vectors[i][j];
+                    a[j][k] = c * x - s * y;
+                    a[j][i] = s * x + c * y;
+                    e->vectors[k][j] = c * v - s * w;
+                    e->vectors[i][j] = s * v + c * w;
+                }
+            }
+    }
+    for (int i = 0; i < m; i++) e->square[i] = a[i][i];
+}
+
+/* mu with (g + lambda^2 1) mu = v; what depends on other rows, to rounding, is dropped. */
+HK_INLINE void ik_eigen_solve(int m, const ik_eigen *e, const real *v, real damping_sq, real *mu) {
+    real sum = R(0.0), along[IK_ROWS];
+    for (int i = 0; i < m; i++) sum += e->square[i] > R(0.0) ? e->square[i] : R(0.0);
+    for (int i = 0; i < m; i++) {
+        const real square = e->square[i] + damping_sq;
+        along[i] = R(0.0);
+        for (int j = 0; j < m; j++) along[i] += e->vectors[i][j] * v[j];
+        along[i] = square > R(8.0) * HK_EPS * sum ? along[i] / square : R(0.0);
+    }
+    for (int j = 0; j < m; j++) {
+        mu[j] = R(0.0);
+        for (int i = 0; i < m; i++) mu[j] += e->vectors[i][j] * along[i];
+    }
+}
+
+/* The singular values of J from the eigenvalues of J J^T. */
+HK_INLINE void ik_eigen_ends(int m, const ik_eigen *e, real *low, real *high) {
+    real least = e->square[0], most = e->square[0];
+    for (int i = 1; i < m; i++) {
+        least = e->square[i] < least ? e->square[i] : least;
+        most = e->square[i] > most ? e->square[i] : most;
+    }
+    *low = HK_MATH(sqrt)(least < R(0.0) ? R(0.0) : least);
+    *high = HK_MATH(sqrt)(most < R(0.0) ? R(0.0) : most);
+}
+
+/* step <- (1 - J+ J) step by the eigenvectors, as `ik_null_projection`. */
+HK_INLINE void ik_eigen_projection(int m, int n, const real *J, const ik_eigen *e, real *step) {
+    for (int twice = 0; twice < 2; twice++) {
+        real moved[IK_ROWS], mu[IK_ROWS];
+        ik_rows_of(m, n, J, step, moved);
+        ik_eigen_solve(m, e, moved, R(0.0), mu);
+        for (int i = 0; i < m; i++) mu[i] = -mu[i];
+        ik_columns_of(m, n, J, mu, step, step);
     }
 }
 

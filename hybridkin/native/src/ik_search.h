@@ -1,5 +1,5 @@
-/* The search for configurations that reach positions, or poses of rigid arms, one row per target,
-   HK_LANES rows at a time.
+/* The search for configurations that reach targets of any task, one row per target, HK_LANES rows at
+   a time.
 
    Every row is a state machine: it requests the model at a configuration and processes the result.
  */
@@ -15,7 +15,7 @@ typedef struct {
     int64_t row;
     int phase, iteration, n_iter, found, inside;
     real start, nu, growth, predicted, share; /* of the descent, and of the slide */
-    real target[16], ask[HK_MAX_N], wish[HK_MAX_N], free[HK_MAX_N];
+    real target[IK_WIDTH], ask[HK_MAX_N], wish[HK_MAX_N], free[HK_MAX_N];
     int slow;
     ik_point live, best;
     ik_step_t step;
@@ -24,7 +24,8 @@ typedef struct {
 typedef struct {
     ik_settings ik;
     int mode, max_iter;
-    real tol, turn_tol; /* of the whole error; of position and rotation apart where turn_tol > 0 */
+    int parts;       /* of the error, of three rows each, with tolerances of their own; 0: none */
+    const real *tol; /* of the whole error, or of every part */
 } ik_search_t;
 
 static inline void ik_keep(const ik_settings *ik, ik_point *to, const ik_point *from) {
@@ -50,34 +51,10 @@ static inline void ik_ask(const ik_settings *ik, ik_row *r, int phase) {
 }
 
 static inline int ik_reached(const ik_search_t *s, const ik_point *at) {
-    if (!(s->turn_tol > R(0.0))) return at->error <= s->tol;
-    return ik_norm(3, at->e) <= s->tol && ik_norm(3, at->e + 3) <= s->turn_tol;
-}
-
-/* e (3) = the rotation vector of A B^T, for rotations A in a pose (4, 4) and B (3, 3), by the unit
-   quaternion, divided by its largest component, which is never small. */
-static void ik_turn(const real *A, const real *B, real *e) {
-    real E[9], w, size;
-    int largest = 3;
-    for (int i = 0; i < 9; i++) {
-        const real *a = A + i / 3 * 4, *b = B + i % 3 * 3;
-        E[i] = a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-    }
-    const real trace = E[0] + E[4] + E[8];
-    const real skew[3] = {E[7] - E[5], E[2] - E[6], E[3] - E[1]};
-    const real squares[4] = {R(1.0) + R(2.0) * E[0] - trace, R(1.0) + R(2.0) * E[4] - trace,
-                             R(1.0) + R(2.0) * E[8] - trace, R(1.0) + trace};
-    for (int i = 0; i < 3; i++)
-        if (squares[i] > squares[largest]) largest = i;
-    for (int i = 0; i < 3; i++) {
-        e[i] = largest == 3 ? skew[i] : E[3 * i + largest] + E[3 * largest + i];
-        if (i == largest) e[i] = squares[i];
-    }
-    w = largest == 3 ? squares[3] : skew[largest];
-    if (w < R(0.0)) w = -w, e[0] = -e[0], e[1] = -e[1], e[2] = -e[2];
-    size = ik_norm(3, e);
-    const real ratio = size > R(1e-9) * w ? R(2.0) * HK_MATH(atan2)(size, w) / size : R(2.0) / w;
-    for (int i = 0; i < 3; i++) e[i] *= ratio;
+    int all = 1;
+    if (s->parts == 0) return at->error <= s->tol[0];
+    for (int k = 0; k < s->parts; k++) all &= ik_norm(3, at->e + 3 * k) <= s->tol[k];
+    return all;
 }
 
 /* Whether no motion within the limits lowers the error to first order. */
@@ -99,7 +76,7 @@ static inline int ik_blocked(const ik_settings *ik, const ik_point *at) {
 static void ik_wish(const ik_search_t *s, const ik_point *at, real *wish, real *free) {
     const ik_settings *ik = &s->ik;
     const int n = ik->n;
-    real J[IK_ROWS * HK_MAX_N], g[IK_PAIRS];
+    real *J = ik_slot(ik, IK_WISHED), g[IK_PAIRS];
     if (s->mode & IK_TO_DOMAIN) { /* Newton's step of the domain distance */
         real distance, square = R(0.0);
         hk_domain(&ik->plan, ik->model, at->q, &distance, wish, ik->work);
@@ -184,7 +161,7 @@ static void ik_lowered(const ik_search_t *s, ik_row *r, const ik_point *now) {
     /* The damping follows the ratio of actual to predicted gain. */
     r->nu *= better ? ik_clip(R(1.0) - u * u * u, R(1.0) / R(3.0), R(2.0)) : r->growth;
     r->growth = better ? R(2.0) : R(2.0) * r->growth;
-    r->slow = better && error - now->error < IK_SLOW * s->tol ? r->slow + 1 : 0;
+    r->slow = better && error - now->error < IK_SLOW * s->tol[0] ? r->slow + 1 : 0;
     if (better) ik_keep(&s->ik, &r->live, now);
     r->iteration++;
     ik_lower_on(s, r);
@@ -242,30 +219,57 @@ static void ik_take(const ik_search_t *s, ik_row *r, const ik_point *now) {
     }
 }
 
-/* Memory of a search besides that of the model: q, x, J, then z and C of poses, and the rows. */
+/* Memory of a search besides that of the model: q, x, J, then the rows. */
 #define IK_ROW_LANES (int)((sizeof(ik_row) * HK_LANES + sizeof(V) - 1) / sizeof(V))
-#define IK_SEARCH_WORK(n, S)                                                                       \
-    ((n) + 3 + IK_ROWS * (n) + (IK_ROWS + 1) * HK_MOST_Z(n, S) + HK_INSIDE_WORK(n, S) +            \
-     IK_ROW_LANES)
+#define IK_SEARCH_WORK(n) ((n) + IK_ROWS + IK_ROWS * (n) + IK_ROW_LANES)
+
+/* x (width) of one lane: a tip and its axes, or points. */
+static inline void ik_lane(const ik_settings *ik, int lane, const V *vx, const V *turn, real *x) {
+    real tip[3], axes[9];
+    if (IK_IS_POSE(ik)) {
+        for (int j = 0; j < 3; j++) tip[j] = vx[j][lane];
+        for (int j = 0; j < 9; j++) axes[j] = turn[j][lane];
+        ik_pose_of(tip, axes, x);
+    } else
+        for (int j = 0; j < ik->m; j++) x[j] = vx[j][lane];
+}
+
+/* The task at rows q (rows, n), for its rows x (rows, width) and J (rows, m, n). */
+static void ik_look_at(const ik_settings *ik, int64_t rows, const real *q, real *x, real *J) {
+    const int n = ik->n, m = ik->m;
+    V *work = hkv_aligned(ik->work), turn[9];
+    V *vq = hkv_take(&work, n), *vx = hkv_take(&work, m), *vJ = hkv_take(&work, m * n);
+    for (int64_t r = 0; r < rows; r += HK_LANES) {
+        const int count = (int)(rows - r < HK_LANES ? rows - r : HK_LANES);
+        EACH(i)
+            for (int j = 0; j < n; j++) vq[j][i] = q[(r + (i < count ? i : count - 1)) * n + j];
+        if (IK_IS_POSE(ik))
+            hkv_pose(&ik->plan, ik->model, vq, vx, turn, vJ, NULL, work);
+        else
+            hkv_model(&ik->plan, ik->model, vq, vx, vJ, NULL, work);
+        for (int i = 0; i < count; i++, x += ik->width, J += m * n) {
+            ik_lane(ik, i, vx, turn, x);
+            for (int j = 0; j < m * n; j++) J[j] = vJ[j][i];
+            ik_scale_rows(ik, J);
+        }
+    }
+}
 
 /* Search `rows` rows from q (rows, n), which becomes the best configurations; J (rows, m, n) there,
    errors e (rows, m), what was found (rows), and the iterations (rows). */
 static void ik_search(ik_search_t *s, int64_t rows, const real *target, real *q, real *J, real *e,
                       int32_t *found, int32_t *n_iter) {
-    const int n = s->ik.n, m = s->ik.m, pose = m == 6, width = pose ? 16 : 3;
+    const int n = s->ik.n, m = s->ik.m, width = s->ik.width;
     const hk_plan *plan = &s->ik.plan;
-    const int32_t *more = plan->code + s->ik.model + HK_MORE;
-    const int k = pose ? hkv_n_coordinates(plan, s->ik.model) : 0;
-    V *work = hkv_aligned(s->ik.work), frame[9], distance = SPLAT(0.0);
-    V *vq = hkv_take(&work, n), *vx = hkv_take(&work, 3), *vJ = hkv_take(&work, m * n);
-    V *z = hkv_take(&work, k), *C = hkv_take(&work, m * k);
+    V *work = hkv_aligned(s->ik.work), turn[9], distance = SPLAT(0.0);
+    V *vq = hkv_take(&work, n), *vx = hkv_take(&work, m), *vJ = hkv_take(&work, m * n);
     ik_row *lane = (ik_row *)hkv_take(&work, IK_ROW_LANES);
     ik_point now;
-    const hkv_inside inside = hkv_inside_of(plan, s->ik.model, &work);
     int64_t next = 0;
     int busy = 0;
     for (int j = 0; j < n; j++) vq[j] = SPLAT(0.0);
     s->ik.work = (real *)work;
+    s->ik.quick = 1;
     EACH(i) lane[i].phase = IK_DONE;
     do {
         EACH(i) {
@@ -281,26 +285,19 @@ static void ik_search(ik_search_t *s, int64_t rows, const real *target, real *q,
                 for (int j = 0; j < n; j++) vq[j][i] = r->ask[j];
         }
         if (!busy) return;
-        if (pose) {
-            hkv_coordinates(plan, s->ik.model, vq, z, &inside);
-            hkv_rigid(more[0], more + 2, hk_numbers(plan, s->ik.model), z, vx, C, frame, work);
-            for (int j = 0; j < 6 * n; j++) vJ[j] = SPLAT(0.0);
-            hkv_pull_rows(plan, s->ik.model, &inside, 6, C, vJ);
-        } else
+        if (IK_IS_POSE(&s->ik))
+            hkv_pose(plan, s->ik.model, vq, vx, turn, vJ, &distance, work);
+        else
             hkv_model(plan, s->ik.model, vq, vx, vJ, &distance, work);
         EACH(i) {
             ik_row *r = lane + i;
+            real x[IK_WIDTH];
             if (r->phase == IK_DONE) continue;
             for (int j = 0; j < n; j++) now.q[j] = r->ask[j];
-            for (int j = 0; j < 3 * n; j++) now.J[j] = vJ[j][i];
-            for (int j = 0; j < 3; j++) now.e[j] = r->target[pose ? 4 * j + 3 : j] - vx[j][i];
-            if (pose) {
-                real turn[9];
-                for (int j = 0; j < 9; j++) turn[j] = frame[j][i];
-                ik_turn(r->target, turn, now.e + 3);
-                for (int j = 3; j < 6; j++) now.e[j] *= s->ik.radian;
-                for (int j = 3 * n; j < 6 * n; j++) now.J[j] = s->ik.radian * vJ[j][i];
-            }
+            for (int j = 0; j < m * n; j++) now.J[j] = vJ[j][i];
+            ik_lane(&s->ik, i, vx, turn, x);
+            ik_difference(&s->ik, x, r->target, now.e);
+            ik_scale_rows(&s->ik, now.J);
             ik_in_plane(&s->ik, m, now.J);
             now.error = ik_norm(m, now.e), now.distance = distance[i];
             ik_take(s, r, &now);

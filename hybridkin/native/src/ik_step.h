@@ -1,5 +1,6 @@
-/* One step of inverse kinematics for a position (m = 3 rows) or, in a search, a pose (6): the
-   damped inverse, a posture in its null space, and limits inside the step. One row at a time. */
+/* One step of inverse kinematics, for a task of m rows: a position (3), several points, or a pose
+   (6). The damped inverse, a posture in its null space, and limits inside the step. One row at a
+   time. */
 
 #include "ik_box.h"
 
@@ -7,33 +8,56 @@
    a weight. */
 typedef struct {
     hk_plan plan;
-    real *work;                        /* memory of a call */
-    int model, n, m, flags, n_normals; /* last: of the plane to keep to */
+    real *work;  /* memory of a call */
+    real *slots; /* matrices as large as J with the normals of a plane, see `ik_slot` */
+    int model, n, m, width, flags; /* width: numbers of a target */
+    int n_normals, n_spaces;       /* of the plane to keep to; half-spaces of the tip */
+    int quick;                     /* estimates of singular values suffice */
     const real *low, *high, *speed, *accel, *posture, *unit, *period, *pulls, *normals;
-    real gain, beta, dt, damping; /* gain < 0: 1 / dt; damping < 0: adaptive */
-    real radian;                  /* what a radian of a pose counts */
+    const real *scale;             /* of every row of the task [m per unit] */
+    const real *spaces, *offsets;  /* normals (m, n_spaces), and how far along them */
+    real gain, beta, dt, damping;  /* gain < 0: 1 / dt; damping < 0: adaptive */
 } ik_settings;
+
+/* What the matrices are for; of the ends of a step there are three. */
+enum { IK_WEIGHTED, IK_IN_PLANE, IK_TAUT, IK_WISHED, IK_END, IK_SLOTS = IK_END + 3 };
+
+/* Numbers of these matrices. */
+#define IK_SLOTS_WORK(n, m, normals) (IK_SLOTS * (n) * ((m) + (normals)))
+
+static inline real *ik_slot(const ik_settings *ik, int which) {
+    return ik->slots + which * ik->n * (ik->m + ik->n_normals);
+}
+
+#define IK_IS_POSE(ik) (HK_POSES && (ik)->flags & IK_POSE)
+#define IK_IN_SPACES(ik) (HK_SPACES && (ik)->n_spaces > 0 && (ik)->flags & IK_LIMITED)
+
+enum { IK_WIDTH = HK_POSES && HK_MAX_R < 16 ? 16 : HK_MAX_R }; /* of a target at most */
 
 /* A step: its bounds and the posture step, which go in, and what comes out. */
 typedef struct {
     real lower[HK_MAX_N], upper[HK_MAX_N], posture[HK_MAX_N];
     real dq[HK_MAX_N], sigma_min, damping;
     unsigned char held[HK_MAX_N];
+    int stopped; /* by half-spaces of the tip */
 } ik_step_t;
 
 static inline ik_settings ik_settings_of(const int32_t *code, const real *data, int at,
                                          real *work) {
-    const int32_t *node = code + at;
-    const int n = node[HK_N];
-    const real *a = data + node[HK_DATA], *b = a + 6 * n;
+    const int32_t *node = code + at, *more = node + HK_MORE;
+    const int n = node[HK_N], m = node[HK_M], flags = more[1], n_normals = more[2];
+    const real *a = data + node[HK_DATA], *b = a + 6 * n, *c = b + 4 + m;
     const ik_settings ik = {
         .plan = {code, data},
-        .work = work,
-        .model = node[HK_MORE],
+        .work = work + IK_SLOTS_WORK(n, m, n_normals),
+        .slots = work,
+        .model = more[0],
         .n = n,
-        .m = node[HK_M],
-        .flags = node[HK_MORE + 1],
-        .n_normals = node[HK_MORE + 2],
+        .m = m,
+        .width = HK_POSES && flags & IK_POSE ? IK_POSE_NUMBERS : m,
+        .flags = flags,
+        .n_normals = n_normals,
+        .n_spaces = more[3],
         .low = a,
         .high = a + n,
         .speed = a + 2 * n,
@@ -44,12 +68,65 @@ static inline ik_settings ik_settings_of(const int32_t *code, const real *data, 
         .beta = b[1],
         .dt = b[2],
         .damping = b[3],
-        .radian = b[4],
-        .period = b + 5,
-        .pulls = b + 5 + n,
-        .normals = b + 5 + 2 * n,
+        .scale = b + 4,
+        .period = c,
+        .pulls = c + n,
+        .normals = c + 2 * n,
+        .spaces = c + (2 + n_normals) * n,
+        .offsets = c + (2 + n_normals) * n + more[3] * m,
     };
     return ik;
+}
+
+/* e (3) = the rotation vector of A B^T, for rotations A and B in poses (4, 4), by the unit
+   quaternion, divided by its largest component, which is never small. */
+static inline void ik_turn(const real *A, const real *B, real *e) {
+    real E[9], w, size;
+    int largest = 3;
+    for (int i = 0; i < 9; i++) {
+        const real *a = A + i / 3 * 4, *b = B + i % 3 * 4;
+        E[i] = a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+    }
+    const real trace = E[0] + E[4] + E[8];
+    const real skew[3] = {E[7] - E[5], E[2] - E[6], E[3] - E[1]};
+    const real squares[4] = {R(1.0) + R(2.0) * E[0] - trace, R(1.0) + R(2.0) * E[4] - trace,
+                             R(1.0) + R(2.0) * E[8] - trace, R(1.0) + trace};
+    for (int i = 0; i < 3; i++)
+        if (squares[i] > squares[largest]) largest = i;
+    for (int i = 0; i < 3; i++) {
+        e[i] = largest == 3 ? skew[i] : E[3 * i + largest] + E[3 * largest + i];
+        if (i == largest) e[i] = squares[i];
+    }
+    w = largest == 3 ? squares[3] : skew[largest];
+    if (w < R(0.0)) w = -w, e[0] = -e[0], e[1] = -e[1], e[2] = -e[2];
+    size = ik_norm(3, e);
+    const real ratio = size > R(1e-9) * w ? R(2.0) * HK_MATH(atan2)(size, w) / size : R(2.0) / w;
+    for (int i = 0; i < 3; i++) e[i] *= ratio;
+}
+
+/* The error e (m) of x to a target, both of `width` numbers. */
+static inline void ik_difference(const ik_settings *ik, const real *x, const real *target,
+                                 real *e) {
+    if (IK_IS_POSE(ik)) {
+        for (int i = 0; i < 3; i++) e[i] = target[4 * i + 3] - x[4 * i + 3];
+        ik_turn(target, x, e + 3);
+        for (int i = 0; i < 6; i++) e[i] *= ik->scale[i];
+    } else
+        for (int i = 0; i < ik->m; i++) e[i] = ik->scale[i] * (target[i] - x[i]);
+}
+
+/* x (16) of a pose, from the tip and its axes (3, 3). */
+static inline void ik_pose_of(const real *tip, const real *turn, real *x) {
+    for (int i = 0; i < 16; i++) {
+        const int row = i / 4, column = i % 4;
+        x[i] = row == 3 ? (real)(column == 3) : column == 3 ? tip[row] : turn[3 * row + column];
+    }
+}
+
+/* Take the units of the task into J (m, n). */
+static inline void ik_scale_rows(const ik_settings *ik, real *J) {
+    for (int i = 0; i < ik->m; i++)
+        for (int j = 0; ik->scale[i] != R(1.0) && j < ik->n; j++) J[ik->n * i + j] *= ik->scale[i];
 }
 
 /* lambda^2, zero for a healthy J and growing smoothly from there (Nakamura & Hanafusa, 1986). */
@@ -77,7 +154,7 @@ static HK_NOINLINE void ik_limited_in_plane(const ik_settings *ik, const real *J
                                             const real *z, const real *aside, const real *lower,
                                             const real *upper, real damping_sq, real *dq) {
     const int n = ik->n, m = ik->m;
-    real rows[IK_MOST_ROWS * HK_MAX_N], motion[IK_MOST_ROWS], g[IK_MOST_PAIRS];
+    real *rows = ik_slot(ik, IK_IN_PLANE), motion[IK_MOST_ROWS], g[IK_MOST_PAIRS];
     const real stiff = IK_BALANCE * ik_norm(m * n, J);
     for (int i = 0; i < m * n; i++) rows[i] = J[i];
     for (int i = 0; i < m; i++) motion[i] = v[i];
@@ -97,18 +174,21 @@ static HK_NOINLINE void ik_limited_in_plane(const ik_settings *ik, const real *J
    lambda^2 / sigma_max^2 in place of the settings' damping, NULL where that counts. */
 HK_INLINE void ik_limited_step_of(int m, int n, const ik_settings *ik, const real *J, const real *v,
                                   int slides, const real *trust, ik_step_t *s) {
-    real own[(IK_ROWS + 2) * HK_MAX_N], z[HK_MAX_N], mu[IK_ROWS], g[IK_PAIRS];
+    real ends[2 * HK_MAX_N], z[HK_MAX_N], mu[IK_ROWS], g[IK_PAIRS];
     real low = R(0.0), high, damping_sq, *dq = s->dq;
+    const int exact = m != 3 && !trust && !ik->quick;
+    ik_eigen e;
     const real *lower = s->lower, *upper = s->upper;
     for (int j = 0; j < n; j++) z[j] = slides ? s->posture[j] : R(0.0);
     if (ik->flags & IK_WEIGHTS) {
+        real *own = ik_slot(ik, IK_WEIGHTED);
         for (int j = 0; j < n; j++) {
             for (int i = 0; i < m; i++) own[n * i + j] = J[n * i + j] * ik->unit[j];
-            own[m * n + j] = lower[j] / ik->unit[j];
-            own[(m + 1) * n + j] = upper[j] / ik->unit[j];
+            ends[j] = lower[j] / ik->unit[j];
+            ends[n + j] = upper[j] / ik->unit[j];
             z[j] = z[j] / ik->unit[j];
         }
-        J = own, lower = own + m * n, upper = own + (m + 1) * n;
+        J = own, lower = ends, upper = ends + n;
     }
     ik_products(m, n, J, NULL, g);
     if (trust)
@@ -116,13 +196,21 @@ HK_INLINE void ik_limited_step_of(int m, int n, const ik_settings *ik, const rea
     else {
         if (m == 3)
             ik_singular_values(g, &low, &high);
-        else
+        else if (exact) {
+            ik_eigen_of(m, g, &e);
+            ik_eigen_ends(m, &e, &low, &high);
+        } else
             ik_pivots(m, g, &low, &high);
         damping_sq = ik_damping_sq(ik, low, high);
     }
-    const ik_factors f = ik_factor(m, g, damping_sq);
-    ik_solve(m, &f, v, mu);
-    if (slides) ik_null_projection(m, n, J, g, z);
+    if (exact) {
+        ik_eigen_solve(m, &e, v, damping_sq, mu);
+        if (slides) ik_eigen_projection(m, n, J, &e, z);
+    } else {
+        const ik_factors f = ik_factor(m, g, damping_sq);
+        ik_solve(m, &f, v, mu);
+        if (slides) ik_null_projection(m, n, J, g, z);
+    }
     ik_columns_of(m, n, J, mu, z, dq);
     if (ik->flags & IK_LIMITED) {
         int over =
@@ -191,62 +279,223 @@ static inline void ik_step_bounds(const ik_settings *ik, const real *q, real sec
     }
 }
 
+/* The largest change of a motion `way` (m) of the task per period, in multiples of it. */
+static inline real ik_braking(const ik_settings *ik, const real *J, const real *way, real seconds,
+                              ik_step_t *s) {
+    real least = R(INFINITY);
+    for (int j = 0; j < ik->n; j++) s->lower[j] = -least, s->upper[j] = least;
+    ik_limited_step(ik, J, way, 0, NULL, s);
+    for (int j = 0; j < ik->n; j++) {
+        const real ratio = ik->accel[j] * seconds * seconds / ik_abs(s->dq[j]);
+        least = ratio < least ? ratio : least;
+    }
+    return least;
+}
+
 /* Limit the speed towards target and posture so that the actuators can brake in time: shorten the
    posture step, and return the share of the error e that may be taken back. */
 static inline real ik_brake(const ik_settings *ik, const real *q, const real *J, const real *e,
                             real seconds, ik_step_t *s) {
-    real least = R(INFINITY);
-    for (int j = 0; j < ik->n; j++) s->lower[j] = -least, s->upper[j] = least;
-    ik_limited_step(ik, J, e, 0, NULL, s);
+    const real least = ik_braking(ik, J, e, seconds, s);
     for (int j = 0; j < ik->n; j++) {
-        const real change = ik->accel[j] * seconds * seconds, ratio = change / ik_abs(s->dq[j]);
+        const real change = ik->accel[j] * seconds * seconds;
         const real most = ik_stopping(ik_abs(ik->posture[j] - q[j]), change);
-        least = ratio < least ? ratio : least;
         s->posture[j] = ik_clip(s->posture[j], -most, most);
     }
     return ik_stopping(R(1.0), least);
 }
 
-/* The model at one configuration. Every step and tick calls this one, and gets the same bits; who
-   includes this file writes it. */
-static void ik_model(const ik_settings *ik, const real *q, real *x, real *J, real *distance);
+/* The components (n_spaces) of a motion of the tip along the normals of the half-spaces. */
+static inline void ik_along(const ik_settings *ik, const real *way, real *along) {
+    for (int i = 0; i < ik->n_spaces; i++) {
+        along[i] = R(0.0);
+        for (int r = 0; r < ik->m; r++) along[i] += ik->spaces[r * ik->n_spaces + i] * way[r];
+    }
+}
+
+/* The shortest motion (m) of the tip that goes along no normal farther than `margin` (n_spaces).
+
+   It is -A^T nu, where nu >= 0 minimises |A^T nu|^2 / 2 + nu . margin: a change of nu is a step in a
+   box. Rounds on the multipliers take out the effect of its damping. */
+static HK_NOINLINE void ik_way_in(const ik_settings *ik, const real *margin, real *way) {
+    const int k = ik->n_spaces, m = ik->m;
+    const real rounding = HK_MATH(sqrt)(HK_EPS), small = rounding > R(1e-6) ? rounding : R(1e-6);
+    real nu[HK_MAX_N], z[HK_MAX_N], lower[HK_MAX_N], upper[HK_MAX_N], change[HK_MAX_N];
+    real still[IK_ROWS], moved[IK_ROWS];
+    int out = 0;
+    for (int r = 0; r < m; r++) way[r] = still[r] = R(0.0);
+    for (int i = 0; i < k; i++) {
+        nu[i] = R(0.0), upper[i] = R(INFINITY);
+        out |= margin[i] < R(0.0);
+    }
+    for (int round = 0; out && round <= IK_PROXIMAL; round++) {
+        real mu[IK_MOST_ROWS] = {R(0.0)};
+        ik_along(ik, way, z);
+        for (int i = 0; i < k; i++) z[i] = (z[i] - margin[i]) / small, lower[i] = -nu[i];
+        ik_box(m, k, ik->spaces, still, z, lower, upper, small, mu, change);
+        for (int i = 0; i < k; i++) nu[i] += change[i];
+        IK_OF(m, ik_rows_of, k, ik->spaces, change, moved);
+        for (int r = 0; r < m; r++) way[r] -= moved[r];
+    }
+}
+
+/* A motion v (m), moved into what the margins allow. */
+static inline void ik_allowed(const ik_settings *ik, const real *margin, const real *v,
+                              real *allowed) {
+    real along[HK_MAX_N], way[IK_ROWS];
+    ik_along(ik, v, along);
+    for (int i = 0; i < ik->n_spaces; i++) along[i] = margin[i] - along[i];
+    ik_way_in(ik, along, way);
+    for (int r = 0; r < ik->m; r++) allowed[r] = v[r] + way[r];
+}
+
+/* How far a step leads beyond the margins, over (n_spaces); whether anywhere by more than
+   rounding. */
+static inline int ik_leaves(const ik_settings *ik, const real *J, const real *dq,
+                            const real *margin, real *over) {
+    real moved[IK_ROWS];
+    int any = 0;
+    IK_OF(ik->m, ik_rows_of, ik->n, J, dq, moved);
+    ik_along(ik, moved, over);
+    for (int i = 0; i < ik->n_spaces; i++) {
+        over[i] -= margin[i];
+        any |= over[i] > R(32.0) * HK_EPS;
+    }
+    return any;
+}
+
+/* The share of the way from one step to another after which it leaves no margin, where the other is
+   beyond one, `over`, and this one is not, `least`. */
+static inline real ik_share(const ik_settings *ik, const real *least, const real *over) {
+    const real close = R(32.0) * HK_EPS;
+    real share = R(1.0);
+    for (int i = 0; i < ik->n_spaces; i++) {
+        if (!(over[i] > close)) continue;
+        const real here = ik_clip((close - least[i]) / (over[i] - least[i]), R(0.0), R(1.0));
+        share = here < share ? here : share;
+    }
+    return share;
+}
+
+/* A step `safe` (n) on the shortest way back into the half-spaces, as far as the bounds allow and
+   it leads out of none; the margins of those that it does not reach are widened up to it. */
+static inline void ik_safe_step(const ik_settings *ik, const real *J, const ik_step_t *s,
+                                real *margin, real *safe) {
+    real rest[HK_MAX_N], least[HK_MAX_N], over[HK_MAX_N], way[IK_ROWS];
+    ik_step_t back;
+    for (int j = 0; j < ik->n; j++) {
+        back.lower[j] = s->lower[j], back.upper[j] = s->upper[j];
+        rest[j] = ik_clip(R(0.0), s->lower[j], s->upper[j]);
+    }
+    ik_way_in(ik, margin, way);
+    ik_limited_step(ik, J, way, 0, NULL, &back);
+    ik_leaves(ik, J, rest, margin, least);
+    ik_leaves(ik, J, back.dq, margin, over);
+    for (int i = 0; i < ik->n_spaces; i++) /* no farther out than at rest */
+        if (least[i] > R(0.0)) over[i] -= least[i], least[i] = R(0.0);
+    const real share = ik_share(ik, least, over);
+    for (int j = 0; j < ik->n; j++)
+        safe[j] = ik_clip(rest[j] + share * (back.dq[j] - rest[j]), s->lower[j], s->upper[j]);
+    ik_leaves(ik, J, safe, margin, over);
+    for (int i = 0; i < ik->n_spaces; i++) margin[i] += over[i] > R(0.0) ? over[i] : R(0.0);
+}
+
+/* A step within its bounds after which, to first order, the tip is within the half-spaces: it has
+   `margin` (n_spaces) left. If the bounds move it out, alternating projections look for a motion
+   that meets both, and at last a share of the way from a safe step. */
+static HK_NOINLINE void ik_step_inside(const ik_settings *ik, const real *J, const real *v,
+                                       real *margin, int slides, ik_step_t *s) {
+    const int n = ik->n, m = ik->m;
+    real wanted[IK_ROWS], over[HK_MAX_N];
+    int stopped = 0;
+    ik_allowed(ik, margin, v, wanted);
+    ik_limited_step(ik, J, wanted, slides, NULL, s);
+    if (ik_leaves(ik, J, s->dq, margin, over)) {
+        real moved[IK_ROWS], least[HK_MAX_N], safe[HK_MAX_N] = {R(0.0)};
+        ik_safe_step(ik, J, s, margin, safe);
+        int out = ik_leaves(ik, J, s->dq, margin, over);
+        for (int round = 0; out && round < IK_PROJECTIONS; round++) {
+            for (int i = 0; i < ik->n_spaces; i++) over[i] = -over[i];
+            ik_way_in(ik, over, wanted);
+            IK_OF(m, ik_rows_of, n, J, s->dq, moved);
+            for (int r = 0; r < m; r++) wanted[r] = moved[r] + IK_EXCESS * wanted[r];
+            ik_limited_step(ik, J, wanted, slides, NULL, s);
+            out = ik_leaves(ik, J, s->dq, margin, over);
+        }
+        if (out) {
+            ik_leaves(ik, J, safe, margin, least);
+            const real share = ik_share(ik, least, over);
+            for (int j = 0; j < n; j++) {
+                s->dq[j] = ik_clip(safe[j] + share * (s->dq[j] - safe[j]), s->lower[j], s->upper[j]);
+                s->held[j] = (unsigned char)((s->dq[j] <= s->lower[j]) | (s->dq[j] >= s->upper[j]));
+            }
+        }
+    }
+    for (int r = 0; r < m; r++) stopped |= ik_abs(wanted[r] - v[r]) > R(32.0) * HK_EPS;
+    s->stopped = stopped;
+}
+
+/* The model at one configuration: x (width) and its derivative J (m, n). Every step and tick calls
+   this one, and gets the same bits; who includes this file writes it. */
+static void ik_model(const ik_settings *ik, const real *q, real *x, real *J);
+
+/* x (width) at q, and the motions J (m, n) of the task that keep to the plane. */
+static inline void ik_look(const ik_settings *ik, const real *q, real *x, real *J) {
+    ik_model(ik, q, x, J);
+    ik_scale_rows(ik, J);
+    ik_in_plane(ik, ik->m, J);
+}
 
 /* A step of a model whose Jacobian jumps where tendons get slack or taut: J where it ends, and what
    is missing there of the motion of the tip, as the model computes it. */
 typedef struct {
-    real dq[HK_MAX_N], J[3 * HK_MAX_N], missing[3], distance;
+    real dq[HK_MAX_N], missing[IK_ROWS], distance, *J;
 } ik_end;
+
+static inline void ik_copy_end(const ik_settings *ik, const ik_end *from, ik_end *to) {
+    for (int j = 0; j < ik->n; j++) to->dq[j] = from->dq[j];
+    for (int i = 0; i < ik->m; i++) to->missing[i] = from->missing[i];
+    for (int i = 0; i < ik->m * ik->n; i++) to->J[i] = from->J[i];
+    to->distance = from->distance;
+}
+
+/* The length of a column of J (m, n). */
+static inline real ik_column(const ik_settings *ik, const real *J, int j) {
+    real sum = R(0.0);
+    for (int i = 0; i < ik->m; i++) sum += J[ik->n * i + j] * J[ik->n * i + j];
+    return HK_MATH(sqrt)(sum);
+}
 
 /* Clear what a learned error makes of the columns of slack tendons: it would drive them far. */
 static void ik_clear_slack(const ik_settings *ik, real *J) {
     real size[HK_MAX_N], largest = R(0.0);
     for (int j = 0; j < ik->n; j++) {
-        const real column[3] = {J[j], J[ik->n + j], J[2 * ik->n + j]};
-        size[j] = ik_norm(3, column);
+        size[j] = ik_column(ik, J, j);
         largest = ik_larger(size[j], largest);
     }
     for (int j = 0; j < ik->n; j++)
         if (ik->pulls[j] != R(0.0) && size[j] <= IK_SLACK * largest)
-            for (int i = 0; i < 3; i++) J[ik->n * i + j] = R(0.0);
+            for (int i = 0; i < ik->m; i++) J[ik->n * i + j] = R(0.0);
 }
 
 static void ik_evaluate(const ik_settings *ik, const real *q, const real *x, const real *motion,
                         ik_end *end) {
-    real at[HK_MAX_N], tip[3];
+    real at[HK_MAX_N], tip[IK_WIDTH], moved[IK_ROWS];
     for (int j = 0; j < ik->n; j++) at[j] = q[j] + end->dq[j];
-    ik_model(ik, at, tip, end->J, NULL);
-    ik_in_plane(ik, 3, end->J);
+    ik_look(ik, at, tip, end->J);
     ik_clear_slack(ik, end->J);
-    for (int i = 0; i < 3; i++) end->missing[i] = motion[i] - (tip[i] - x[i]);
-    end->distance = ik_norm(3, end->missing);
+    ik_difference(ik, x, tip, moved);
+    for (int i = 0; i < ik->m; i++) end->missing[i] = motion[i] - moved[i];
+    end->distance = ik_norm(ik->m, end->missing);
 }
 
 /* Newton's method for a motion of the tip, from an end and within the bounds of the step: the
    nearest of a few ends. */
 static void ik_approach(const ik_settings *ik, const real *q, const real *x, const real *motion,
                         real close, const ik_step_t *s, ik_end *best) {
+    ik_end end = {.J = ik_slot(ik, IK_END + 2)};
     ik_evaluate(ik, q, x, motion, best);
-    ik_end end = *best;
+    ik_copy_end(ik, best, &end);
     for (int i = 0; i < IK_CORRECTIONS && best->distance > close; i++) {
         ik_step_t more;
         for (int j = 0; j < ik->n; j++) {
@@ -260,7 +509,7 @@ static void ik_approach(const ik_settings *ik, const real *q, const real *x, con
             if (more.dq[j] >= more.upper[j]) end.dq[j] = s->upper[j];
         }
         ik_evaluate(ik, q, x, motion, &end);
-        if (end.distance < best->distance) *best = end;
+        if (end.distance < best->distance) ik_copy_end(ik, &end, best);
     }
 }
 
@@ -269,8 +518,8 @@ static int ik_pull_in(const ik_settings *ik, const ik_step_t *s, real share, ik_
     int moved = 0;
     for (int j = 0; j < ik->n; j++) {
         const real to = ik->pulls[j] < R(0.0) ? s->lower[j] : s->upper[j], way = to - end->dq[j];
-        const real column[3] = {end->J[j], end->J[ik->n + j], end->J[2 * ik->n + j]};
-        if (ik->pulls[j] == R(0.0) || ik_norm(3, column) > R(0.0) || !ik_finite(1, &way)) continue;
+        const int slack = ik->pulls[j] != R(0.0) && !(ik_column(ik, end->J, j) > R(0.0));
+        if (!slack || !ik_finite(1, &way)) continue;
         end->dq[j] = ik_clip(to - (R(1.0) - share) * way, s->lower[j], s->upper[j]);
         moved |= way != R(0.0);
     }
@@ -281,23 +530,23 @@ static int ik_pull_in(const ik_settings *ik, const ik_step_t *s, real share, ik_
    half of the motion v, pull in slack tendons, as far as the tip gets nearer to v or not away. */
 static void ik_arrive(const ik_settings *ik, const real *q, const real *x, const real *J,
                       const real *v, ik_step_t *s) {
-    const int n = ik->n;
+    const int n = ik->n, m = ik->m;
     const real slip =
-        ik_norm(3 * n, J) * (IK_SLIP * ik_norm(n, s->dq) + R(32.0) * HK_EPS * ik_norm(n, q));
-    real promised[3], left[3];
-    ik_end end;
-    ik_rows_of(3, n, J, s->dq, promised);
+        ik_norm(m * n, J) * (IK_SLIP * ik_norm(n, s->dq) + R(32.0) * HK_EPS * ik_norm(n, q));
+    real promised[IK_ROWS], left[IK_ROWS];
+    ik_end end = {.J = ik_slot(ik, IK_END)}, pulled = {.J = ik_slot(ik, IK_END + 1)};
+    IK_OF(m, ik_rows_of, n, J, s->dq, promised);
     for (int j = 0; j < n; j++) end.dq[j] = s->dq[j];
-    ik_approach(ik, q, x, promised, ik_larger(R(0.5) * ik_norm(3, promised), slip), s, &end);
-    for (int i = 0; i < 3; i++) left[i] = v[i] - promised[i] + end.missing[i];
+    ik_approach(ik, q, x, promised, ik_larger(R(0.5) * ik_norm(m, promised), slip), s, &end);
+    for (int i = 0; i < m; i++) left[i] = v[i] - promised[i] + end.missing[i];
     const real rounding = R(1.0) + HK_MATH(sqrt)(HK_EPS); /* a slack tendon does not move the tip */
-    const real most = ik_norm(3, left), close = ik_larger(R(0.5) * ik_norm(3, v), slip);
+    const real most = ik_norm(m, left), close = ik_larger(R(0.5) * ik_norm(m, v), slip);
     for (real share = R(1.0); most > close && share > IK_LEAST_PULL; share *= IK_PULL_RATIO) {
-        ik_end pulled = end;
+        ik_copy_end(ik, &end, &pulled);
         if (!ik_pull_in(ik, s, share, &pulled)) break;
         ik_approach(ik, q, x, v, slip, s, &pulled);
         if (pulled.distance > rounding * most) continue;
-        end = pulled;
+        ik_copy_end(ik, &pulled, &end);
         break;
     }
     for (int j = 0; j < n; j++) {
@@ -307,33 +556,52 @@ static void ik_arrive(const ik_settings *ik, const real *q, const real *x, const
 }
 
 /* Eq. (1) for one period from q: the error e and the motion `feed` of the target (may be NULL) are
-   taken back. What is not finite, or overflows, holds still, with a limit of acceleration after it
-   has braked; from outside the limits the actuators that are known walk back. */
+   taken back. `tip` (m) is where half-spaces see it. What is not finite, or overflows, holds still,
+   with a limit of acceleration after it has braked; from outside the limits the actuators that are
+   known walk back. */
 static HK_NOINLINE void ik_control(const ik_settings *ik, const real *q, const real *x,
                                    const real *J, const real *e, const real *feed, real seconds,
-                                   const real *last, ik_step_t *s) {
-    const int n = ik->n;
-    real taut[3 * HK_MAX_N], v[3], gain = ik->gain < R(0.0) ? R(1.0) : ik->gain * seconds,
-                                   beta = ik->beta * seconds;
+                                   const real *last, const real *tip, ik_step_t *s) {
+    const int n = ik->n, m = ik->m, slides = ik->flags & IK_POSTURE;
+    real v[IK_ROWS], gain = ik->gain < R(0.0) ? R(1.0) : ik->gain * seconds;
+    real beta = ik->beta * seconds;
     gain = gain > R(1.0) ? R(1.0) : gain;
     beta = beta > R(1.0) ? R(1.0) : beta;
-    for (int i = 0; i < 3; i++) v[i] = gain * e[i] + (feed ? feed[i] : R(0.0));
-    const real sizes[2] = {ik_norm(3, e), ik_norm(3, v)};
+    for (int i = 0; i < m; i++) v[i] = gain * e[i] + (feed ? feed[i] : R(0.0));
+    const real sizes[2] = {ik_norm(m, e), ik_norm(m, v)};
     const int known = !last || ik_finite(n, last);
-    if (known && ik_finite(n, q) && ik_finite(3 * n, J) && ik_finite(2, sizes)) {
+    s->stopped = 0;
+    if (known && ik_finite(n, q) && ik_finite(m * n, J) && ik_finite(2, sizes)) {
         if (ik->flags & IK_PULLS) {
-            for (int j = 0; j < 3 * n; j++) taut[j] = J[j];
+            real *taut = ik_slot(ik, IK_TAUT);
+            for (int j = 0; j < m * n; j++) taut[j] = J[j];
             ik_clear_slack(ik, taut);
             J = taut;
         }
         for (int j = 0; j < n; j++) s->posture[j] = beta * (ik->posture[j] - q[j]);
         if (ik->flags & IK_ACCELERATES) {
             const real share = ik_brake(ik, q, J, e, seconds, s);
-            for (int i = 0; i < 3; i++)
+            for (int i = 0; i < m; i++)
                 v[i] = (share < gain ? share : gain) * e[i] + (feed ? feed[i] : R(0.0));
         }
-        ik_step_bounds(ik, q, seconds, last, s);
-        ik_limited_step(ik, J, v, ik->flags & IK_POSTURE, NULL, s);
+        if (IK_IN_SPACES(ik)) {
+            const int k = ik->n_spaces;
+            real margin[HK_MAX_N], left[HK_MAX_N];
+            ik_along(ik, tip, left);
+            for (int i = 0; i < k; i++) margin[i] = ik->offsets[i] - left[i];
+            for (int i = 0; i < k && ik->flags & IK_ACCELERATES; i++) {
+                real normal[IK_ROWS];
+                for (int r = 0; r < m; r++) normal[r] = ik->spaces[r * k + i];
+                margin[i] = ik_stopping(margin[i], ik_braking(ik, J, normal, seconds, s));
+            }
+            for (int i = 0; i < k; i++) left[i] = margin[i];
+            ik_step_bounds(ik, q, seconds, last, s);
+            ik_step_inside(ik, J, v, left, slides, s);
+            ik_allowed(ik, margin, v, v);
+        } else {
+            ik_step_bounds(ik, q, seconds, last, s);
+            ik_limited_step(ik, J, v, slides, NULL, s);
+        }
         if (ik->flags & IK_PULLS && ik_finite(n, s->dq)) ik_arrive(ik, q, x, J, v, s);
         if (ik_finite(n, s->dq)) return; /* else v is too large to compute with */
     }
@@ -345,53 +613,98 @@ static HK_NOINLINE void ik_control(const ik_settings *ik, const real *q, const r
     s->sigma_min = R(NAN), s->damping = R(0.0);
 }
 
-enum { IK_STATE = IK_Q + 7 * HK_MAX_N }; /* numbers of the state at most */
+/* The parts of the state of a robot that follows targets. */
+typedef struct {
+    real *target, *feed, *tip, *offset, *x, *error, *q, *dq, *before, *held, *J;
+} ik_state;
 
-/* One period of a robot that follows targets. */
-static inline void ik_tick(const ik_settings *ik, real *state) {
-    const int n = ik->n, mode = (int)state[IK_MODE];
-    const real *target = state + IK_TARGET, *tip = state + IK_TIP, period = state[IK_PERIOD];
-    real *q = state + IK_Q, *dq = q + n, *before = q + 2 * n, *held = q + 3 * n, *J = q + 4 * n;
-    real *x = state + IK_X, *error = state + IK_ERROR, *offset = state + IK_OFFSET;
-    const real memory = state[IK_MEMORY];
-    real used[3] = {R(0.0), R(0.0), R(0.0)}, *last = NULL, moved[HK_MAX_N];
-    ik_step_t step;
-    ik_model(ik, q, x, J, NULL);
-    ik_in_plane(ik, 3, J);
-    for (int i = 0; i < 3; i++) error[i] = R(NAN);
-    if (mode & IK_HAS_TARGET) {
-        real apart[3];
-        for (int i = 0; i < 3; i++) {
-            used[i] = target[i] - x[i];
-            error[i] = mode & IK_HAS_TIP ? target[i] - tip[i] : used[i];
-            apart[i] = used[i] - error[i];
-        }
-        if (mode & IK_HAS_TIP) {
-            /* Without a measurement, use the model's error corrected by the remembered offset;
-               without memory, use no error. */
-            const int seen = mode & IK_MUST_SEE || ik_finite(3, apart);
-            for (int i = 0; i < 3; i++) {
-                used[i] = seen ? error[i] : used[i] - (memory > R(0.0) ? offset[i] : used[i]);
-                offset[i] = seen ? apart[i] : offset[i];
-            }
+#define IK_STATE_SIZE(n, m, width) (IK_TARGET + 3 * (width) + 3 * (m) + 4 * (n) + (m) * (n))
+
+static inline ik_state ik_state_of(const ik_settings *ik, real *state) {
+    ik_state parts;
+    parts.target = state + IK_TARGET;
+    parts.feed = parts.target + ik->width;
+    parts.tip = parts.feed + ik->m;
+    parts.offset = parts.tip + ik->width;
+    parts.x = parts.offset + ik->m;
+    parts.error = parts.x + ik->width;
+    parts.q = parts.error + ik->m;
+    parts.dq = parts.q + ik->n;
+    parts.before = parts.dq + ik->n;
+    parts.held = parts.before + ik->n;
+    parts.J = parts.held + ik->n;
+    return parts;
+}
+
+/* Whether a pose (4, 4) holds a rotation, or something that is not finite. */
+static inline int ik_is_rotation(const real *T) {
+    real off = R(0.0);
+    for (int i = 0; i < 3; i++) {
+        for (int j = 0; j < 3; j++)
+            if (!ik_finite(1, T + 4 * i + j)) return 1;
+        for (int j = 0; j <= i; j++) {
+            real product = i == j ? R(-1.0) : R(0.0);
+            for (int l = 0; l < 3; l++) product += T[4 * l + i] * T[4 * l + j];
+            off = ik_larger(ik_abs(product), off);
         }
     }
+    const real det = T[0] * (T[5] * T[10] - T[6] * T[9]) - T[1] * (T[4] * T[10] - T[6] * T[8]) +
+                     T[2] * (T[4] * T[9] - T[5] * T[8]);
+    return off <= R(1e-3) && det > R(0.0);
+}
+
+/* One period of a robot that follows targets. Returns 0, and does nothing, if a pose in the state
+   holds no rotation. */
+static inline int ik_tick(const ik_settings *ik, real *state) {
+    const int n = ik->n, m = ik->m, mode = (int)state[IK_MODE];
+    const ik_state now = ik_state_of(ik, state);
+    const real period = state[IK_PERIOD], memory = state[IK_MEMORY];
+    real used[IK_ROWS], seen_at[IK_ROWS], *last = NULL, moved[HK_MAX_N];
+    int seen = 0;
+    ik_step_t step;
+    if (IK_IS_POSE(ik) && ((mode & IK_HAS_TARGET && !ik_is_rotation(now.target)) ||
+                           (mode & IK_HAS_TIP && !ik_is_rotation(now.tip))))
+        return 0;
+    ik_look(ik, now.q, now.x, now.J);
+    for (int i = 0; i < m; i++) used[i] = R(0.0), now.error[i] = R(NAN);
+    if (mode & IK_HAS_TARGET) {
+        ik_difference(ik, now.x, now.target, used);
+        for (int i = 0; i < m; i++) now.error[i] = used[i];
+    }
+    if (mode & IK_HAS_TARGET && mode & IK_HAS_TIP) {
+        /* Without a measurement, use the model's error corrected by the remembered offset;
+           without memory, use no error. */
+        real apart[IK_ROWS];
+        ik_difference(ik, now.tip, now.target, now.error);
+        for (int i = 0; i < m; i++) apart[i] = used[i] - now.error[i];
+        seen = mode & IK_MUST_SEE || ik_finite(m, apart);
+        for (int i = 0; i < m; i++) {
+            const real remembered = memory > R(0.0) ? now.offset[i] : used[i];
+            used[i] = seen ? now.error[i] : used[i] - remembered;
+            now.offset[i] = seen ? apart[i] : now.offset[i];
+        }
+    }
+    for (int i = 0; i < m; i++) /* a step alone knows of no earlier measurement */
+        seen_at[i] = now.x[i] + (seen || !(mode & IK_MUST_SEE) ? now.offset[i] : R(0.0));
     if (ik->flags & IK_ACCELERATES && !(mode & IK_FROM_REST)) {
         const real ratio = state[IK_LAST] > R(0.0) ? period / state[IK_LAST] : R(1.0);
         last = moved;
-        for (int j = 0; j < n; j++) last[j] = ratio * dq[j];
+        for (int j = 0; j < n; j++) last[j] = ratio * now.dq[j];
     }
-    ik_control(ik, q, x, J, used, mode & IK_HAS_FEED ? state + IK_FEED : NULL, period, last, &step);
+    ik_control(ik, now.q, now.x, now.J, used, mode & IK_HAS_FEED ? now.feed : NULL, period, last,
+               seen_at, &step);
     state[IK_LAST] = period;
     if (memory > R(0.0))
-        for (int i = 0; i < 3; i++) offset[i] *= HK_MATH(exp)(-period / memory);
+        for (int i = 0; i < m; i++) now.offset[i] *= HK_MATH(exp)(-period / memory);
     state[IK_SIGMA_MIN] = step.sigma_min;
     state[IK_DAMPING] = step.damping;
-    state[IK_DISTANCE] = ik_norm(3, error);
+    state[IK_DISTANCE] = ik_norm(m, now.error);
+    state[IK_STOPPED] = (real)step.stopped;
     for (int j = 0; j < n; j++) {
-        before[j] = q[j];
-        dq[j] = step.dq[j];
-        held[j] = step.held[j];
-        q[j] = q[j] + dq[j];
+        now.before[j] = now.q[j];
+        now.dq[j] = step.dq[j];
+        now.held[j] = step.held[j];
+        now.q[j] = now.q[j] + step.dq[j];
     }
+    return 1;
 }

@@ -22,7 +22,8 @@ typedef int64_t hk_bits;
 #endif
 #define R(c) ((real)(c))
 
-/* Code exported for one model sets HK_KINDS, one bit per kind of its nodes, and its own sizes. */
+/* Code exported for one model sets HK_KINDS, one bit per kind of its nodes, its own sizes, and
+   whether its task is a pose (HK_POSES) or has half-spaces (HK_SPACES). */
 #ifdef HK_KINDS
 #define HK_USES(kind) ((HK_KINDS >> (kind)) % 2u)
 #define HK_IS_ONLY_CHAIN(kind) ((HK_KINDS & 14u) == 1u << (kind)) /* of the first three kinds */
@@ -32,6 +33,8 @@ typedef int64_t hk_bits;
 #else
 #define HK_USES(kind) 1
 #define HK_IS_ONLY_CHAIN(kind) 0
+#define HK_POSES 1 /* of a task */
+#define HK_SPACES 1
 #define HK_COMMON(sizes) (sizes) /* have instances of their own, which keep all in registers */
 #define HK_INLINE static inline __attribute__((always_inline))
 #define HK_NOINLINE __attribute__((noinline))
@@ -41,7 +44,7 @@ typedef int64_t hk_bits;
 #define HK_MOST_Z(n, S) (3 * (S) > (n) ? 3 * (S) : (n)) /* inner coordinates */
 
 /* A plan begins with its largest sizes. */
-enum { HK_MOST_N, HK_MOST_S, HK_MOST_M, HK_MOST_F, HK_MOST_P };
+enum { HK_MOST_N, HK_MOST_S, HK_MOST_M, HK_MOST_F, HK_MOST_P, HK_MOST_R };
 
 /* A node of a plan: code[at] is its kind, then the lengths of its input and output, where its
    numbers begin in `data`, and what else its kind needs: sizes, and where its parts stand. */

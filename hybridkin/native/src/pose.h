@@ -1,4 +1,5 @@
-/* Readouts of pose features: weights on the axes of a robot's frames, and on moments about them. */
+/* Poses of chains, and readouts of pose features: weights on the axes of a robot's frames, and on
+   moments about them. */
 
 /* What a readout needs of segment k: the frame before it, the features of the frame after it, and
    in the frame before it how the end of its arc moves and turns by its length and bendings. */
@@ -9,6 +10,8 @@ typedef struct {
     V arc_end[3], end[3]; /* end of the arc, and with its rigid offset */
     V moves[3][3], spins[3][3];
 } HK(posed);
+
+#define HK_POSED (int)(sizeof(HK(posed)) / sizeof(V)) /* numbers of it */
 
 static inline void HK(cross)(const V *a, const V *b, V *c) {
     for (int i = 0; i < 3; i++)
@@ -44,6 +47,61 @@ static inline void HK(follow)(V length, V bx, V by, real offset, V axes[3][3], V
         s->end[j] = at[j] = s->arc_end[j] + axes[2][j] * offset;
     }
 }
+
+/* The tip x (3) of arcs z (3 S) in the measuring frame, its axes as the columns of `turn` (3, 3), and
+   where C is not NULL the motion and the angular velocity C (6, 3 S) by the arcs. */
+static inline void HK(arcs_pose)(int S, const real *frame, const V *z, V *x, V *turn, V *C,
+                                 V *work) {
+    HK(posed) *segments = (HK(posed) *)HK(take)(&work, HK_POSED * S);
+    V axes[3][3];
+    for (int j = 0; j < 3; j++) {
+        x[j] = SPLAT(frame[9 + j]);
+        for (int axis = 0; axis < 3; axis++) axes[axis][j] = SPLAT(frame[3 * j + axis]);
+    }
+    for (int k = 0; k < S; k++)
+        HK(follow)(z[k], z[S + k], z[2 * S + k], frame[HK_FRAME + k], axes, x, segments + k);
+    for (int i = 0; i < 9; i++) turn[i] = axes[i % 3][i / 3];
+    for (int k = 0; C && k < S; k++) {
+        const HK(posed) *s = segments + k;
+        V lever[3];
+        for (int i = 0; i < 3; i++) lever[i] = x[i] - s->arc_end[i];
+        for (int part = 0; part < 3; part++) {
+            V move[3], spin[3], turned[3];
+            for (int i = 0; i < 3; i++) {
+                const V a = s->before[i], b = s->before[3 + i], c = s->before[6 + i];
+                move[i] = a * s->moves[part][0] + b * s->moves[part][1] + c * s->moves[part][2];
+                spin[i] = a * s->spins[part][0] + b * s->spins[part][1] + c * s->spins[part][2];
+            }
+            HK(cross)(spin, lever, turned);
+            for (int i = 0; i < 3; i++) {
+                C[(3 * i + part) * S + k] = move[i] + turned[i];
+                C[(9 + 3 * i + part) * S + k] = spin[i];
+            }
+        }
+    }
+}
+
+/* The tip x (3) of a chain, its axes `turn` (3, 3) and, where J is not NULL, their motion and angular
+   velocity J (6, n). */
+static inline void HK(chain_pose)(const hk_plan *p, int at, const V *q, V *x, V *turn, V *J,
+                                  V *work) {
+    const int32_t *more = p->code + at + HK_MORE;
+    const int n = p->code[at + HK_N], k = HK(n_coordinates)(p, at);
+    const real *numbers = hk_numbers(p, at);
+    V *z = HK(take)(&work, k), *C = HK(take)(&work, 6 * k);
+    HK(inside) in = HK(inside_of)(p, at, &work);
+    if (!J) C = NULL;
+    HK(coordinates)(p, at, q, z, &in);
+    if (HK_CHAIN_IS(p, at, HK_RIGID))
+        HK(rigid)(more[0], more + 2, numbers, z, x, C, turn, work);
+    else if (HK_USES(HK_ARCS) || HK_USES(HK_ELASTIC))
+        HK(arcs_pose)(more[0], numbers, z, x, turn, C, work);
+    for (int i = 0; J && i < 6 * n; i++) J[i] = SPLAT(0.0);
+    if (J) HK(pull_rows)(p, at, &in, 6, C, J);
+}
+
+#define HK_CHAIN_POSE_WORK(n, S)                                                                   \
+    (7 * HK_MOST_Z(n, S) + HK_INSIDE_WORK(n, S) + HK_RIGID_WORK(n) + 51 * (S))
 
 /* What a weighted sum of features does: its value, and by virtual work its slope by the arcs (3 S),
    for forces w on the lever from the base (3), then on the vectors of every frame (18; the last has
@@ -108,10 +166,9 @@ static inline void HK(pose_readout)(const hk_plan *p, int at, int n_out, const r
     const int S = p->code[at + HK_MORE], n = p->code[at + HK_N];
     const real *frame = hk_numbers(p, at);
     const V reach = SPLAT(frame[HK_FRAME - 1]);
-    const int numbers = (int)(sizeof(HK(posed)) / sizeof(V));
     V *z = HK(take)(&work, 3 * S), *by_arcs = HK(take)(&work, 3 * S);
     V axes[3][3], end[3] = {SPLAT(0.0), SPLAT(0.0), SPLAT(0.0)};
-    HK(posed) *segments = (HK(posed) *)HK(take)(&work, numbers * S);
+    HK(posed) *segments = (HK(posed) *)HK(take)(&work, HK_POSED * S);
     HK(inside) in = HK(inside_of)(p, at, &work);
     HK(coordinates)(p, at, q, z, &in);
     for (int i = 0; i < 9; i++) axes[i / 3][i % 3] = SPLAT(i % 4 == 0 ? 1.0 : 0.0);

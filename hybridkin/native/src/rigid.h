@@ -6,7 +6,7 @@
    joint's frame in the frame before it, turned so that its axis is z (rotation (3, 3), position
    (3)); of the first one in the measuring frame; then position and rotation of the tip in the last
    one. `slides` (n): which joints are prismatic. Where `frame` is not NULL it becomes the
-   rotation (3, 3) of the tip, and J (6, n) has the rows of its angular velocity. */
+   rotation (3, 3) of the tip, and J (6, n) also has the rows of its angular velocity. */
 static inline void HK(rigid)(int n, const int32_t *slides, const real *numbers, const V *q, V *x,
                              V *J, V *frame, V *work) {
     V turn[9], at[3] = {SPLAT(0.0), SPLAT(0.0), SPLAT(0.0)};
@@ -36,7 +36,7 @@ static inline void HK(rigid)(int n, const int32_t *slides, const real *numbers, 
         const real *column = numbers + 3 + i % 3;
         frame[i] = row[0] * column[0] + row[1] * column[3] + row[2] * column[6];
     }
-    for (int i = 0; frame && i < 3 * n; i++)
+    for (int i = 0; frame && J && i < 3 * n; i++)
         J[3 * n + i] = slides[i % n] ? SPLAT(0.0) : axes[i % n * 3 + i / n];
     for (int k = 0; J && k < n; k++)
         for (int i = 0; i < 3; i++) {
