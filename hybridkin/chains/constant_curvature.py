@@ -20,7 +20,13 @@ from hybridkin._core.stored import Layout, Stored
 from hybridkin.chains._arcs import turned_by_first
 from hybridkin.chains._checks import filled, float_dtype
 from hybridkin.chains._paths import bend_counts, free_arcs
-from hybridkin.chains.arc_chain import STRUCTURE, ArcChain, Change, each_marker, frame_numbers
+from hybridkin.chains.arc_chain import (
+    STRUCTURE,
+    ArcChain,
+    Change,
+    each_marker,
+    frame_numbers,
+)
 
 __all__ = ["ConstantCurvatureChain"]
 

@@ -15,7 +15,13 @@ from hybridkin._core.plan import Plan
 from hybridkin._core.stored import Layout, Stored
 from hybridkin.chains import _slack
 from hybridkin.chains._checks import filled, float_dtype
-from hybridkin.chains.arc_chain import STRUCTURE, ArcChain, Change, each_marker, frame_numbers
+from hybridkin.chains.arc_chain import (
+    STRUCTURE,
+    ArcChain,
+    Change,
+    each_marker,
+    frame_numbers,
+)
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
 
 __all__ = ["ElasticTendonChain"]

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from typing_extensions import Self
 
+from hybridkin._core.arrays import as_array
 from hybridkin._core.blocks import check_vectors, in_blocks
 from hybridkin._core.model import ForwardModel, PoseModel
-from hybridkin._core.plan import NoKernel, Plan
+from hybridkin._core.plan import CHAINS, NoKernel, Plan
 from hybridkin._core.rotations import rotation, rotation_vector
 from hybridkin._core.stored import Layout, Stored
 from hybridkin.chains.chain import Chain
@@ -228,6 +229,10 @@ def _turned(v: Tensor, motion: Tensor) -> Tensor:
     return (v.unflatten(-1, (-1, 3)) @ motion[:3, :3].to(v).mT).flatten(-2)
 
 
+def _write_stacked(plan: Plan, stored: Stored) -> int:
+    return plan.stack(stored.part("tips").parts.values())
+
+
 class Stacked(Hybrid):
     """The hybrids of all markers of a chain as one torch module q (..., n) -> x (..., 3 K).
 
@@ -241,7 +246,9 @@ class Stacked(Hybrid):
         The hybrid of every marker, on the chain of that marker alone.
     """
 
-    layout = Layout("stacked", {}, parts=("mechanical", "tips"))
+    layout = Layout(
+        "stacked", {}, parts=("mechanical", "tips"), write_plan=_write_stacked
+    )
 
     def __init__(self, mechanical: ForwardModel | None, tips: Sequence[Hybrid]) -> None:
         super().__init__()
@@ -320,6 +327,17 @@ class Stacked(Hybrid):
         return cast("list[Hybrid]", [*self.tips])
 
 
+def _write_with_pose(plan: Plan, stored: Stored) -> int:
+    chain = plan.node_of(stored.part("mechanical"))
+    if plan.kind(chain) not in CHAINS:
+        raise NoKernel(
+            f"a {stored.part('mechanical').kind!r} has no kernel of its pose"
+        )
+    learned = plan.node_of(stored.part("learned"))
+    radians = stored.derived["radians"]
+    return plan.node("with_pose", plan.lengths(chain)[0], 3, [radians], chain, learned)
+
+
 class WithPose(Hybrid, PoseModel):
     """Position and frame of the tip, p = p_mech + e_p and R = exp(e_r / reach) R_mech.
 
@@ -336,7 +354,9 @@ class WithPose(Hybrid, PoseModel):
         and shorten the six numbers together.
     """
 
-    layout = Layout("with_pose", {}, parts=("mechanical", "learned"))
+    layout = Layout(
+        "with_pose", {}, parts=("mechanical", "learned"), write_plan=_write_with_pose
+    )
     mechanical: PoseModel  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def __init__(self, mechanical: PoseModel, learned: HybridModule) -> None:
@@ -379,6 +399,12 @@ class WithPose(Hybrid, PoseModel):
     def with_drift(self, drift: AffineModule) -> Self:
         """Return the same model with another drift; this model does not change."""
         return type(self)(self.mechanical, self.learned.with_drift(drift))
+
+    def stored(self) -> Stored:
+        """Return the description of the model, for kernels with the radians per metre of e_r."""
+        stored = super().stored()
+        stored.derived["radians"] = as_array(1.0 / reach_of(self.mechanical))
+        return stored
 
     def forward(self, q: Tensor) -> Tensor:
         """Return tip positions (..., 3) [m]."""

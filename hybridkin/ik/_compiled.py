@@ -69,11 +69,11 @@ def core_of(settings: StepSettings) -> Core | None:
 
     The core is kept with the settings, and made again if a model has changed.
     """
-    kept = vars(settings).get("_core")
+    kept = vars(settings).get("_program")
     programs = [program_of(model) for model in settings.task.models]
     if kept is None or kept[0] != programs:
         kept = programs, *_core_or_reason(settings, programs)
-        object.__setattr__(settings, "_core", kept)
+        object.__setattr__(settings, "_program", kept)
     return kept[1]
 
 
@@ -91,7 +91,7 @@ def _core_or_reason(
 
 def why_torch(settings: StepSettings) -> str:
     """Return why settings that `core_of` has seen have no core."""
-    reason = vars(settings)["_core"][2]
+    reason = vars(settings)["_program"][2]
     if reason:
         return reason
     reasons = [backend(model) for model in settings.task.models]
@@ -400,7 +400,9 @@ class _Input:
                 return False
             self.numbers[...] = point
             return True
-        if self._shape != (3,) or (type(point) is not list and type(point) is not tuple):
+        if self._shape != (3,) or (
+            type(point) is not list and type(point) is not tuple
+        ):
             return False
         try:
             _write_point(self._bytes, self._at, *point)

@@ -364,7 +364,7 @@ class StepSettings(Portable):
         )
         settings = {name: getattr(self, name) for name in names}
         settings["pose"] = isinstance(self.task, PoseTask)
-        models = {str(k): part for k, part in enumerate(self.task.stored_models())}
+        models = {str(k): m.stored() for k, m in enumerate(self.task.steered)}
         return Stored.of(self.layout.kind, arrays, models, **settings)
 
     # The plane of q to keep to, where the log lies in one.

@@ -267,7 +267,9 @@ def _step_inside(
             out = (over > close).any(-1, keepdim=True)
             if not out.any():
                 break
-            back = apply_rows(J, step.dq) + IK_EXCESS * limits.way_in(-over)
+            # A bit farther in, because a step in a box is right to rounding only.
+            way = limits.way_in(-over - 8.0 * close)
+            back = apply_rows(J, step.dq) + IK_EXCESS * way
             wanted = torch.where(out, back, wanted)
             step = limited_step(settings, J, wanted, z, *bounds)
         share = _share(along(safe) - margin, along(step.dq) - margin)

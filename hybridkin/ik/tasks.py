@@ -16,7 +16,6 @@ from hybridkin._core.arrays import as_tensor, identity, number, whole
 from hybridkin._core.blocks import in_blocks
 from hybridkin._core.model import Fitted, ForwardModel, PoseModel, as_forward_model
 from hybridkin._core.rotations import rotation_vector
-from hybridkin._core.stored import Stored
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -102,9 +101,10 @@ class Task:
     def check(self, x_target: Tensor, name: str) -> None:
         """Raise if targets ``(..., *shape)`` are not valid, e.g. their rotations."""
 
-    def stored_models(self) -> list[Stored]:
-        """Return the descriptions of the models whose outputs are x, for kernels."""
-        return [model.stored() for model in self.models]
+    @property
+    def steered(self) -> tuple[ForwardModel, ...]:
+        """The models whose outputs, side by side, are the points that are steered."""
+        return self.models
 
     def reached(self, error: Tensor, tol: Tolerance) -> Tensor:
         """Return whether errors (N, m) are within one tolerance [m], or one for every part."""
@@ -264,9 +264,10 @@ class PoseTask(Task):
             )
         return model
 
-    def stored_models(self) -> list[Stored]:
-        """Return the description of the model of the tip, for kernels."""
-        return [self.models[0].tip_model.stored()]
+    @property
+    def steered(self) -> tuple[ForwardModel, ...]:
+        """The model of the tip."""
+        return (self.models[0].tip_model,)
 
     def evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return the tip's poses (N, 4, 4) and J (N, 6, n), its angular rows times `radian`."""

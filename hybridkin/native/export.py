@@ -21,6 +21,7 @@ from hybridkin._core.files import write_files
 from hybridkin._core.kernel_numbers import IK_LIMITED, c_header
 from hybridkin._core.model import ForwardModel, as_forward_model
 from hybridkin._core.plan import NoKernel, Plan
+from hybridkin._core.rotations import rotation
 from hybridkin._core.stored import Stored
 from hybridkin._core.version import __version__
 
@@ -38,11 +39,19 @@ _RANGES = (
     ("center", "half_width"),
 )
 _SIZES = dict(N="actuators", S="segments", M="outputs", F="features", P="powers")
+_SIZES["R"] = "rows of a task"
 _NO_LIMITS = np.array([[-math.inf], [math.inf], [math.inf], [math.inf]])
 _MOST_STACK = 56 * 1024  # bytes to compute in; small arrays come on top
 # steps per run of the test; memory in periods
 _STEPS = 4
 _MEMORY = 5.0
+_ABOUT_POSES = (
+    "desired pose now, a homogeneous (4, 4) matrix, row by row [m]; one that holds no rotation "
+    "counts as NaN;"
+)
+_ABOUT_SPACES = (
+    " For the half-spaces of the tip it solves at most 11 times, usually once."
+)
 # Operations of a node with `a` numbers, n inputs and m outputs, in a model with S segments.
 _OPERATIONS = {
     "arcs": lambda a, n, m, S: 8 * a + 210 * S + 25 * S * S,
@@ -118,15 +127,12 @@ def export_c(
             f"`name` must be a valid name in C, e.g. trunk_3, got {name!r}."
         )
     controller = model if isinstance(model, _Controller) else None
-    # The model of a task: of several markers it is the one that is steered.
     if controller:
-        module = controller.settings.task.models[0]
+        modules = [*controller.settings.task.steered]
     else:
-        module = as_forward_model(model)
+        modules = [as_forward_model(model)]
     try:
-        plan = Plan((controller or module).stored())
-        if controller and plan.n_outputs > 3:
-            raise NoKernel("a step to a target pose has no kernel")
+        plan = Plan((controller or modules[0]).stored())
         _check_stack(plan, dtype)
     except (NoKernel, TypeError) as error:
         way = "use it from Python, or a model and a task that have kernels"
@@ -151,11 +157,9 @@ def export_c(
             VERSION=__version__,
         ),
         "ABOUT_Q": about_q.replace("*/", "* /"),
-        **dict(
-            REAL=_REAL[dtype], N=plan.n_inputs, M=plan.n_outputs, TOL=_TOLERANCE[dtype]
-        ),
-        **_code(plan, controller is not None, dtype),
-        **_vectors(module, plan, controller, dtype),
+        **dict(REAL=_REAL[dtype], N=plan.n_inputs, TOL=_TOLERANCE[dtype]),
+        **_code(plan, controller, dtype),
+        **_vectors(modules, plan, controller, dtype),
     }
     parts = dict(
         STEP_H="step.h", STEP_C="step.c", TICKS="ticks.c", STEP_README="step.md"
@@ -189,43 +193,59 @@ def _with_headers(path: Path) -> str:
     )
 
 
-def _code(plan: Plan, steps: bool, dtype: str) -> dict[str, Any]:
+def _code(plan: Plan, controller: _Controller | None, dtype: str) -> dict[str, Any]:
     """Return sizes and numbers of a plan as C, and the entries of README.md about them."""
-    at = plan.entry(plan.root, 0) if steps else plan.root
+    at = plan.root if controller is None else plan.entry(plan.root, 0)
+    task = None if controller is None else controller.settings.task
+    pose = task is not None and task.shape == (4, 4)
+    spaces = 0 if task is None else plan.entry(plan.root, 3)
     # gcc warns about arrays of length 1 if it cannot see that loops over them run at all.
     sizes = {f"MAX_{s}": max(plan.largest[what], 2) for s, what in _SIZES.items()}
     kinds = sum(1 << kind for kind in {*plan.code[plan.places].tolist()})
     lines = [
         f"#define HK_{a} {number}"
-        for a, number in {**sizes, "KINDS": f"{kinds}u"}.items()
+        for a, number in {
+            **sizes,
+            "KINDS": f"{kinds}u",
+            "POSES": int(pose),
+            "SPACES": int(spaces > 0),
+        }.items()
     ]
     fields = {
         "DEFINES": "\n".join(["#define HK_FLOAT"] * (dtype == "float32") + lines),
         "CODE": _literals(plan.code),
         "DATA": _literals(plan.data.astype(dtype)),
-        **dict(MODEL=at, ROOT=plan.root, CALL="forward(q, x)"),
+        **dict(M=plan.lengths(at)[1], MODEL=at, ROOT=plan.root, CALL="forward(q, x)"),
         "BYTES": len(plan.data) * (8 if dtype == "float64" else 4) + 4 * len(plan.code),
         "OPERATIONS": f"{_operations(plan):,}",
     }
-    if steps:
+    if task is not None:
         limits, dt = _limits(plan)
         words = (", ".join(f"{v:.6g}" for v in row) for row in limits)
         fields |= zip(("Q_MIN", "Q_MAX", "DQ_MAX", "DDQ_MAX"), words, strict=True)
         fields |= {"DT": dt, "CALL": "step(&state, target, NULL, NULL)"}
         sentence = "limits.md" if np.isfinite(limits).any() else "no_limits.md"
         fields["LIMITS"] = _filled(sentence, fields)
-        fields["NEWTON"] = f"{10 * plan.n_inputs**2 + 80 * plan.n_inputs:,}"
+        m = plan.n_outputs
+        fields["NEWTON"] = (
+            f"{10 * plan.n_inputs**2 + (20 + 7 * m * m) * plan.n_inputs:,}"
+        )
+        fields |= {"TASK": m, "WIDTH": math.prod(task.shape)}
+        fields["NORMALS"] = plan.entry(plan.root, 2)
+        fields["ABOUT_TARGET"] = _ABOUT_POSES if pose else "desired x now [m];"
+        fields["SPACES"] = _ABOUT_SPACES if spaces else ""
     return fields
 
 
 def _check_stack(plan: Plan, dtype: str) -> None:
     """Raise if the code would need more than 64 KiB of stack; bounds the HK_MODEL_WORK of src."""
-    n, segments, m, features, powers = plan.code[:5].tolist()
+    n, segments, m, features, powers, rows = plan.code[:6].tolist()
     numbers = (
         2 * (features + powers)
-        + max(n, 3 * segments, m) * (n + 37)
-        + 140 * segments
+        + max(n, 3 * segments, m) * (n + 41)
+        + 200 * segments
         + 30
+        + (8 * (rows + 1) * (n + 12) if rows else 0)
     )
     if numbers * np.dtype(dtype).itemsize > _MOST_STACK:
         raise NoKernel(
@@ -276,12 +296,12 @@ def _literals(values: NDArray) -> str:
 
 
 def _vectors(
-    module: ForwardModel, plan: Plan, controller: _Controller | None, dtype: str
+    modules: list[ForwardModel], plan: Plan, controller: _Controller | None, dtype: str
 ) -> dict[str, Any]:
     """Return the data of the test: inputs, and the outputs that torch computes."""
-    double = copy.deepcopy(module).double()
+    doubles = [copy.deepcopy(module).double() for module in modules]
     rng = np.random.default_rng(0)
-    center, half = _usual(double, plan.n_inputs)
+    center, half = _usual(doubles[0], plan.n_inputs)
     if controller is not None and np.isfinite(_limits(plan)[0][:2]).all():
         low, high, *_ = _limits(plan)[0]
         center = 0.5 * (low + high)
@@ -294,14 +314,17 @@ def _vectors(
     rows = rows.astype(dtype)
     with torch.no_grad():
         at = torch.from_numpy(rows.astype(float))
-        x, J = (a.numpy() for a in double.forward_and_jacobian(at))
-        distance = double.domain_distance(at).numpy()
+        pairs = [double.forward_and_jacobian(at) for double in doubles]
+        x = torch.cat([x for x, _ in pairs], dim=1).numpy()
+        J = torch.cat([J for _, J in pairs], dim=1).numpy()
+        distances = [double.domain_distance(at).numpy() for double in doubles]
+    distance = np.max(distances, axis=0)
     arrays = {"Q": rows, "X": x, "J": J, "DISTANCE": distance, "HOME": rows[0]}
     fields = {f"{key}_SCALE": float(np.nanmax(abs(a[:8]))) for key, a in arrays.items()}
     if controller is not None:
-        arrays |= _runs(controller, plan, rows[:8], x[:8], dtype)
+        runs, fields["COMPARED"] = _runs(controller, plan, rows[:8], dtype)
+        arrays |= runs
         fields |= {"STEPS": _STEPS, "MEMORY": _MEMORY * _limits(plan)[1]}
-        fields["COMPARED"] = 8 if dtype == "float64" else 4
     return {
         "ROWS": len(rows),
         **fields,
@@ -326,9 +349,9 @@ def _usual(module: ForwardModel, n: int) -> tuple[NDArray, NDArray]:
 
 
 def _runs(
-    controller: _Controller, plan: Plan, starts: NDArray, tips: NDArray, dtype: str
-) -> dict[str, NDArray]:
-    """Return runs of steps that start inside the limits and at them, and their results."""
+    controller: _Controller, plan: Plan, starts: NDArray, dtype: str
+) -> tuple[dict[str, NDArray], int]:
+    """Return runs of steps that start inside the limits and at them, and how many to compare."""
     rng = np.random.default_rng(1)
     (low, high, *_), dt = _limits(plan)
     low = low.astype(dtype)
@@ -337,13 +360,21 @@ def _runs(
     starts[4:, ::2] = np.where(np.isfinite(high), high, starts[4:])[:, ::2]
     # Short steps in single precision: at limits and in weak directions its steps can differ.
     far = np.array([0.2, 0.1, 0.01] if dtype == "float64" else [1e-4, 1e-3, 1e-4])
-    changes = rng.standard_normal((3, 8, _STEPS, 3)) * np.ptp(tips, axis=0)
-    changes *= far[:, None, None, None]
-    changes[[0, 2]] += tips[:, None]
-    target, dx, measured = changes.astype(dtype)
+    task = controller.settings.task
+    with torch.no_grad():
+        here = task.evaluate(torch.from_numpy(starts.astype(float)))[0].numpy()
+    size = np.ptp(_positions(task, here), axis=0)
+    target, measured = (
+        _beside(task, here, share * size, rng).astype(dtype) for share in far[[0, 2]]
+    )
+    rows = rng.standard_normal((8, _STEPS, plan.n_outputs))
+    dx = (far[1] * size.mean() * rows).astype(dtype)
     measured[:, 2] = math.nan  # no measurement
     fields = []
-    for q, *run in zip(starts, target, dx, measured, strict=True):
+    healthy = 8 if dtype == "float64" else 4  # runs whose steps are compared
+    for run_number, (q, *run) in enumerate(
+        zip(starts, target, dx, measured, strict=True)
+    ):
         tracker = controller.tracker(
             torch.from_numpy(q.astype(float)), memory=_MEMORY * dt
         )
@@ -352,6 +383,8 @@ def _runs(
             reading = tip if i < _STEPS - 1 else None  # as in the template
             q = tracker.step(goal, speed, x_measured=reading).numpy()
             fields.append([*q, tracker.sigma_min**2])
+            if dtype == "float32" and tracker.damping > 0.0:
+                healthy = min(healthy, run_number)  # weak directions
     command, squares = np.split(np.array(fields), [plan.n_inputs], axis=1)
     fields = {
         "STARTS": starts,
@@ -360,7 +393,25 @@ def _runs(
         "COMMAND": command,
         "SIGMA_SQ": squares,
     }
-    return fields | {"TARGET": target, "DX": dx, "MEASURED_TIPS": measured}
+    fields |= {"TARGET": target, "DX": dx, "MEASURED_TIPS": measured}
+    return fields, healthy
+
+
+def _positions(task: Any, x: NDArray) -> NDArray:
+    """Return the positions (N, ..., 3) in points or poses of a task (N, ...)."""
+    return x[:, :3, 3] if task.shape == (4, 4) else x
+
+
+def _beside(task: Any, x: NDArray, size: NDArray, rng: np.random.Generator) -> NDArray:
+    """Return points or poses (N, steps, ...) beside those of a task, turned by up to 0.1 rad."""
+    beside = np.repeat(x[:, None], _STEPS, axis=1)
+    change = rng.standard_normal((*beside.shape[:2], *size.shape)) * size
+    if task.shape != (4, 4):
+        return beside + change
+    beside[..., :3, 3] += change
+    turns = torch.from_numpy(0.1 * change / max(np.abs(change).max(), 1e-9))
+    beside[..., :3, :3] = rotation(turns)[0].numpy() @ beside[..., :3, :3]
+    return beside
 
 
 def _measured(source: str, texts: dict[str, str]) -> str:

@@ -94,7 +94,6 @@ def test_a_step_is_stopped_where_a_plane_turns_it():
         tracker = ik.tracker(torch.zeros(5, dtype=torch.float64))
         tracker.step(target)
         assert (tracker.status is IKStatus.AT_LIMITS) == expected[k]
-        assert tracker.backend.startswith("torch: ")
         tracker.step(target)
         assert_close(tracker.x, torch.where(target == 9.0, 1e-3, target), rtol=0.0, atol=1e-12)
 

@@ -81,11 +81,13 @@ static call_t call;
 static int64_t rows;
 static double *q, *x, *J, *distance;
 static void (*evaluate)(const call_t *, const double *, int64_t, double *, double *, double *);
-static void (*tick)(const call_t *);
+static int32_t (*tick)(const call_t *);
 static void (*steps)(const call_t *, int64_t, int32_t, const double *, const double *,
                      const double *, const double *, const double *, double *, unsigned char *);
-static void (*find)(const call_t *, int64_t, int32_t, int32_t, double, double, const double *,
-                    double *, double *, double *, int32_t *, int32_t *);
+static void (*find)(const call_t *, int64_t, int32_t, int32_t, int32_t, const double *,
+                    const double *, double *, double *, double *, int32_t *, int32_t *);
+static void (*look)(const call_t *, int64_t, const double *, double *, double *);
+static const double tolerance = 1e-9;
 
 static void *value(void *count) {
     return evaluate(&call, q, *(int64_t *)count, x, NULL, NULL), NULL;
@@ -102,10 +104,11 @@ static void *many_steps(void *none) {
     return steps(&call, rows, 15, q, x, x, x, q, J, (unsigned char *)distance), none;
 }
 static void *search(void *mode) {
-    return find(&call, rows, *(int32_t *)mode, 30, 1e-9, 0.0, x, q, J, distance,
-                (int32_t *)(distance + 6 * rows), (int32_t *)(distance + 7 * rows)),
+    return find(&call, rows, *(int32_t *)mode, 30, 0, &tolerance, x, q, J, distance,
+                (int32_t *)(distance + 24 * rows), (int32_t *)(distance + 25 * rows)),
            NULL;
 }
+static void *task(void *none) { return look(&call, rows, q, x, J), none; }
 
 static void *filled(FILE *file, size_t size, size_t count) {
     void *array = calloc(count, size);
@@ -124,15 +127,16 @@ int main(int argc, char **argv) {
     rows = head[3];
     q = filled(file, sizeof *q, (size_t)(rows * n));
     x = filled(NULL, sizeof *x, (size_t)(rows * (m > 16 ? m : 16)));
-    J = filled(NULL, sizeof *J, (size_t)(rows * (m * n + n + 6)));
-    distance = filled(NULL, sizeof *distance, (size_t)(rows * (8 + n)));
+    J = filled(NULL, sizeof *J, (size_t)(rows * (m * n + n + 27)));
+    distance = filled(NULL, sizeof *distance, (size_t)(rows * (26 + n)));
     *(void **)&evaluate = dlsym(library, "hk_evaluate");
     *(void **)&tick = dlsym(library, "hk_ik_tick");
     *(void **)&steps = dlsym(library, "hk_ik_steps");
     *(void **)&find = dlsym(library, "hk_ik_find");
+    *(void **)&look = dlsym(library, "hk_ik_look");
     int64_t (*work)(const int32_t *, int32_t);
     *(void **)&work = dlsym(library, "hk_work");
-    call = (call_t){code, data, at, filled(NULL, 8, (size_t)work(code, at)), filled(NULL, 8, 1000)};
+    call = (call_t){code, data, at, filled(NULL, 8, (size_t)work(code, at)), filled(NULL, 8, 4000)};
     int64_t counts[2] = {1, rows};
     if (code[at] != HK_IK) {
         for (int k = 0; k < 2; k++) {
@@ -144,17 +148,16 @@ int main(int argc, char **argv) {
         return 0;
     }
     int32_t modes[2] = {3, 4};
-    const int pose = m == 6;
-    call.at = code[at + HK_MORE]; /* targets that are reached */
-    evaluate(&call, q, rows, x, J, distance);
-    call.at = at;
-    for (int64_t r = 0; r < rows && pose; r++)
-        for (int i = 0; i < 16; i++) x[16 * r + i] = i % 5 == 0;
-    for (int j = 0; j < n; j++) call.state[25 + j] = q[j];
-    call.state[0] = 7.0;
-    call.state[1] = 0.01;
-    if (!pose) report("tick", ticks, NULL);
-    if (!pose) report("steps", many_steps, NULL);
+    const int width = code[at + HK_MORE + 1] & IK_POSE ? IK_POSE_NUMBERS : m;
+    look(&call, rows, q, x, J); /* targets that are reached */
+    for (int j = 0; j < n; j++) call.state[IK_TARGET + 3 * width + 3 * m + j] = q[j];
+    for (int i = 0; i < width; i++)
+        call.state[IK_TARGET + i] = call.state[IK_TARGET + width + m + i] = x[i];
+    call.state[IK_MODE] = 7.0;
+    call.state[IK_PERIOD] = 0.01;
+    report("tick", ticks, NULL);
+    report("steps", many_steps, NULL);
+    report("task", task, NULL);
     report("search", search, modes);
     report("search for a posture", search, modes + 1);
     return 0;

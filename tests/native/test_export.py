@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from painted import LIMIT, painted, stacks
-from saved_models import FOLDER, arm, tendon_chain, trunk
+from saved_models import FOLDER, tendon_chain, trunk
 
 from hybridkin import (
     ConstantCurvatureChain,
@@ -21,7 +21,7 @@ from hybridkin import (
 )
 from hybridkin._core.plan import NoKernel
 from hybridkin.cli.main import main
-from hybridkin.ik.tasks import PointsTask, PoseTask, as_task
+from hybridkin.ik.tasks import PointsTask, as_task
 from hybridkin.native import export_c
 
 LOOP = Path(__file__).parents[2] / "examples" / "c" / "loop.c"
@@ -228,10 +228,7 @@ def test_wrong_arguments(tmp_path):
         export_c(lambda q: q, tmp_path / "out")
     for ik, reason in (
         (limited(tendon_chain(), q_pref=lambda q: 0.0 * q), "a posture that is a function"),
-        (limited(tendon_chain(), tip_limits=([[0.0, 0.0, 1.0]], [0.9])), "limits of the tip"),
-        (limited(PoseTask(arm()), q_min=-1.0, q_max=1.0), "a step to a target pose"),
-        (limited(PoseTask(tendon_chain())), "the kernels for poses support rigid arms only"),
-        (limited(PointsTask(tendon_chain(), [1.0])), "a PointsTask has no kernel"),
+        (limited(PointsTask(tendon_chain(), np.linspace(0.1, 1.0, 9))), "27 rows of a task"),
     ):
         with pytest.raises(NoKernel, match=f"cannot be written in C: {reason}"):
             export_c(ik, tmp_path / "out")

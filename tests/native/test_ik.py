@@ -17,7 +17,7 @@ from hybridkin import (
 )
 from hybridkin._core.plan import NoKernel, Plan
 from hybridkin.ik.results import IKStatus
-from hybridkin.ik.tasks import PoseTask
+from hybridkin.ik.tasks import PointsTask, PoseTask, PositionTask
 
 pytestmark = pytest.mark.needs_core
 
@@ -148,9 +148,9 @@ def test_what_has_no_kernel_runs_in_torch():
     assert InverseKinematics(BHA, **limits).tracker(q).backend == "compiled"
     others = [
         InverseKinematics(BHA, q_pref=lambda q: 0.9 * q, **limits),
-        InverseKinematics(PoseTask(BHA), **limits),
-        InverseKinematics(lambda q: BHA(q), **limits),
-        InverseKinematics(BHA, tip_limits=(np.eye(3), np.ones(3)), **limits),
+        InverseKinematics(PositionTask(lambda q: BHA(q)), **limits),
+        InverseKinematics(PoseTask(BHA.with_markers([(2, 1.0, (0.01, 0.0, 0.0))])), **limits),
+        InverseKinematics(PointsTask(BHA, np.linspace(0.1, 3.0, 9)), **limits),
     ]
     for ik in others:
         assert ik.tracker(q).backend.startswith("torch: ")

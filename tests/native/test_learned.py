@@ -5,9 +5,8 @@ import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
 from saved_models import FOLDER
-from sklearn.linear_model import LinearRegression
 
-from hybridkin import ConstantCurvatureChain, HybridForwardModel, load_model
+from hybridkin import ConstantCurvatureChain, load_model
 from hybridkin.hybrid._features import (
     Features,
     HiddenFeatures,
@@ -275,11 +274,3 @@ def test_parts_without_kernel_leave_the_model_to_torch():
     module = HybridModule(None, corrections, torch.ones(1))
     assert program_of(module) is None
     assert "features" in backend(module)
-    q, x = log()
-    pose = np.hstack([x, 0.1 * x])
-    chain = ConstantCurvatureChain([0.05])
-    model = HybridForwardModel(chain, LinearRegression(), output="pose").fit(q, pose)
-    assert backend(model.module_).startswith("torch")
-    x, J = model.predict_and_jacobian(q)
-    assert x.shape == (60, 6)
-    assert J.shape == (60, 6, 3)

@@ -20,7 +20,7 @@ from hybridkin import (
 )
 from hybridkin._core.plan import MOST
 from hybridkin.ik._compiled import core_of
-from hybridkin.ik.tasks import PoseTask
+from hybridkin.ik.tasks import PointsTask, PoseTask
 from hybridkin.native import library
 from hybridkin.native.library import program_of
 
@@ -97,9 +97,14 @@ def test_functions_of_the_library_take_little_stack(tmp_path, kind):
     model, q = largest(kind)
     plans = [program_of(model).plan]
     if kind != "regressor":
-        task = PoseTask(model) if kind == "arm" else model
-        ik = InverseKinematics(task, q_min=-0.02, q_max=0.02, ddq_max=10.0, dq_max=1.0)
-        plans.append(core_of(ik.settings, search=True).plan)
+        options = {"q_min": -0.02, "q_max": 0.02, "ddq_max": 10.0, "dq_max": 1.0}
+        tasks = [PoseTask(model)] if kind in CHAINS else [model]
+        if kind in ("arcs", "elastic"):
+            tasks.append(PointsTask(model, np.linspace(1.0, SEGMENTS, MOST["rows of a task"] // 3)))
+        plans += [core_of(InverseKinematics(task, **options).settings).plan for task in tasks]
+        spaces = np.random.default_rng(0).standard_normal((ACTUATORS, 3)), np.ones(ACTUATORS)
+        ik = InverseKinematics(model, **options, weights=2.0, tip_limits=spaces)
+        plans.append(core_of(ik.settings).plan)
     program = painted(tmp_path)
     for plan in plans:
         write_plan(tmp_path / "plan", plan, q)

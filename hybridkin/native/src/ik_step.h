@@ -406,7 +406,7 @@ static inline void ik_safe_step(const ik_settings *ik, const real *J, const ik_s
 static HK_NOINLINE void ik_step_inside(const ik_settings *ik, const real *J, const real *v,
                                        real *margin, int slides, ik_step_t *s) {
     const int n = ik->n, m = ik->m;
-    real wanted[IK_ROWS], over[HK_MAX_N];
+    real wanted[IK_ROWS] = {R(0.0)}, over[HK_MAX_N];
     int stopped = 0;
     ik_allowed(ik, margin, v, wanted);
     ik_limited_step(ik, J, wanted, slides, NULL, s);
@@ -415,7 +415,8 @@ static HK_NOINLINE void ik_step_inside(const ik_settings *ik, const real *J, con
         ik_safe_step(ik, J, s, margin, safe);
         int out = ik_leaves(ik, J, s->dq, margin, over);
         for (int round = 0; out && round < IK_PROJECTIONS; round++) {
-            for (int i = 0; i < ik->n_spaces; i++) over[i] = -over[i];
+            /* A bit farther in, because a step in a box is right to rounding only. */
+            for (int i = 0; i < ik->n_spaces; i++) over[i] = -over[i] - R(256.0) * HK_EPS;
             ik_way_in(ik, over, wanted);
             IK_OF(m, ik_rows_of, n, J, s->dq, moved);
             for (int r = 0; r < m; r++) wanted[r] = moved[r] + IK_EXCESS * wanted[r];

@@ -1,46 +1,62 @@
 
 #include "ik_step.h"
 
-static void ik_model(const ik_settings *ik, const real *q, real *x, real *J, real *distance) {
-    hk_model(&plan, @MODEL@, q, x, J, distance, ik->work);
+static void ik_model(const ik_settings *ik, const real *q, real *x, real *J) {
+#if HK_POSES
+    real tip[3], turn[9];
+    hk_pose(&plan, @MODEL@, q, tip, turn, J, NULL, ik->work);
+    ik_pose_of(tip, turn, x);
+#else
+    hk_model(&plan, @MODEL@, q, x, J, NULL, ik->work);
+#endif
 }
+
+/* Numbers of memory for a step, on the stack. */
+enum { STEP_WORK = WORK + IK_SLOTS_WORK(@N@, @TASK@, @NORMALS@) };
 
 void @NAME@_reset(@NAME@_state *state, const @REAL@ *q) {
     const @NAME@_state none = {0};
+    real work[STEP_WORK], J[@TASK@ * @N@];
+    const ik_settings ik = ik_settings_of(code, data, @ROOT@, work);
     *state = none;
     for (int j = 0; j < @N@; j++) state->q[j] = q[j];
-    @NAME@_forward(q, state->x);
+    ik_model(&ik, q, state->x, J);
     state->error = state->sigma_min = (real)NAN;
 }
 
 void @NAME@_step(@NAME@_state *state, const @REAL@ *target, const @REAL@ *dx,
     const @REAL@ *measured) {
-    real work[WORK], all[IK_STATE] = {0};
+    real work[STEP_WORK], all[IK_STATE_SIZE(@N@, @TASK@, @WIDTH@)] = {0};
     const ik_settings ik = ik_settings_of(code, data, @ROOT@, work);
-    for (int i = 0; i < 3; i++) {
-        all[IK_TARGET + i] = target[i];
-        all[IK_FEED + i] = dx ? ik.dt * dx[i] : (real)0;
-        all[IK_TIP + i] = measured ? measured[i] : (real)0;
-        all[IK_OFFSET + i] = state->offset[i];
+    const ik_state now = ik_state_of(&ik, all);
+    for (int i = 0; i < @WIDTH@; i++) {
+        now.target[i] = target[i];
+        now.tip[i] = measured ? measured[i] : (real)0;
+    }
+    for (int i = 0; i < @TASK@; i++) {
+        now.feed[i] = dx ? ik.dt * dx[i] : (real)0;
+        now.offset[i] = state->offset[i];
     }
     for (int j = 0; j < @N@; j++) {
-        all[IK_Q + j] = state->q[j];
-        all[IK_Q + @N@ + j] = state->dq[j];
+        now.q[j] = state->q[j];
+        now.dq[j] = state->dq[j];
     }
     all[IK_MODE] = (real)(IK_HAS_TARGET + (dx ? IK_HAS_FEED : 0) + (measured ? IK_HAS_TIP : 0));
     all[IK_PERIOD] = ik.dt;
     all[IK_MEMORY] = state->memory;
-    ik_tick(&ik, all);
-    for (int i = 0; i < 3; i++) {
-        state->offset[i] = all[IK_OFFSET + i];
-        state->x[i] = all[IK_X + i];
+    if (!ik_tick(&ik, all)) { /* no rotation: not known */
+        now.target[0] = now.tip[0] = (real)NAN;
+        ik_tick(&ik, all);
     }
+    for (int i = 0; i < @TASK@; i++) state->offset[i] = now.offset[i];
+    for (int i = 0; i < @WIDTH@; i++) state->x[i] = now.x[i];
     state->error = all[IK_DISTANCE];
     state->sigma_min = all[IK_SIGMA_MIN];
     state->damping = all[IK_DAMPING];
+    state->stopped = all[IK_STOPPED] > (real)0;
     for (int j = 0; j < @N@; j++) {
-        state->q[j] = all[IK_Q + j];
-        state->dq[j] = all[IK_Q + @N@ + j];
-        state->held[j] = all[IK_Q + 3 * @N@ + j] > (real)0;
+        state->q[j] = now.q[j];
+        state->dq[j] = now.dq[j];
+        state->held[j] = now.held[j] > (real)0;
     }
 }

@@ -1,14 +1,17 @@
 
+enum { @GUARD@_TARGET = @WIDTH@, @GUARD@_ROWS = @TASK@ }; /* lengths of a target, and of its error */
+
 /* State of a controller between two periods. */
 typedef struct {
     @REAL@ q[@N@];    /* the present command */
     @REAL@ dq[@N@];   /* the last step; the limit of acceleration refers to it */
-    @REAL@ x[3];    /* the model's tip at the start of the last step [m] */
-    @REAL@ error;   /* distance of that tip, or of the measured one, to the target [m] */
+    @REAL@ x[@WIDTH@];    /* of the model at the start of the last step, as a target */
+    @REAL@ error;   /* distance of that x, or of the measured one, to the target [m] */
     @REAL@ sigma_min, damping; /* smallest singular value of J there (NaN: the robot was held), and
                                  the damping of the step in the same unit (0: none) */
     unsigned char held[@N@]; /* actuators that the step held at a limit of motion */
-    @REAL@ offset[3]; /* measured minus predicted tip at the last measurement [m] */
+    unsigned char stopped;   /* whether limits of the tip changed its motion */
+    @REAL@ offset[@TASK@]; /* measured minus predicted at the last measurement [m] */
     @REAL@ memory;  /* time constant [s] of the offset while measurements are NaN; 0: not used */
 } @NAME@_state;
 
@@ -17,7 +20,8 @@ void @NAME@_reset(@NAME@_state *state, const @REAL@ *q);
 
 /* One period of @DT@ s: q of the state becomes the next command, within the limits of README.md.
 
-   target: desired tip now [m]; dx: its velocity [m/s], may be NULL (at rest);
-   measured: measured tip [m], may be NULL (use the model's), NaN if there is no measurement. */
+   target: @ABOUT_TARGET@
+   dx: velocity of its @TASK@ rows [m/s], may be NULL (at rest);
+   measured: measured x, as a target, may be NULL (use the model's), NaN if there is none. */
 void @NAME@_step(@NAME@_state *state, const @REAL@ *target, const @REAL@ *dx,
     const @REAL@ *measured);

@@ -7,9 +7,10 @@ enum { RUNS = 8, STEPS = @STEPS@, COMPARED = @COMPARED@ };
 static const @REAL@ low[N] = {@LOW@};
 static const @REAL@ high[N] = {@HIGH@};
 static const @REAL@ starts[RUNS * N] = {@STARTS@};
-static const @REAL@ target[RUNS * STEPS * 3] = {@TARGET@};
-static const @REAL@ dx[RUNS * STEPS * 3] = {@DX@};
-static const @REAL@ measured[RUNS * STEPS * 3] = {@MEASURED_TIPS@};
+enum { TARGET = @WIDTH@, TASK = @TASK@ };
+static const @REAL@ target[RUNS * STEPS * TARGET] = {@TARGET@};
+static const @REAL@ dx[RUNS * STEPS * TASK] = {@DX@};
+static const @REAL@ measured[RUNS * STEPS * TARGET] = {@MEASURED_TIPS@};
 static const double command[RUNS * STEPS * N] = {@COMMAND@};
 static const double sigma_min_sq[RUNS * STEPS] = {@SIGMA_SQ@};
 
@@ -20,7 +21,8 @@ static void check_steps(double *worst) {
         state.memory = (@REAL@)@MEMORY@;
         for (int i = STEPS * run; i < STEPS * (run + 1); i++) {
             const int reads = i % STEPS < STEPS - 1; /* the last one without a measured tip */
-            @NAME@_step(&state, target + 3 * i, dx + 3 * i, reads ? measured + 3 * i : NULL);
+            @NAME@_step(&state, target + TARGET * i, dx + TASK * i,
+                reads ? measured + TARGET * i : NULL);
             const @REAL@ square = state.sigma_min * state.sigma_min;
             for (int j = 0; j < N; j++)
                 if (!(state.q[j] >= low[j] && state.q[j] <= high[j])) {
