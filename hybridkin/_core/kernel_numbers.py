@@ -37,7 +37,7 @@ HK_MAX_S = 16  # segments
 HK_MAX_M = 64  # outputs of a regressor, or inner coordinates
 HK_MAX_F = 2048  # features whose leverage is taken
 HK_MAX_P = 1024  # powers of the inputs of a polynomial
-HK_MAX_R = 24  # rows of a task of inverse kinematics
+HK_MAX_R = 12  # rows of a task of inverse kinematics
 HK_GROUP = 8  # hidden units, or columns of a leverage, stored together
 
 # Features of a readout that are not those of a network.
