@@ -32,6 +32,7 @@ ELSEWHERE = {
     *("view", "follow", "go_to", "close", "wait"),
     # files: hostile ones are an examination of their own
     *("from_urdf", "from_mjcf", "to_urdf", "load_armlab", "load_asl_trunk", "load_ftdcr"),
+    *("load_asu_bellows", "load_soromox_tentacle"),
     # arguments go to matplotlib, or are dictionaries and sentences
     *("new_figure", "lines", "caption", "save", "figure", "table", "text", "file", "markdown"),
     *(

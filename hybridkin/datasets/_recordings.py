@@ -1,4 +1,4 @@
-"""Recordings of real robots: readers for three published data sets, which the user provides."""
+"""Recordings of real robots: readers for five published data sets, which the user provides."""
 
 from __future__ import annotations
 
@@ -36,6 +36,17 @@ _SOURCES = {
         "Systems Lab",
         "Stanford Autonomous Systems Lab, trunk-stack, 2024, "
         "https://github.com/StanfordASL/trunk-stack.",
+    ),
+    "asu_bellows": (
+        "github.com/ASU-RISE-Lab/4-chamber-softarm-control, commit 6df7ec9d, MIT, "
+        "(c) 2023 ASU-RISE-Lab",
+        "ASU RISE Lab, 4-chamber-softarm-control, 2023, "
+        "https://github.com/ASU-RISE-Lab/4-chamber-softarm-control.",
+    ),
+    "soromox_tentacle": (
+        "github.com/tud-phi/soromox, commit 4f03054a, "
+        "paper_results/secVa_system_identification, MIT, (c) 2025-2026 SoRoMoX contributors",
+        "SoRoMoX contributors, soromox, 2026, https://github.com/tud-phi/soromox.",
     ),
 }
 
@@ -174,6 +185,93 @@ def load_asl_trunk(data_home: str | os.PathLike[str] | None = None) -> Bunch:
         run_names=file.get("run_names"),
         kind=file["kind"],
         units={"q": "1", "x": "m"},
+    )
+
+
+def load_asu_bellows(data_home: str | os.PathLike[str] | None = None) -> Bunch:
+    """Return data of a real planar arm with two bellows segments and six pressures.
+
+    The rows are steps and cycles of 20 to 70 s at about 10 Hz, recorded on several days: they show
+    dynamics and hysteresis, and a pressure does not determine a length. Split by `day`.
+
+    Parameters
+    ----------
+    data_home : path-like or None, default=None
+        Folder that holds ``asu_bellows``; None takes the environment variable HYBRIDKIN_DATA.
+
+    Returns
+    -------
+    data : :class:`~sklearn.utils.Bunch`
+        ``q`` (n_samples, 6), measured pressures [Pa], three per segment, base to tip;
+        ``q_command`` (n_samples, 6), commanded pressures [Pa]; ``x`` (n_samples, 3), tip relative
+        to the base marker [m], in axes of the camera; ``middle`` (n_samples, 3), marker between
+        the segments [m]; ``groups``, the run of each row, named by ``run_names[groups]``; ``day``
+        of each row; ``time`` within a run [s]; ``units``, ``source``, ``citation``, ``DESCR``.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the file does not exist; the message names its source.
+    """
+    path = _path(data_home, "asu_bellows", "asu_bellows.npz")
+    shapes = {
+        "pressure_pa": (6,),
+        "pressure_command_pa": (6,),
+        "tip_m": (3,),
+        "middle_m": (3,),
+        "run_id": (),
+        "t": (),
+    }
+    file = _arrays(path, shapes)
+    return _recording(
+        load_asu_bellows,
+        "asu_bellows",
+        q=file["pressure_pa"].astype(float),
+        q_command=file["pressure_command_pa"].astype(float),
+        x=file["tip_m"].astype(float),
+        middle=file["middle_m"].astype(float),
+        groups=file["run_id"].astype(int),
+        run_names=file.get("run_names"),
+        day=file.get("day"),
+        time=file["t"].astype(float),
+        units={"q": "Pa", "x": "m"},
+    )
+
+
+def load_soromox_tentacle(data_home: str | os.PathLike[str] | None = None) -> Bunch:
+    """Return data of a real tapered silicone tentacle pulled by two tendon forces.
+
+    22 loads at rest, under gravity; the tentacle is 0.36 m long. Each row is the mean of one load:
+    hold out whole rows.
+
+    Parameters
+    ----------
+    data_home : path-like or None, default=None
+        Folder that holds ``soromox_tentacle``; None takes the environment variable HYBRIDKIN_DATA.
+
+    Returns
+    -------
+    data : :class:`~sklearn.utils.Bunch`
+        ``q`` (22, 2), tendon forces [N], pulling > 0 (motor torques over a spool of 32.5 mm);
+        ``x`` (22, 12), four markers on the body relative to the base marker [m], base to tip: as
+        for a chain of four markers; ``groups``, the name of each load; ``units``, ``source``,
+        ``citation``, ``DESCR``.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the file does not exist; the message names its source.
+    """
+    path = _path(data_home, "soromox_tentacle", "soromox_tentacle.npz")
+    file = _arrays(path, {"force_n": (2,), "marker_m": (4, 3)})
+    markers = file["marker_m"].astype(float)
+    return _recording(
+        load_soromox_tentacle,
+        "soromox_tentacle",
+        q=file["force_n"].astype(float),
+        x=markers.reshape(len(markers), -1),
+        groups=file.get("load"),
+        units={"q": "N", "x": "m"},
     )
 
 

@@ -11,8 +11,10 @@ from hybridkin.datasets import (
     Log,
     load_armlab,
     load_asl_trunk,
+    load_asu_bellows,
     load_ftdcr,
     load_log,
+    load_soromox_tentacle,
     load_trunk,
     paper_split,
 )
@@ -190,7 +192,10 @@ def test_files_that_are_no_logs_raise(tmp_path, monkeypatch):
 # recordings of real robots
 
 
-@pytest.mark.parametrize("load", [load_ftdcr, load_armlab, load_asl_trunk])
+_RECORDINGS = [load_ftdcr, load_armlab, load_asl_trunk, load_asu_bellows, load_soromox_tentacle]
+
+
+@pytest.mark.parametrize("load", _RECORDINGS)
 def test_absent_recordings_name_their_source(load, tmp_path, monkeypatch):
     monkeypatch.delenv("HYBRIDKIN_DATA", raising=False)
     with pytest.raises(FileNotFoundError, match="github"):
@@ -225,6 +230,28 @@ def test_armlab_and_asl_trunk(data_home):
     assert trunk.q.shape == (2170, 6)
     assert_array_equal(trunk.x, trunk.disks[:, 2])
     assert set(trunk.groups) <= set(range(len(trunk.run_names)))
+
+
+def test_asu_bellows(data_home):
+    data = load_asu_bellows(data_home)
+    assert data.q.shape == data.q_command.shape == (8956, 6)
+    for run in np.unique(data.groups):
+        rows = data.groups == run
+        assert (np.diff(data.time[rows]) > 0).all()
+        assert {data.run_names[run].split("__")[0]} == set(data.day[rows])
+    # The tip hangs at the length of the arm; pressures follow their commands.
+    assert 0.2 < np.median(np.linalg.norm(data.x, axis=1)) < 0.4
+    assert np.median(np.abs(data.q - data.q_command)) < 0.1 * np.ptp(data.q_command)
+
+
+def test_soromox_tentacle(data_home):
+    data = load_soromox_tentacle(data_home)
+    assert data.q.shape == (22, 2)
+    assert data.x.shape == (22, 12)
+    assert len(set(data.groups)) == 22
+    # One tendon pulls to one side, the other one to the other.
+    single = (data.q == 0).any(axis=1)
+    assert_array_equal(np.sign(data.x[single, -1]), np.sign(data.q @ [1, -1])[single])
 
 
 def test_a_log_shows_a_summary():
