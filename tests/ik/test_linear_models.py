@@ -15,7 +15,7 @@ from hybridkin.ik._gram import (
     solve_rows,
 )
 from hybridkin.ik.solver import IKStatus
-from hybridkin.ik.tasks import PointsTask, PoseTask, PositionTask
+from hybridkin.ik.tasks import PositionTask
 from hybridkin.ik.trajectories import Trajectory
 
 A = torch.randn(3, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -71,20 +71,6 @@ def test_rows_without_limits_start_again_each_around_itself():
     assert found.n_starts[2] == 1
 
 
-def test_parts_of_a_task_have_their_own_tolerances():
-    """An error of two parts is reached where each is within its own, in its own unit."""
-    task = PoseTask(TENDONS, radian=0.5)
-    error = torch.tensor([[3e-3, 0.0, 4e-3, 0.0, 1e-2, 0.0]] * 3, dtype=torch.float64)
-    error[1, 0], error[2, 4] = 3.1e-3, 1.1e-2
-    assert task.reached(error, (5e-3, 2e-2)).tolist() == [True, False, False]
-    assert task.reached(error[:1], 0.5e-2).tolist() == [False]
-    assert task.reached(error[:1], 1.2e-2).tolist() == [True]
-    with pytest.raises(ValueError, match=r"`radian` must be a positive length \[m\], got 0"):
-        PoseTask(TENDONS, radian=0)
-    with pytest.raises(ValueError, match=r"`weights` must be positive.*for 2 points"):
-        PointsTask(TENDONS, [1.0, 2.0], weights=[1.0])
-
-
 def test_a_step_is_stopped_where_a_plane_turns_it():
     """Only then; a step along the plane, or away from it, is free. Signs of q do not matter."""
     ik = InverseKinematics(MODEL, tip_limits=([[0.0, 0.0, 1.0]], [1e-3]), beta=0.0)
@@ -127,47 +113,6 @@ def test_angles_come_into_uneven_limits_by_whole_turns():
     turns = (found - q) / (2.0 * np.pi)
     assert_close(turns, turns.round(), rtol=0.0, atol=1e-12)
     assert_close(found[2:, 1], q.new_tensor([-0.5, 13.0 - 6.0 * np.pi]), atol=1e-9, rtol=0)
-
-
-def test_targets_of_poses_must_hold_rotations():
-    ik = InverseKinematics(PoseTask(TENDONS), q_pref=0.0)
-    pose = np.eye(4)
-    pose[2, 3] = 0.2
-    for factor in (1.01 * np.eye(3), np.diag([1.0, 1.0, -1.0]), np.ones((3, 3))):
-        wrong = pose.copy()
-        wrong[:3, :3] = factor
-        with pytest.raises(ValueError, match="must hold rotations in its upper left"):
-            ik.solve(wrong)
-    found = ik.solve(pose, tol=(1e-4, 1e-3))
-    assert repr(found).startswith("IKSolution(1 targets: 1 CONVERGED; error mean ")
-
-
-def test_what_dependent_rows_cannot_reach_is_dropped():
-    """The multipliers are those of the pseudo-inverse, also if the rows want different things."""
-    J = torch.tensor([[[1.0, 2.0, 2.0], [1.0, 2.0, 2.0]]], dtype=torch.float64)
-    v = torch.tensor([[3.0, 1.0]], dtype=torch.float64)
-    mu = damped_solve(row_gram(J), v)
-    assert_close(mu, (torch.linalg.pinv(J @ J.mT) @ v[..., None])[..., 0])
-    assert_close(apply_rows(J, apply_columns(J, mu)), torch.full_like(v, 2.0))
-
-
-def test_a_healthy_cold_start_is_the_middle_of_the_limits():
-    """Without a posture the solution is then the nearest one, by the pseudo-inverse."""
-    ik = InverseKinematics(MODEL, q_min=[-1.0] * 5, q_max=2.0, beta=0.0)
-    middle = torch.full((5,), 0.5, dtype=torch.float64)
-    target = A @ middle + 0.1
-    expected = middle + torch.linalg.pinv(A) @ (target - A @ middle)
-    assert_close(ik.solve(target, tol=1e-9).q, expected, rtol=0.0, atol=1e-8)
-
-
-def test_one_row_settles_at_the_preferred_posture():
-    a = torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64)
-    task = PositionTask((lambda q: q @ a[:, None], lambda q: a.expand(*q.shape[:-1], 1, 3)), 1)
-    preferred = torch.tensor([0.1, 0.2, -0.3], dtype=torch.float64)
-    found = InverseKinematics(task, q_pref=preferred).solve(a.new_tensor([0.7]), a)
-    assert found.converged
-    expected = preferred + a * (0.7 - a @ preferred) / a.square().sum()
-    assert_close(found.q, expected, rtol=0.0, atol=1e-6)
 
 
 def test_a_gap_in_a_path_stops_the_feed_forward_only_there():

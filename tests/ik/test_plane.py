@@ -74,21 +74,3 @@ def test_solutions_lie_in_the_plane(model, targets):
     assert model.in_domain(found.q).all()
     in_torch = ik.solve(torch.from_numpy(targets[:4]), q0=torch.from_numpy(balanced(1)[0]))
     assert off_plane(model, in_torch.q) < COUNT
-
-
-def test_the_domain_ends_beside_the_plane(model):
-    q, normals = balanced(20, seed=3) / 2, model.module_.plane[1].numpy()
-    assert model.in_domain(q).all()
-    assert not model.in_domain(q + 30 * COUNT * normals[:, 0]).any()
-
-
-def test_mechanics_that_move_the_tip_there_have_no_plane():
-    rng = np.random.default_rng(0)
-    chain = ConstantCurvatureChain([0.05])
-    q = rng.uniform(0.2, 0.3, (60, 3))
-    q += 0.25 - q.mean(axis=1, keepdims=True)  # chambers with a constant sum
-    x = chain(torch.from_numpy(q + 0.1 * (q - 0.25) ** 2)).numpy()
-    model = HybridForwardModel(chain, "quadratic").fit(q, x)
-    assert model.module_.plane is None
-    assert model.in_domain(q).all()
-    assert not model.in_domain(q + 0.03).any()

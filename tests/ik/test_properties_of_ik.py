@@ -12,11 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from saved_models import arm, tendon_chain, trunk, trunk_log
-from strategies import ERRORS, answer, arrays
+from strategies import answer, arrays
 
 from hybridkin import ELMRegressor, HybridForwardModel, InverseKinematics
 from hybridkin.ik.results import IKStatus
-from hybridkin.ik.tasks import PointsTask, PoseTask, PositionTask
+from hybridkin.ik.tasks import PointsTask, PoseTask
 from hybridkin.native import available
 
 Q, X, GROUPS = trunk_log()
@@ -239,103 +239,3 @@ def test_a_solution_stays_within_the_limits_whatever_is_asked(data, case, restar
         alone = answer(ik.solve, plain.astype(target.dtype), start, **options)[0]
         assert_array_equal(alone.status[good], solution.status[good])
         assert_allclose(alone.q[good], solution.q[good], rtol=0.0, atol=1e-3 * half)
-
-
-@given(st.data(), solvers(), st.sampled_from(["model", "measured", None]), st.integers(0, 4))
-def test_a_track_stays_within_the_limits_whatever_comes(data, case, feedback, rows):
-    name, ik = case
-    n, (low, high) = dofs(name)[0], bounds(ik)
-    path = targets(data.draw, name, rows)
-    t = data.draw(st.none() | arrays((rows,), 0.0, 0.01).map(np.sort))
-    readings = iter(targets(data.draw, name, rows))
-    _, middle, half = MODELS[name]
-    q0 = data.draw(st.none() | arrays((n,), middle - half, middle + half, special=()))
-    if q0 is not None or not ik.settings.n_actuators:
-        q0 = np.clip(np.zeros(n) if q0 is None else q0, low, high)
-    plant = (lambda q: next(readings)) if data.draw(st.booleans()) else None
-    track, error = answer(ik.track, path, t, q0=q0, plant=plant, feedback=feedback)
-    if error is not None:
-        return
-    assert np.isfinite(track.q).all()
-    low, high = bounds(ik, track.q.dtype)
-    assert ((track.q >= low) & (track.q <= high)).all()
-    assert (track.status[~finite(rows, track.q.dtype, path)] == IKStatus.INVALID_INPUT).all()
-    assert answer(repr, track)[1] is None
-
-
-@given(st.data())
-def test_settings_make_a_solver_or_are_refused_by_name(data):
-    name = data.draw(st.sampled_from(["trunk", "arm", "line", "pose"]))
-    n = dofs(name)[0]
-    sizes = st.sampled_from([(), (n,), (1,), (0,), (n, 1), (n + 1,)])
-    numbers = arrays(sizes, -1.0, 1.0)
-    words = st.sampled_from(["adaptive", "off", "saturate", "", None, True])
-    values = numbers | words | st.floats(width=64) | st.just([]) | st.just({})
-    pair = st.tuples(arrays(st.sampled_from([(2, 3), (1, 3), (0, 3), (3,)])), arrays((2,)))
-    options = data.draw(
-        st.dictionaries(
-            st.sampled_from(["q_min", "q_max", "dq_max", "ddq_max", "q_pref", "weights"]), values
-        )
-    )
-    for option in ("beta", "gain", "damping", "limits", "dt"):
-        if data.draw(st.integers(0, 3)) == 0:
-            options[option] = data.draw(values)
-    if data.draw(st.integers(0, 3)) == 0:
-        options["tip_limits"] = data.draw(pair | values)
-    ik, error = answer(InverseKinematics, MODELS[name][0], **options)
-    if error is not None:
-        return
-    assert answer(repr, ik)[1] is None
-    middle = MODELS[name][1]
-    q, target = np.full((2, n), middle), targets(data.draw, name, 2)
-    step, error = answer(ik.step, q, target)
-    assert error is None
-    assert np.isfinite(step.dq).all()
-    if ik.settings.limits != "off":
-        check_limits(ik, q, step.dq, np.zeros_like(q))
-
-
-@given(st.data())
-def test_tasks_are_made_or_refused_by_name(data):
-    number = st.floats(width=64) | st.integers(-3, 9) | st.sampled_from([None, "a", [], np.ones(2)])
-    size, radian = data.draw(number), data.draw(number)
-    at = data.draw(st.lists(number, max_size=3))
-    weights = data.draw(st.none() | st.lists(number, max_size=3))
-    for make in (
-        lambda: PositionTask(trunk(), size),
-        lambda: PoseTask(trunk(), radian=radian),
-        lambda: PointsTask(trunk(), at, weights),
-    ):
-        task, error = answer(make)
-        assert isinstance(error, (type(None), *ERRORS))
-        if error is None:
-            assert len(task.units) == len(task.parts)
-
-
-@given(st.data())
-def test_shapes_that_do_not_fit_are_refused_by_name(data):
-    shapes = st.sampled_from([(), (0,), (1,), (3,), (2, 3), (3, 2), (0, 3), (2, 0), (4, 2, 3)])
-    q, target, dx, tip, dq = (data.draw(arrays(shapes, 0.1, 0.4)) for _ in range(5))
-    ik = InverseKinematics(trunk(), q_min=0.1, q_max=0.4)
-    answer(ik.step, q, target, dx, x_measured=tip, dq=dq)
-    answer(ik.solve, target, q, max_iter=2, restarts=0)
-    answer(ik.track, target, q0=q)
-    tracker, error = answer(ik.tracker, q)
-    if error is None:
-        answer(tracker.step, target, dx, x_measured=tip)
-        assert np.isfinite(tracker.q).all()
-
-
-@given(st.data())
-def test_counts_and_tolerances_are_refused_by_name(data):
-    number = (
-        st.floats(width=64) | st.integers(-3, 5) | st.sampled_from([None, "a", [], (1e-3, 1.0)])
-    )
-    ik = InverseKinematics(trunk(), q_min=0.1, q_max=0.4)
-    options = data.draw(
-        st.dictionaries(st.sampled_from(["tol", "max_iter", "restarts", "n_solutions"]), number)
-    )
-    solution, error = answer(ik.solve, X[:2], Q[:2], **options)
-    assert error is not None or np.isfinite(solution.q).any()
-    answer(ik.tracker, Q[0], tol=data.draw(number), memory=data.draw(number))
-    answer(ik.track, X[:2], q0=Q[0], tol=data.draw(number), memory=data.draw(number))

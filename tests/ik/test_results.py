@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hybridkin import InverseKinematics, robots
-from hybridkin.ik.results import IKSolution, IKStatus, Track
+from hybridkin.ik.results import IKStatus, Track
 
 TRUNK = robots.bionic_handling_assistant()
 
@@ -36,20 +36,3 @@ def test_results_are_frozen():
     for result in (ik.solve(target), ik.track(target[None], q0=q), ik.step(q, target)):
         with pytest.raises(FrozenInstanceError):
             result.error = 0.0
-
-
-def test_numbers_of_statuses_are_those_that_logs_hold():
-    names = "CONVERGED AT_LIMITS UNREACHABLE SINGULAR MAX_ITER OUT_OF_DOMAIN INVALID_INPUT"
-    assert [status.name for status in IKStatus] == [*names.split(), "NO_FURTHER"]
-    assert [status.value for status in IKStatus] == list(range(8))
-
-
-def test_a_solution_says_how_many_starts_there_were_if_more_than_one():
-    x, ones = np.zeros((2, 3)), np.ones(2)
-    texts = []
-    for starts in ([1, 1], [1, 2], [9, 1]):
-        status = np.full(2, IKStatus.MAX_ITER.value)
-        solution = IKSolution(x, x, 1e-3 * ones, status, ones, np.array(starts), ones, ones)
-        texts.append(repr(solution).removeprefix("IKSolution(2 targets: 2 MAX_ITER; "))
-    end = "error mean 0.001 m, max 0.001 m)"
-    assert texts == [end, f"up to 2 starts; {end}", f"up to 9 starts; {end}"]

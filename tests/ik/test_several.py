@@ -6,7 +6,6 @@ import torch
 from torch.testing import assert_close
 
 from hybridkin import ConstantCurvatureChain, InverseKinematics, RigidChain
-from hybridkin.ik._search import _SAME
 from hybridkin.ik.solver import IKStatus
 from hybridkin.ik.tasks import PoseTask
 
@@ -58,14 +57,6 @@ def test_both_elbows_nearest_first_and_no_third(kind):
     assert_close(first.q, solution.q[0, 0, :1], rtol=0.0, atol=1e-9)
 
 
-def test_each_elbow_comes_first_if_the_start_is_nearest_to_it():
-    ik = InverseKinematics(planar(0.3, 0.2), q_min=-math.pi, q_max=math.pi)
-    target, both = np.array([0.3, 0.2, 0.0]), np.array(elbows(0.3, 0.2))
-    for order in (both, both[::-1]):
-        solution = ik.solve(target, order[0] + 0.01, tol=1e-6, n_solutions=2)
-        np.testing.assert_allclose(solution.q, order, rtol=0.0, atol=1e-4)
-
-
 def test_turns_of_a_joint_are_one_configuration_near_the_start():
     ik = InverseKinematics(planar(0.3, 0.2), q_min=-2.0 * math.pi, q_max=2.0 * math.pi)
     q0 = np.array([2.5, -2.0])
@@ -73,25 +64,6 @@ def test_turns_of_a_joint_are_one_configuration_near_the_start():
     assert solution.converged.tolist() == [True, True, False, False]
     assert (np.abs(solution.q[:2] - q0) <= math.pi + 1e-9).all()
     assert len({tuple(row.round(3)) for row in np.mod(solution.q[:2], 2.0 * math.pi)}) == 2
-
-
-@pytest.mark.slow
-def test_configurations_of_a_redundant_robot_differ(rng):
-    q = 0.1 + 0.3 * torch.rand(12, 9, generator=rng).double()
-    target = TRUNK(q).numpy()
-    for settings in ({}, {"beta": 0.0}):
-        ik = InverseKinematics(TRUNK, q_min=0.1, q_max=0.4, **settings)
-        solution = ik.solve(target, n_solutions=3, restarts=8)
-        assert solution.converged[:, 0].all()
-        there = solution.converged
-        assert ((solution.q[there] >= 0.1) & (solution.q[there] <= 0.4)).all()
-        far = np.linalg.norm(solution.q - 0.25, axis=-1)
-        for row in range(12):
-            for i in range(there[row].sum()):
-                assert (np.diff(far[row][there[row]]) >= 0.0).all()
-                apart = np.abs(solution.q[row, :i] - solution.q[row, i]).max(-1)
-                assert (apart > _SAME * 0.3).all()
-        assert (there.sum(1) == 3).any() == ("beta" in settings)
 
 
 def test_several_are_refused_where_they_cannot_be():

@@ -1,8 +1,6 @@
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 from torch.testing import assert_close
 
@@ -12,12 +10,10 @@ from hybridkin.ik._gram import (
     adaptive_damping,
     apply_columns,
     apply_rows,
-    damped_solve,
     null_projection,
     row_gram,
 )
 from hybridkin.ik.solver import IKStatus, InverseKinematics
-from hybridkin.ik.trajectories import figure_eight
 
 RADII = [0.100, 0.093, 0.079]
 CHAIN = ConstantCurvatureChain(RADII)
@@ -54,21 +50,6 @@ def bha(**settings):
 # ---------------------------------------------------------------- three-row solvers
 
 
-def test_singular_values_and_damped_solve_agree_with_dense_linear_algebra(rng):
-    J = randn(rng, 200, 3, 9) * torch.logspace(-3, 3, 200, dtype=torch.float64)[:, None, None]
-    J[::4, 2] = 1e-3 * J[::4, 2] + J[::4, 0] - J[::4, 1]
-    gram = row_gram(J)
-    exact = torch.linalg.svdvals(J)
-    assert ((gram.sigma_max - exact[:, 0]).abs() <= 1e-12 * exact[:, 0]).all()
-    assert ((gram.sigma_min - exact[:, 2]).abs() <= 1e-7 * exact[:, 0]).all()
-    v, damping_sq = randn(rng, 200, 3), 1e-3 * exact[:, 0] ** 2
-    mu = damped_solve(gram, v, damping_sq)
-    eye = torch.eye(3, dtype=torch.float64)
-    assert_close(
-        mu, torch.linalg.solve(J @ J.mT + damping_sq[:, None, None] * eye, v), rtol=1e-9, atol=0.0
-    )
-
-
 def test_adaptive_damping_is_zero_when_healthy_free_of_units_and_smooth():
     ratio = torch.linspace(0.0, 0.04, 401, dtype=torch.float64)
     J = torch.zeros(401, 3, 4, dtype=torch.float64)
@@ -97,16 +78,9 @@ def reference_qp(J, v, z, lower, upper, damping_sq):
     return x
 
 
-SIZES = [(1e-6, 3, 30), (1e-3, 6, 30)]
-SIZES += [
-    pytest.param(relative, m, 350, marks=pytest.mark.slow)
-    for relative, m in [(1e-6, 3), (1e-3, 3), (1.0, 3), (1e-6, 6)]
-]
-
-
-@pytest.mark.parametrize(("relative", "m", "N"), SIZES)
-def test_box_limited_step_is_the_optimum_of_a_reference_qp(rng, relative, m, N):
-    n = 9
+@pytest.mark.parametrize(("relative", "m"), [(1e-6, 3), (1.0, 3), (1e-3, 6)])
+def test_box_limited_step_is_the_optimum_of_a_reference_qp(rng, relative, m):
+    N, n = 60, 9
     J = randn(rng, N, m, n)
     J[::9, -1] = 1e-4 * J[::9, -1] + J[::9, 0]
     v = randn(rng, N, m) * 10.0 ** uniform(rng, -2.0, 1.5, N, 1)  # the far ones are infeasible
@@ -123,9 +97,8 @@ def test_box_limited_step_is_the_optimum_of_a_reference_qp(rng, relative, m, N):
     expected = np.stack([reference_qp(*row) for row in zip(*problems, strict=True)])
     assert_close(dq, torch.from_numpy(expected), rtol=0.0, atol=1e-8)
     out_of_reach = (v - apply_rows(J, dq)).norm(dim=-1) > 0.1
-    held = (dq == lower) | (dq == upper)
     assert out_of_reach.sum() > 0.08 * N
-    assert held.any(-1).sum() > 0.57 * N
+    assert ((dq == lower) | (dq == upper)).any(-1).sum() > 0.57 * N
 
 
 def test_strict_step_reaches_a_reachable_task_and_ignores_posture_in_the_task(rng):
@@ -155,20 +128,6 @@ def test_strict_step_reaches_a_reachable_task_and_ignores_posture_in_the_task(rn
 # ---------------------------------------------------------------- one step
 
 
-@pytest.mark.slow
-def test_linear_model_is_reached_in_one_step_and_settles_at_the_preferred_posture(rng, A):
-    q_pref, target = randn(rng, 7), randn(rng, 3)
-    ik = InverseKinematics(Linear(A), q_pref=q_pref, beta=20.0, dt=0.01)
-    q = randn(rng, 7)
-    q = q + ik.step(q, target).dq
-    assert_close(A @ q, target, rtol=0.0, atol=1e-12)
-    for _ in range(200):
-        q = q + ik.step(q, target).dq
-    pinv = torch.linalg.pinv(A)
-    null = torch.eye(7, dtype=torch.float64) - pinv @ A
-    assert_close(q, pinv @ target + null @ q_pref, rtol=0.0, atol=1e-12)
-
-
 @pytest.mark.parametrize("limits", ["saturate", "off"])
 def test_step_equals_equation_1_when_healthy_and_nothing_is_limited(rng, limits):
     q, q_pref = uniform(rng, 0.15, 0.35, 20, 9), uniform(rng, 0.2, 0.3, 9)
@@ -195,60 +154,6 @@ def test_step_takes_the_measured_tip_in_place_of_the_models(rng):
     seen = x + 1e-3
     dq = bha(beta=0.0).step(q, x, x_measured=seen).dq
     assert_close(CHAIN.jacobian(q) @ dq, x - seen, rtol=1e-10, atol=1e-15)
-
-
-@pytest.mark.slow
-@given(seed=st.integers(0, 2**31), dtype=st.sampled_from([torch.float64, torch.float32]))
-def test_limits_hold_to_the_last_bit(seed, dtype):
-    rng = torch.Generator().manual_seed(seed)
-    low, high = uniform(rng, -1.0, 0.2, 7), uniform(rng, 0.2, 1.0, 7)
-    model = Linear(randn(rng, 3, 7))
-    speed = 100.0 * torch.rand(7, generator=rng)
-    ik = InverseKinematics(model, q_min=low, q_max=high, dq_max=speed)
-    low, high = low.to(dtype), high.to(dtype)
-    q = (low + (high - low) * torch.rand(40, 7, generator=rng).to(dtype)).clamp(low, high)
-    target = 3.0 * randn(rng, 40, 3).to(dtype)
-    for _ in range(5):
-        q = q + ik.step(q, target).dq
-        assert ((q >= low) & (q <= high)).all()
-    q = ik.solve(target).q
-    assert ((q >= low) & (q <= high)).all()
-    assert ((q == low) | (q == high)).any()
-
-
-@pytest.mark.slow
-def test_solver_evaluates_the_model_inside_the_limits_only(rng):
-    class Witness(torch.nn.Module):
-        lowest, highest = np.inf, -np.inf
-
-        def forward_and_jacobian(self, q):
-            self.lowest = min(self.lowest, float(q.min()))
-            self.highest = max(self.highest, float(q.max()))
-            return CHAIN.forward_and_jacobian(q)
-
-        def forward(self, q):
-            return CHAIN(q)
-
-    witness = Witness()
-    ik = InverseKinematics(witness, q_min=[0.1] * 9, q_max=0.4)
-    ik.solve(randn(rng, 200, 3), restarts=2)
-    assert (witness.lowest, witness.highest) == (0.1, 0.4)
-
-
-def test_start_outside_the_limits_walks_back_at_full_speed():
-    ik = bha(dq_max=0.5, dt=0.01)
-    q = torch.full((9,), 0.25, dtype=torch.float64)
-    q[0], q[4] = 0.4 + 0.0125, 0.1 - 0.006
-    path = []
-    for _ in range(5):
-        q = q + ik.step(q, torch.tensor([0.1, 0.0, 0.8], dtype=torch.float64)).dq
-        path.append(q)
-    path = torch.stack(path)
-    back = torch.tensor([0.4075, 0.4025], dtype=torch.float64)
-    assert_close(path[:2, 0], back, rtol=0.0, atol=1e-15)
-    assert_close(path[0, 4], torch.tensor(0.099, dtype=torch.float64), rtol=0.0, atol=1e-15)
-    assert (path[2:, 0] <= 0.4).all()
-    assert (path[1:, 4] >= 0.1).all()
 
 
 def test_speed_limit_holds_and_free_actuators_take_over(rng):
@@ -312,19 +217,17 @@ def test_target_above_the_longest_robot_is_unreachable_by_what_is_missing(d):
     assert (solution.q == 0.4).all()
 
 
-def test_unreachable_targets_never_converge_and_get_the_nearest_point(rng):
-    # A chain with bends up to theta cannot be farther from its base than its length.
-    direction = torch.nn.functional.normalize(randn(rng, 300, 3), dim=-1)
-    target = uniform(rng, 1.25, 2.0, 300, 1) * direction
-    solution = bha().solve(target)
-    assert not solution.converged.any()
+def test_a_target_out_of_reach_gets_the_nearest_point(rng):
+    direction = torch.nn.functional.normalize(randn(rng, 40, 3), dim=-1)
+    target = uniform(rng, 1.25, 2.0, 40, 1) * direction  # farther than the robot is long
+    solution = bha().solve(target, restarts=4)
     assert (solution.status == IKStatus.UNREACHABLE).all()
     # Nearest to first order: no feasible direction lowers the error.
     q, J, e = solution.q, CHAIN.jacobian(solution.q), target - solution.x
     pull = apply_columns(J, e)
     pull[((q == 0.4) & (pull > 0)) | ((q == 0.1) & (pull < 0))] = 0.0
     nearest = pull.norm(dim=-1) < 1e-3 * e.norm(dim=-1) * J.flatten(1).norm(dim=-1)
-    assert nearest.double().mean() > 0.98
+    assert nearest.double().mean() > 0.95
 
 
 def test_straight_backbone_leaves_the_point_where_first_order_is_blind():
@@ -336,65 +239,19 @@ def test_straight_backbone_leaves_the_point_where_first_order_is_blind():
     assert abs(solution.error[4] - 0.01) < 1e-6
 
 
-def test_posture_after_convergence_is_the_nearest_solution(rng, A):
-    q_pref = randn(rng, 7)
-    target = randn(rng, 5, 3)
-    solution = InverseKinematics(Linear(A), q_pref=q_pref).solve(target, randn(rng, 5, 7))
-    pinv = torch.linalg.pinv(A)
-    expected = q_pref + apply_rows(pinv, target - A @ q_pref)
-    assert_close(solution.q, expected, rtol=0.0, atol=1e-9)
-
-
-@pytest.mark.slow
-def test_further_starts_reach_what_a_warm_start_misses(rng):
-    target = CHAIN(uniform(rng, 0.1, 0.4, 300, 9))
-    starts = uniform(rng, 0.1, 0.4, 300, 9)
-    once = bha().solve(target, starts, restarts=0)
-    again = bha().solve(target, starts)
-    assert again.converged.all()
-    assert not once.converged.all()
-    same = bha().solve(target, starts)
-    assert_close(again.q, same.q, rtol=0.0, atol=0.0)
-    assert (again.n_iter >= once.n_iter).all()
-
-
-def test_max_iter_is_honest(rng):
-    target = CHAIN(uniform(rng, 0.1, 0.4, 50, 9))
-    solution = bha().solve(target, max_iter=1)
-    allowed = {IKStatus.MAX_ITER, IKStatus.AT_LIMITS, IKStatus.CONVERGED}
-    assert set(solution.status.tolist()) <= allowed
-    assert (solution.status == IKStatus.MAX_ITER).any()
-    start = (CHAIN(torch.full((9,), 0.25).double()) - target).norm(dim=-1)
-    assert (solution.error <= start).all()
-
-
-def solve_whole_and_in_parts(ik, target):
-    whole = ik.solve(target, restarts=2)
-    single = [ik.solve(row, restarts=2) for row in target]
-    cut = len(target) // 3
-    parts = [ik.solve(part, restarts=2) for part in target.split([cut, 2 * cut])]
-    return whole, single, [torch.stack([s.q for s in single]), torch.cat([s.q for s in parts])]
-
-
-@pytest.mark.slow
-def test_batch_equals_loop_and_any_split(rng):
+def test_a_batch_equals_its_loop(rng):
     ik = bha()
-    whole, single, others = solve_whole_and_in_parts(ik, CHAIN(uniform(rng, 0.1, 0.4, 12, 9)))
-    for other in others:
-        assert_close(whole.q, other, rtol=0.0, atol=1e-12)
-        assert_close(whole.x, CHAIN(other), rtol=0.0, atol=1e-12)
-    assert whole.status.tolist() == [int(s.status) for s in single]
-    whole, single, others = solve_whole_and_in_parts(ik, randn(rng, 9, 3))
-    for other in others:
-        # On the way to a nearest point rounding is not contracted as it is by Gauss-Newton.
-        assert_close(whole.q, other, rtol=0.0, atol=1e-9)
-    assert whole.status.tolist() == [int(s.status) for s in single]
-    q = uniform(rng, 0.2, 0.3, 4, 15, 9)
-    target = CHAIN(q) + 0.01 * randn(rng, 4, 15, 3)
-    steps = ik.step(q, target)
-    rows = [ik.step(*row).dq for row in zip(q.reshape(60, 9), target.reshape(60, 3), strict=True)]
-    assert steps.dq.shape == (4, 15, 9)
-    assert_close(steps.dq.reshape(60, 9), torch.stack(rows), rtol=0.0, atol=1e-12)
+    q = uniform(rng, 0.2, 0.3, 2, 6, 9)
+    target = CHAIN(uniform(rng, 0.1, 0.4, 2, 6, 9))
+    whole = ik.solve(target, restarts=2)
+    near = CHAIN(q) + 0.01 * randn(rng, 2, 6, 3)
+    step = ik.step(q, near)
+    assert step.dq.shape == (2, 6, 9)
+    for i in np.ndindex(2, 6):
+        alone = ik.solve(target[i], restarts=2)
+        assert_close(whole.q[i], alone.q, rtol=0.0, atol=1e-12)
+        assert whole.status[i] == alone.status
+        assert_close(step.dq[i], ik.step(q[i], near[i]).dq, rtol=0.0, atol=1e-12)
 
 
 def test_empty_batches():
@@ -498,38 +355,6 @@ def test_feedback_on_the_plant_removes_what_the_model_does_not_know():
     assert seeing.largest_step == np.abs(np.diff(seeing.q, axis=0)).max()
 
 
-def wrong_plant(q):
-    return CHAIN(torch.from_numpy(1.03 * q)).numpy() + 0.01
-
-
-@pytest.mark.slow
-def test_a_reading_counts_on_where_the_next_ones_are_missing():
-    path, calls = closed_path(30), []
-
-    def now_and_then(q):
-        calls.append(q)
-        return wrong_plant(q) if len(calls) % 20 == 1 else np.full(3, np.nan)
-
-    def error(**options):
-        calls.clear()
-        track = bha(dt=0.02).track(path, plant=now_and_then, feedback="measured", **options)
-        return np.linalg.norm(wrong_plant(track.q) - path, axis=1).mean()
-
-    assert error(memory=5.0) < 0.7 * error()
-    # Once forgotten, the model's own tip is what counts.
-    assert error(memory=1e-3) > 3.0 * error(memory=5.0)
-
-
-def test_without_any_reading_memory_goes_by_the_models_tip():
-    path = closed_path(30)
-
-    def blind(q):
-        return np.full(3, np.nan)
-
-    track = bha().track(path, plant=blind, feedback="measured", memory=1.0)
-    np.testing.assert_array_equal(track.q, bha().track(path).q)
-
-
 def test_a_failing_plant_loses_only_its_own_point():
     calls = []
 
@@ -555,44 +380,6 @@ def test_a_failing_plant_loses_only_its_own_point():
     assert np.isfinite(track.q).all()
     assert np.isfinite(track.max_error)
     assert seen == [(i, 10) for i in range(10)]
-
-
-@pytest.mark.slow
-def test_track_takes_a_trajectory_uneven_times_and_gaps_in_the_path():
-    ik = bha()
-    path = figure_eight([0.0, 0.0, 0.75], (0.3, 0.15), duration=2.0, dt=0.02)
-    track = ik.track(path, tol=1e-3)
-    np.testing.assert_array_equal(track.t, path.t)
-    assert (track.status == IKStatus.CONVERGED).all()
-    assert track.x_measured is None
-    uneven = np.delete(np.arange(len(path)), [10, 11, 50])
-    skipping = ik.track(path.x[uneven], path.t[uneven])
-    assert skipping.max_error < 9.0 * track.max_error  # a threefold period, squared
-    spoilt = path.x.copy()
-    spoilt[40:45] = np.nan
-    track = ik.track(spoilt, path.t)
-    assert (track.status == IKStatus.INVALID_INPUT).nonzero()[0].tolist() == [40, 41, 42, 43, 44]
-    assert track.error[47:].max() < 1e-3  # one jump to the path, one step to settle
-
-
-@pytest.mark.slow
-def test_a_path_out_of_reach_is_followed_at_the_limits():
-    start, end = np.array([0.0, 0.0, 0.8]), np.array([0.0, 0.0, 1.5])
-    path = start + np.linspace(0.0, 1.0, 200)[:, None] * (end - start)
-    track = bha().track(path)
-    reached = path[:, 2] <= 1.2
-    assert (track.status[reached] == IKStatus.CONVERGED).all()
-    assert (track.status[~reached] == IKStatus.AT_LIMITS).all()
-    assert abs(track.error[-1] - 0.3) < 1e-6
-    assert track.q.max() == 0.4
-
-
-def test_a_speed_limit_shows_in_the_status():
-    jump = np.array([[0.0, 0.0, 0.75]] * 3 + [[0.1, 0.0, 0.8]] * 40)
-    track = bha(dq_max=0.3).track(jump)
-    assert track.largest_step <= 0.3 * 0.01 * (1 + 1e-12)
-    assert IKStatus.AT_LIMITS in track.status
-    assert track.status[-1] == IKStatus.CONVERGED
 
 
 # ---------------------------------------------------------------- doors
@@ -634,64 +421,56 @@ def test_float32_solves_to_a_tenth_of_a_millimetre(rng):
     assert (exact - target[solution.converged].double()).norm(dim=-1).max() < 1.01e-4
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"q_min": 0.5}, "`q_min` must not exceed `q_max`"),
-        ({"q_min": [0.1, 0.2]}, "one value per actuator"),
-        ({"q_min": float("nan")}, "`q_min` must be a number"),
-        ({"q_pref": np.zeros((2, 9))}, "`q_pref` must be a number"),
-        ({"q_pref": np.inf}, "`q_pref` .* finite"),
-        ({"dq_max": 0.0}, "`dq_max` .* positive"),
-        ({"gain": 101.0}, "`gain` times the period"),
-        ({"gain": 0.0}, "`gain` must be positive"),
-        ({"beta": 101.0}, "`beta` times the period"),
-        ({"beta": -1.0}, "`beta` must not be negative"),
-        ({"dt": 0.0}, "`dt` must be a positive period"),
-        ({"limits": "clip"}, "`limits` must be"),
-        ({"damping": "some"}, "`damping` must be"),
-        ({"damping": -1.0}, "`damping` must be"),
-        ({"weights": -1.0}, "`weights` .* positive"),
-    ],
-)
-def test_bad_settings_say_what_was_needed(settings, message):
+BAD_SETTINGS = [
+    ({"q_min": 0.5}, "`q_min` .* `q_max`"),
+    ({"q_min": [0.1, 0.2]}, "one value per actuator"),
+    ({"q_min": float("nan")}, "`q_min`"),
+    ({"q_pref": np.zeros((2, 9))}, "`q_pref`"),
+    ({"q_pref": np.inf}, "`q_pref`"),
+    ({"dq_max": 0.0}, "`dq_max`"),
+    ({"gain": 101.0}, "`gain`"),
+    ({"gain": 0.0}, "`gain`"),
+    ({"beta": 101.0}, "`beta`"),
+    ({"beta": -1.0}, "`beta`"),
+    ({"dt": 0.0}, "`dt`"),
+    ({"damping": "some"}, "`damping`"),
+    ({"damping": -1.0}, "`damping`"),
+    ({"weights": -1.0}, "`weights`"),
+    ({"tip_limits": 3.0}, "`tip_limits` .* pair"),
+    ({"tip_limits": (np.eye(3), [1.0])}, "`tip_limits` .* shapes"),
+    ({"tip_limits": (np.eye(3), [1.0, np.nan, 0.0])}, "`tip_limits` .* finite"),
+    ({"tip_limits": (np.zeros((1, 3)), [1.0])}, "`tip_limits` .* direction"),
+    ({"tip_limits": ([[1.0, 0, 0], [-1.0, 0, 0]], [0.0, -1.0])}, "`tip_limits` .* none"),
+]
+
+
+@pytest.mark.parametrize(("settings", "message"), BAD_SETTINGS)
+def test_bad_settings_are_refused_by_name(settings, message):
     with pytest.raises(ValueError, match=message):
         bha(**settings)
-
-
-@pytest.mark.parametrize("as_given", [np.asarray, torch.as_tensor], ids=["core", "torch"])
-def test_periods_of_more_than_a_second_need_no_beta(as_given):
-    q, target = as_given(np.full(9, 0.3)), as_given(np.array([0.1, 0.0, 0.8]))
-    slow = bha(dt=2.0, q_pref=0.2)
-    np.testing.assert_allclose(
-        slow.step(q, target).dq, bha(dt=2.0, beta=0.5, q_pref=0.2).step(q, target).dq
-    )
-    quick = bha(dt=0.5, q_pref=0.2)
-    np.testing.assert_allclose(
-        quick.step(q, target).dq, bha(dt=0.5, beta=1.0, q_pref=0.2).step(q, target).dq
-    )
-    assert slow.track(np.full((2, 3), [0.0, 0.0, 0.8]), [0.0, 3.0]).q.shape == (2, 9)
 
 
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda ik: ik.step(np.zeros(8), np.zeros(3)), r"`q` must have shape \(..., 9\)"),
-        (lambda ik: ik.step(np.zeros(9), np.zeros(2)), r"`x_target` must have shape \(..., 3\)"),
+        (lambda ik: ik.step(np.zeros(8), np.zeros(3)), "`q`"),
         (lambda ik: ik.step(np.zeros((2, 9)), np.zeros((3, 3))), "agree in their batch shapes"),
-        (lambda ik: ik.step(["a"] * 9, np.zeros(3)), "`q` must be numeric"),
-        (lambda ik: ik.solve(np.zeros(3), tol=0.0), "`tol` must be positive"),
-        (lambda ik: ik.solve(np.zeros(3), tol=(1e-3, 1e-2)), "`tol` must be positive: one number"),
-        (lambda ik: ik.solve(np.zeros(3), max_iter=0), "`max_iter` must be 1 to"),
-        (lambda ik: ik.track(np.zeros(3)), r"`path` must have shape \(T, 3\)"),
-        (lambda ik: ik.track(np.zeros((3, 3)), [0.0, 1.0]), r"`t` must have shape \(3,\)"),
+        (lambda ik: ik.solve(np.zeros(2)), "`x_target`"),
+        (lambda ik: ik.solve(np.zeros(3), tol=0.0), "`tol`"),
+        (lambda ik: ik.solve(np.zeros(3), tol=(1e-3, 1e-2)), "`tol`"),
+        (lambda ik: ik.solve(np.zeros(3), max_iter=0), "`max_iter`"),
+        (lambda ik: ik.track(np.zeros(3)), "`path`"),
+        (lambda ik: ik.track(np.zeros((3, 3)), [0.0, 1.0]), "`t`"),
         (lambda ik: ik.track(np.zeros((2, 3)), [1.0, 1.0]), "increasing"),
-        (lambda ik: ik.track(np.zeros((2, 3)), feedback="measured"), "needs `plant`"),
-        (lambda ik: ik.track(np.zeros((2, 3)), memory=1.0), "`memory` requires feedback"),
-        (lambda ik: ik.track(np.zeros((2, 3)), feedback="tip"), "`feedback` must be"),
+        (lambda ik: ik.track(np.zeros((2, 3)), feedback="measured"), "`plant`"),
+        (lambda ik: ik.track(np.zeros((2, 3)), memory=1.0), "`memory`"),
+        (lambda ik: ik.track(np.zeros((2, 3)), feedback="tip"), "`feedback`"),
+        (lambda ik: ik.tracker(np.zeros((1, 9))), "`q`"),
+        (lambda ik: ik.tracker(np.full(9, 0.2), memory=0.0), "`memory`"),
+        (lambda ik: ik.tracker(np.full(9, 0.2)).step([0.0, 0.7]), "`x_target`"),
     ],
 )
-def test_bad_calls_say_what_was_needed(call, message):
+def test_bad_calls_are_refused_by_name(call, message):
     with pytest.raises(ValueError, match=message):
         call(bha())
 
@@ -741,21 +520,3 @@ def test_a_track_without_a_start_stays_in_the_domain(as_numpy):
     rows[:, 3] = np.abs(rows[:, 3])
     track = ik.track(path, q0=rows if as_numpy else torch.from_numpy(rows))
     assert (track.status == IKStatus.CONVERGED).all()
-
-
-def test_measured_points_are_converged_within_a_millimetre():
-    rng = np.random.default_rng(0)
-
-    def plant(q):
-        tip = CHAIN(torch.from_numpy(q)).numpy()
-        return 1.02 * tip + 1e-4 * rng.standard_normal(3)  # 14 mm from the model
-
-    path = figure_eight((0.0, 0.0, 0.7), (0.2, 0.1), duration=2.0, dt=0.02)
-    track = bha(dt=0.02).track(path, plant=plant, feedback="measured")
-    first = track.status.tolist().index(IKStatus.CONVERGED)
-    assert first <= 3
-    assert (track.status[first:] == IKStatus.CONVERGED).all()
-    assert (track.error[first:] < 1e-3).all()
-    assert track.error[0] > 1e-2
-    strict = bha(dt=0.02).track(path, plant=plant, feedback="measured", tol=1e-4)
-    assert (strict.status == IKStatus.MAX_ITER).mean() > 0.8

@@ -6,7 +6,6 @@ import torch
 from torch.testing import assert_close
 
 from hybridkin import HybridForwardModel, RigidChain, datasets, robots
-from hybridkin.ik._box import BoxProblem, strict_box_step
 from hybridkin.ik._gram import apply_rows, damped_solve, null_projection, row_gram
 from hybridkin.ik.solver import IKStatus, InverseKinematics
 from hybridkin.ik.tasks import (
@@ -43,7 +42,7 @@ def pose(chain, q):
 # ---------------------------------------------------------------- solvers of any number of rows
 
 
-@pytest.mark.parametrize("m", [1, 2, 6, 8])
+@pytest.mark.parametrize("m", [1, 2, 3, 6, 8])
 def test_solves_and_projections_of_any_number_of_rows(rng, m):
     J = randn(rng, 60, m, 9)
     if m > 1:
@@ -58,18 +57,6 @@ def test_solves_and_projections_of_any_number_of_rows(rng, m):
     z = null_projection(J, gram, p)
     assert apply_rows(J, z).abs().max() < 1e-12
     assert_close(null_projection(J, gram, z), z, rtol=0.0, atol=1e-12)  # N N = N
-
-
-@pytest.mark.parametrize("m", [1, 2, 4, 6])
-def test_reachable_tasks_of_any_number_of_rows_are_reached_in_the_box(rng, m):
-    J = randn(rng, 100, m, 9)
-    inside = uniform(rng, -1.0, 1.0, 100, 9)
-    box = -torch.ones(100, 9, dtype=torch.float64), torch.ones(100, 9, dtype=torch.float64)
-    v, zero = apply_rows(J, inside), torch.zeros(100, dtype=torch.float64)
-    z = 2.0 * null_projection(J, row_gram(J), randn(rng, 100, 9))
-    dq = strict_box_step(BoxProblem(J, v, z, *box), zero)
-    assert ((dq >= box[0]) & (dq <= box[1])).all()
-    assert apply_rows(J, dq - inside).norm(dim=-1).max() < 1e-8
 
 
 # ---------------------------------------------------------------- weights
@@ -99,9 +86,6 @@ def test_weights_say_what_a_motion_costs(rng):
     assert_close(
         scaled.step(start * unit, far).dq / unit, plain.step(start, far).dq, rtol=0.0, atol=1e-9
     )
-    for bad in (0.0, -1.0, np.inf, [1.0, 2.0]):
-        with pytest.raises(ValueError, match=r"weights"):
-            InverseKinematics(CHAIN, weights=bad)
 
 
 # ---------------------------------------------------------------- tasks
@@ -125,54 +109,18 @@ def test_pose_error_falls_as_its_jacobian_says(rng, radian):
 
 @pytest.mark.parametrize("chain", [CHAIN, CHAIN.with_tip(2.5)], ids=["tip", "on the backbone"])
 def test_poses_are_reached_to_two_tolerances(rng, chain):
-    q = uniform(rng, 0.2, 0.3, 200, 9)
+    q = uniform(rng, 0.2, 0.3, 60, 9)
     target = chain.tip_transform(q).get_matrix()
     solution = InverseKinematics(PoseTask(chain), **LIMITS).solve(
         chain.tip_transform(q), tol=(1e-6, 1e-4)
     )
-    assert solution.x.shape == (200, 4, 4)
+    assert solution.x.shape == (60, 4, 4)
     if chain is CHAIN:
         assert solution.converged.double().mean() >= 0.98
     e = PoseTask(chain, radian=1.0).difference(solution.x, target)[solution.converged]
     assert e[:, :3].norm(dim=-1).max() <= 1e-6
     assert e[:, 3:].norm(dim=-1).max() <= 1e-4
     assert_close(solution.x, chain.tip_transform(solution.q).get_matrix(), rtol=0.0, atol=1e-14)
-
-
-def test_a_pose_path_is_followed_to_second_order_with_numpy(rng, rigid):
-    start, end = uniform(rng, 0.3, 1.2, 2, 7)
-    phase = np.sin(np.linspace(0.0, np.pi, 101))[:, None]
-    errors = []
-    for every in (2, 1):
-        q = start.numpy() + phase[::every] * (end - start).numpy()
-        path = pose(rigid, torch.from_numpy(q)).numpy()
-        ik = InverseKinematics(PoseTask(rigid), dt=0.01 * every, beta=0.0)
-        track = ik.track(path, q0=q[0])
-        assert isinstance(track.q, np.ndarray)
-        assert track.x.shape == path.shape
-        errors.append(track.error[5:].max())
-    assert 1.7 < np.log2(errors[0] / errors[1]) < 2.3
-
-
-def test_poses_need_a_model_that_knows_them(rng):
-    with pytest.raises(TypeError, match="PoseModel"):
-        PoseTask(Linear(randn(rng, 3, 9)))
-
-
-@pytest.mark.slow
-def test_a_rigid_arm_reaches_poses_within_its_limits(rng, rigid):
-    q = uniform(rng, -2.5, 2.5, 300, 7)
-    ik = InverseKinematics(PoseTask(rigid), q_min=-2.6, q_max=2.6)
-    solution = ik.solve(pose(rigid, q), restarts=10)
-    assert solution.converged.double().mean() >= 0.99
-    assert ((solution.q >= -2.6) & (solution.q <= 2.6)).all()
-
-
-@pytest.fixture
-def rigid():
-    origins = np.stack([np.eye(4)] * 7)
-    origins[:, 2, 3] = 0.15
-    return RigidChain(origins, [[0, 0, 1], [0, 1, 0]] * 3 + [[0, 0, 1]], tool=[0.0, 0.0, 0.1])
 
 
 def test_points_along_the_backbone(rng):
@@ -187,27 +135,6 @@ def test_points_along_the_backbone(rng):
     assert InverseKinematics(task, **LIMITS).solve(target[:0]).x.shape == (0, 2, 3)
     with pytest.raises(TypeError, match="with_tip"):
         PointsTask(Linear(randn(rng, 3, 9)), [1.0])
-
-
-def conflict(rng, n):
-    q, other = uniform(rng, 0.22, 0.28, n, 9), uniform(rng, 0.22, 0.28, n, 9)
-    tip, elbow = CHAIN(q), CHAIN.with_tip(2.0)(other)
-    elbow[:, 2] += 0.5  # out of reach
-    return tip, elbow
-
-
-@pytest.mark.slow
-def test_weights_trade_conflicting_tasks(rng):
-    tip, elbow = conflict(rng, 12)
-    sizes = []
-    for weight in (0.1, 1.0, 10.0):
-        task = PointsTask(CHAIN, [3.0, 2.0], weights=[1.0, weight])
-        target = torch.stack([tip, elbow], dim=1)
-        solution = InverseKinematics(task, **LIMITS).solve(target, max_iter=200)
-        sizes.append((solution.x - target).norm(dim=-1).mean(dim=0).tolist())
-    (tip_light, elbow_light), (tip_even, elbow_even), (tip_heavy, elbow_heavy) = sizes
-    assert tip_light < tip_even < tip_heavy
-    assert elbow_light > elbow_even > elbow_heavy
 
 
 # ---------------------------------------------------------------- models
@@ -268,14 +195,6 @@ def test_a_users_gradient_in_the_null_space(rng):
     assert_close(linear.solve(x, randn(rng, 7)).q, expected, rtol=0.0, atol=1e-2)
 
 
-def test_answers_do_not_depend_on_the_start(rng):
-    target = CHAIN(uniform(rng, 0.2, 0.3, 200, 9))
-    ik = InverseKinematics(CHAIN, **LIMITS)
-    cold, warm = ik.solve(target).q, ik.solve(target, uniform(rng, 0.2, 0.3, 200, 9)).q
-    apart = (cold - warm).norm(dim=-1)
-    assert apart.quantile(0.95) < 1e-5
-
-
 # ---------------------------------------------------------------- the error model's domain
 
 
@@ -315,75 +234,6 @@ class Unguided(torch.nn.Module):
 
 
 # ---------------------------------------------------------------- derivatives of solve
-
-
-def uneven(q):
-    """Return the gradient of a cost with another curvature for every actuator."""
-    return torch.linspace(0.5, 1.5, 9).to(q) * (q - 0.22) + 5.0 * (q - 0.22) ** 3
-
-
-def finite_differences(ik, target, q, h=1e-5, **options):
-    columns = []
-    for k in range(target.shape[-1]):
-        step = torch.zeros_like(target)
-        step[..., k] = h
-        ends = [
-            ik.solve(moved.requires_grad_(), q, differentiable=True, **options).q.detach()
-            for moved in (target + step, target - step)
-        ]
-        columns.append((ends[0] - ends[1]) / (2.0 * h))
-    return torch.stack(columns, dim=-1)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "settings",
-    [{}, {"weights": np.arange(1.0, 10.0)}, {"q_pref": lambda q: q - 0.5 * uneven(q)}],
-    ids=["posture", "weights", "gradient"],
-)
-def test_derivatives_of_the_solution_against_finite_differences(rng, settings):
-    target = CHAIN(uniform(rng, 0.18, 0.32, 20, 9)).requires_grad_()
-    ik = InverseKinematics(CHAIN, **LIMITS, **settings)
-    solution = ik.solve(target, differentiable=True, tol=1e-8)
-    assert solution.converged.all()
-    assert solution.error.max() < 1e-12
-    rows = [
-        torch.autograd.grad(column.sum(), target, retain_graph=True)[0]
-        for column in solution.q.unbind(-1)
-    ]
-    slope = torch.stack(rows, dim=-2)
-    expected = finite_differences(ik, target.detach(), None, tol=1e-8)
-    assert_close(slope, expected, rtol=0.0, atol=1e-5)
-
-
-@pytest.mark.slow
-def test_derivatives_with_held_actuators_and_by_the_models_parameters(rng):
-    q = uniform(rng, 0.2, 0.3, 9)
-    target = CHAIN(q)
-    free = InverseKinematics(CHAIN, q_pref=0.2, **LIMITS).solve(target).q
-    low = [0.1] * 8 + [float(free[8]) + 0.02]  # the posture pulls against this limit
-    ik = InverseKinematics(CHAIN, q_min=low, q_max=0.4, q_pref=0.2)
-    moving = target.clone().requires_grad_()
-    solution = ik.solve(moving, differentiable=True, tol=1e-8)
-    assert solution.limit_margin == 0.0
-    rows = [torch.autograd.grad(part, moving, retain_graph=True)[0] for part in solution.q.unbind()]
-    slope = torch.stack(rows)
-    assert (slope[8] == 0.0).all()
-    expected = finite_differences(ik, target, None, tol=1e-8)
-    assert_close(slope, expected, rtol=0.0, atol=1e-5)
-    radii = CHAIN.radii.clone().requires_grad_()
-    chain = CHAIN.with_geometry(radii=radii)
-    found = InverseKinematics(chain, **LIMITS).solve(moving, differentiable=True, tol=1e-8).q
-    (by_radii,) = torch.autograd.grad(found[0], radii)
-
-    def first(r):
-        solver = InverseKinematics(CHAIN.with_geometry(radii=r), **LIMITS)
-        again = solver.solve(target.clone().requires_grad_(), differentiable=True, tol=1e-8)
-        return again.q.detach()[0]
-
-    h = 1e-6 * torch.eye(3, dtype=torch.float64)
-    expected = torch.stack([first(radii.detach() + d) - first(radii.detach() - d) for d in h])
-    assert_close(by_radii, expected / 2e-6, rtol=1e-5, atol=1e-5)
 
 
 def test_rows_that_have_not_converged_get_no_derivatives():
