@@ -191,13 +191,13 @@ class Search:
         """Return which of the configurations (s, n) differ, up to `count`, by their distance."""
         picks = []
         while len(picks) < count and torch.isfinite(distance).any():
-            pick = distance.argmin()
+            pick = int(distance.argmin())
             picks.append(pick)
             apart = q - q[pick]
             apart = apart - self.settings.whole_turns(apart)
             same = (apart / self.settings.spans.to(q)).abs().amax(-1) <= _SAME
             distance = torch.where(same, torch.inf, distance)
-        return torch.stack(picks) if picks else distance.new_zeros(0).long()
+        return torch.tensor(picks, dtype=torch.long, device=q.device)
 
     def _from_even_starts(self, best: Found, start: Tensor, restarts: int) -> Found:
         """Return the results from the best points and from `restarts` even starts, row by row."""
@@ -210,8 +210,8 @@ class Search:
             self._to_posture(ends)
         return ends
 
-    def _to_posture(self, reached: Found) -> None:
-        self._descend(reached, lambda q: self.settings.preferred(q) - q)
+    def _to_posture(self, found: Found) -> None:
+        self._descend(found, lambda q: self.settings.preferred(q) - q)
 
     def _attempt(self, q: Tensor, target: Tensor) -> Found:
         """Return the result of one start; results outside the domain are moved towards it."""

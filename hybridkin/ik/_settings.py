@@ -102,9 +102,8 @@ def _in_words(limits: Tensor) -> str:
     """Return a number, or the smallest and the largest one; None if all are infinite."""
     if torch.isinf(limits).all():
         return "None"
-    smallest = f"{float(limits.min()):.4g}"
-    largest = f"{float(limits.max()):.4g}"
-    return smallest if smallest == largest else f"{smallest} to {largest}"
+    ends = (f"{float(end):.4g}" for end in (limits.min(), limits.max()))
+    return " to ".join(dict.fromkeys(ends))
 
 
 def _write_plan(plan: Plan, stored: Stored) -> int:
@@ -213,7 +212,9 @@ class StepSettings(Portable):
             or (not isinstance(self.damping, str) and 0.0 <= self.damping < math.inf),
             f'`damping` must be "adaptive" or lambda / sigma_max >= 0, got {self.damping!r}.',
         )
-        posture = self.middle if self.q_pref is None else self.q_pref
+        posture = self.q_pref
+        if posture is None:
+            posture = self.middle
         if isinstance(posture, Tensor):
             posture = self.on_plane(posture)
         # An angle that can turn once round is periodic.
@@ -249,7 +250,9 @@ class StepSettings(Portable):
             value = getattr(self, name)
             if name in ("task", "of_model") or not argument.init:
                 continue
-            words[name] = _in_words(value) if isinstance(value, Tensor) else repr(value)
+            words[name] = repr(value)
+            if isinstance(value, Tensor):
+                words[name] = _in_words(value)
             if name in self.of_model and words[name] != "None":
                 words[name] += " of the model"
         return words
@@ -284,7 +287,9 @@ class StepSettings(Portable):
         return missed[..., None].flatten(1).amax(-1) * min(self.task.units)
 
     def _positions(self, x: Tensor) -> Tensor:
-        return x[..., :3, 3] if self.task.shape == (4, 4) else x
+        if self.task.shape == (4, 4):
+            return x[..., :3, 3]
+        return x
 
     @property
     def middle(self) -> Tensor | None:
@@ -398,7 +403,9 @@ class StepSettings(Portable):
 
     def preferred(self, q: Tensor) -> Tensor:
         """Return the preferred configurations, of shape (n,) or that of q."""
-        wanted = self.posture(q) if callable(self.posture) else self.posture
+        wanted = self.posture
+        if callable(wanted):
+            wanted = wanted(q)
         if not isinstance(wanted, Tensor):
             got = type(wanted).__name__
             raise TypeError(
@@ -416,7 +423,9 @@ class StepSettings(Portable):
                 "the model."
             )
         start = start.to(like).expand(self.n_actuators)
-        return self.preferred(start) if callable(self.q_pref) else start
+        if callable(self.q_pref):
+            return self.preferred(start)
+        return start
 
     def rates(self, period: float | None = None) -> tuple[float, float, float]:
         """Return gain dt and beta dt, both at most 1, and dt, for a period [s], default `dt`."""
@@ -431,7 +440,9 @@ class StepSettings(Portable):
 
     def unit(self, q: Tensor) -> Tensor:
         """Return the units of q, shape () or (n,), in which all weights are 1."""
-        return q.new_ones(()) if self.weights is None else self.weights.to(q).rsqrt()
+        if self.weights is None:
+            return q.new_ones(())
+        return self.weights.to(q).rsqrt()
 
     # Limits of q and of its steps.
 
@@ -457,7 +468,9 @@ class StepSettings(Portable):
     def allowed(self, x: Tensor) -> Tensor:
         """Return the points nearest to x within the tip limits."""
         limits = self.tip_limits
-        return x if limits is None else x + limits.way_in(limits.margin(x))
+        if limits is None:
+            return x
+        return x + limits.way_in(limits.margin(x))
 
     def change(self, q: Tensor, period: float) -> Tensor:
         """Return the largest difference between consecutive steps."""
@@ -527,11 +540,13 @@ class StepSettings(Portable):
         """
         x = as_tensor(value, name, self.task.device)
         point = shape or self.task.shape
-        need = [lead, *point] if lead else point
+        need = [axis for axis in (lead, *point) if axis != ""]
         check_shape(x, name, need, "one point [m] per row")
         if shape is None:
             self.task.check(x, name)
-        return x if like is None else x.to(like)
+        if like is None:
+            return x
+        return x.to(like)
 
     def times(self, t: Array | None, target: Tensor) -> tuple[Tensor, list[float]]:
         """Return the times of a path's points, and the period after each point."""
@@ -558,4 +573,6 @@ class StepSettings(Portable):
             f"`tol` must be positive: one number [m], or {n}, one for every part of the task; got "
             f"{tol!r:.200}.",
         )
-        return tolerances.item() if np.ndim(tol) == 0 else tuple(tolerances.tolist())
+        if tolerances.ndim == 0:
+            return tolerances.item()
+        return tuple(tolerances.tolist())

@@ -40,19 +40,19 @@ def nearest_starts(
     """
     task = settings.task
     n = q.shape[-1]
-    k = max(
-        count,
-        _SHARED if torch.isfinite(settings.q_max - settings.q_min).all() else _OWN,
-    )
-    sample = even_starts(settings, q, size, k)
-    sample = settings.start_at(sample)
-    x, _ = settings.evaluate(sample.flatten(0, 1))
-    away = task.distances(x.unflatten(0, (-1, k)), target)
-    away = away * torch.where(task.in_domain(sample.flatten(0, 1)), 1.0, _OUTSIDE).view(
-        -1, k
-    )
-    near = away.nan_to_num(torch.inf).topk(count, largest=False).indices
-    return sample.expand(len(q), k, n).gather(1, near[..., None].expand(-1, -1, n))
+    bounded = torch.isfinite(settings.q_max - settings.q_min).all()
+    k = max(count, _SHARED if bounded else _OWN)
+    sample = settings.start_at(even_starts(settings, q, size, k))
+    rows = sample.flatten(0, 1)
+    x, _ = settings.evaluate(rows)
+    # Tips outside the domain count as farther away than they are.
+    distance = task.distances(x.unflatten(0, (-1, k)), target)
+    inside = task.in_domain(rows).view(-1, k)
+    distance = torch.where(inside, distance, _OUTSIDE * distance)
+    distance = distance.nan_to_num(torch.inf)
+    nearest = distance.topk(count, largest=False).indices
+    nearest = nearest[..., None].expand(-1, -1, n)
+    return sample.expand(len(q), k, n).gather(1, nearest)
 
 
 def even_starts(settings: StepSettings, q: Tensor, size: Tensor, count: int) -> Tensor:
@@ -60,21 +60,22 @@ def even_starts(settings: StepSettings, q: Tensor, size: Tensor, count: int) -> 
 
     If an actuator has no limits they fill a range around q (N, n): (N, count, n).
     """
-    low, high = (
-        a.to(q).expand(1, q.shape[-1]) for a in (settings.q_min, settings.q_max)
-    )
+    n = q.shape[-1]
+    low = settings.q_min.to(q).expand(1, n)
+    high = settings.q_max.to(q).expand(1, n)
     if not torch.isfinite(high - low).all():
-        size = torch.minimum(size[:, None], 0.5 * settings.periods.to(q))
-        lower = torch.where(torch.isfinite(low), low, torch.minimum(q, high) - size)
-        high = torch.where(torch.isfinite(high), high, torch.maximum(q, low) + size)
-        low = lower
+        reach = torch.minimum(size[:, None], 0.5 * settings.periods.to(q))
+        below = torch.minimum(q, high) - reach
+        above = torch.maximum(q, low) + reach
+        low = torch.where(torch.isfinite(low), low, below)
+        high = torch.where(torch.isfinite(high), high, above)
     low = low[:, None]
     high = high[:, None]
-    fractions = _even_shares(q.shape[-1], count, q.device).to(q)
+    fractions = _even_points(n, count, q.device).to(q)
     return torch.lerp(low, high, fractions).clamp(low, high)
 
 
-def _even_shares(n: int, count: int, device: torch.device) -> Tensor:
+def _even_points(n: int, count: int, device: torch.device) -> Tensor:
     """Return `count` points that fill the n-dimensional unit cube and its faces evenly.
 
     A Kronecker sequence of the generalised golden ratio in n + 1 dimensions, from the middle. The
@@ -84,10 +85,12 @@ def _even_shares(n: int, count: int, device: torch.device) -> Tensor:
     ----------
     Roberts, "The unreasonable effectiveness of quasirandom sequences" (2018).
     """
+    # The golden ratio of n + 1 dimensions, the root of ratio^(n + 2) = ratio + 1.
     ratio = 2.0
-    for _ in range(64):  # the root of ratio^(n + 2) = ratio + 1
+    for _ in range(64):
         ratio = (1.0 + ratio) ** (1.0 / (n + 2))
-    index = torch.arange(max(count, n + 1), dtype=torch.float64, device=device)
-    steps = ratio ** -(index[: n + 1] + 1.0)
-    points = (0.5 + index[:count, None] * steps) % 1.0
-    return (0.5 + (points[:, :n] - 0.5) / (1.0 - points[:, n:])).clamp(0.0, 1.0)
+    dimension = torch.arange(n + 1, dtype=torch.float64, device=device)
+    index = torch.arange(count, dtype=torch.float64, device=device)[:, None]
+    points = (0.5 + index * ratio ** -(dimension + 1.0)) % 1.0
+    from_middle = (points[:, :n] - 0.5) / (1.0 - points[:, n:])
+    return (0.5 + from_middle).clamp(0.0, 1.0)

@@ -208,8 +208,9 @@ def _with_plane(
         return J, v
     stiff = IK_BALANCE * J.flatten(1).norm(dim=-1)[:, None, None]
     rows = stiff * (settings.plane[1].to(J).mT * settings.unit(v))
-    leaving = torch.zeros_like(J[:, 0]) if posture is None else posture
-    aside = apply_rows(rows, leaving)
+    aside = torch.zeros_like(rows[..., 0])
+    if posture is not None:
+        aside = apply_rows(rows, posture)
     return torch.cat([J, rows], dim=1), torch.cat([v, aside], dim=1)
 
 

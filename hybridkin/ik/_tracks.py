@@ -41,12 +41,8 @@ def followed(settings: StepSettings, q0: Tensor, path: Path, loop: Loop) -> Trac
     task = settings.task
     start = settings.configurations(q0, "q0", path.points)
     target = path.points.to(start.dtype)
-    tracker = Tracker(
-        settings,
-        as_array(start) if path.as_numpy else start,
-        path.tol,
-        loop.memory,
-    )
+    command = as_array(start) if path.as_numpy else start
+    tracker = Tracker(settings, command, path.tol, loop.memory)
     q, x, measured, sigma_min, held, damped = tracker.follow(
         target, path.periods, loop.plant, loop.feedback, loop.progress
     )

@@ -113,7 +113,10 @@ class Step(Generic[ArrayT]):
         row, places = vars(self).get("_row", (None, {}))
         if name not in places:
             raise AttributeError(name)
-        return row[places[name]] > 0.0 if name == "saturated" else row[places[name]]
+        value = row[places[name]]
+        if name == "saturated":
+            return value > 0.0
+        return value
 
     def __repr__(self) -> str:
         """Return a one-line summary."""

@@ -174,6 +174,12 @@ class InverseKinematics:
             q_pref = bound(q_pref, "q_pref", finite=True)
         if weights is not None:
             weights = bound(weights, "weights", finite=True, positive=True)
+        if beta is not None:
+            beta = number(beta, "beta")
+        if gain is not None:
+            gain = number(gain, "gain")
+        if not isinstance(damping, str):
+            damping = number(damping, "damping")
         one_of(limits, "limits", ("saturate", "off"))
         half = None
         if tip_limits is not None and limits != "off":
@@ -183,9 +189,9 @@ class InverseKinematics:
             **bounds,
             ddq_max=bound(ddq_max, "ddq_max", positive=True),
             q_pref=q_pref,
-            beta=None if beta is None else number(beta, "beta"),
-            gain=None if gain is None else number(gain, "gain"),
-            damping=damping if isinstance(damping, str) else number(damping, "damping"),
+            beta=beta,
+            gain=gain,
+            damping=damping,
             limits=limits,
             dt=number(dt, "dt"),
             weights=weights,
@@ -212,7 +218,8 @@ class InverseKinematics:
 
     def _repr_html_(self) -> str:
         settings = self.settings
-        rows = {"task": type(settings.task).__name__, **settings.in_words()}
+        rows: dict[str, object] = {"task": type(settings.task).__name__}
+        rows.update(settings.in_words())
         for model in settings.task.models:
             rows[f"model: {type(model).__name__}"] = model.html_rows()
         return html_table(type(self).__name__, rows)
@@ -282,26 +289,27 @@ class InverseKinematics:
         settings = self.settings
         task = settings.task
         axes = len(task.shape)
-        q_given = settings.configurations(q, "q")
-        arguments = [(q_given, 1)]
-        arguments.append((settings.points(x_target, "x_target", q_given), axes))
+        rows = settings.configurations(q, "q")
+        target = settings.points(x_target, "x_target", rows)
+        arguments = {"q": (rows, 1), "x_target": (target, axes)}
         if dx is not None:
             m = sum(task.parts)
-            arguments.append((settings.points(dx, "dx", q_given, shape=(m,)), 1))
+            arguments["dx"] = (settings.points(dx, "dx", rows, shape=(m,)), 1)
         if x_measured is not None:
-            tip = settings.points(x_measured, "x_measured", q_given)
-            arguments.append((tip, axes))
+            tip = settings.points(x_measured, "x_measured", rows)
+            arguments["x_measured"] = (tip, axes)
         if dq is not None:
-            last_step = settings.configurations(dq, "dq").to(q_given)
-            arguments.append((last_step, 1))
+            arguments["dq"] = (settings.configurations(dq, "dq").to(rows), 1)
         # All of them with the same rows.
-        lead = leading(arguments)
-        in_rows = (rows_of(a, lead, trailing) for a, trailing in arguments)
-        rows = next(in_rows)
-        target = next(in_rows)
-        feed_forward = None if dx is None else settings.dt * next(in_rows)
-        measured = None if x_measured is None else next(in_rows)
-        last = None if dq is None else next(in_rows)
+        lead = leading([*arguments.values()])
+        in_rows = {name: rows_of(a, lead, k) for name, (a, k) in arguments.items()}
+        rows = in_rows["q"]
+        target = in_rows["x_target"]
+        feed_forward = in_rows.get("dx")
+        if feed_forward is not None:
+            feed_forward = settings.dt * feed_forward
+        measured = in_rows.get("x_measured")
+        last = in_rows.get("dq")
         if not settings.accelerates:
             last = None
         as_numpy = is_numpy(q)
@@ -309,7 +317,9 @@ class InverseKinematics:
             parts = core.steps(rows, target, feed_forward, measured, last)
             return Step(*give_back(parts, lead, as_numpy))
         x, J = settings.evaluate(rows)
-        tip = x if measured is None else measured
+        tip = x
+        if measured is not None:
+            tip = measured
         e = task.difference(tip, target)
         step = control_step(settings, rows, J, e, feed_forward, last=last, tip=tip)
         results = (
@@ -531,10 +541,12 @@ class InverseKinematics:
         )
         if tol is None:
             tol = _MEASURED if feedback == "measured" else _TOL
-        points = path
         if isinstance(path, Trajectory):
-            points = path.x
-            t = path.t if t is None else t
+            points: Array = path.x
+            if t is None:
+                t = path.t
+        else:
+            points = path
         target = settings.points(points, "path", lead="T")
         require(len(target) > 0, "`path` must hold at least one point, got none.")
         starts = None

@@ -313,7 +313,10 @@ def from_csv(
         raise ValueError(
             f"{path} must have rows of {columns} columns ({need}), got {table.shape}."
         )
-    t = table[:, 0] if dt is None else _period(dt, "dt") * np.arange(len(table))
+    if dt is None:
+        t = table[:, 0]
+    else:
+        t = _period(dt, "dt") * np.arange(len(table))
     return Trajectory(t, METRES[unit] * table[:, -3:])
 
 
@@ -332,7 +335,9 @@ def _timing(duration: float, dt: float, timing: str) -> tuple[np.ndarray, np.nda
     n = max(1, round(periods(_period(duration, "duration"), dt)))
     one_of(timing, "timing", ("min_jerk", "uniform"))
     s = np.arange(n + 1) / n
-    return float(dt) * np.arange(n + 1), s if timing == "uniform" else min_jerk(s)
+    if timing == "min_jerk":
+        s = min_jerk(s)
+    return float(dt) * np.arange(n + 1), s
 
 
 def _plane(normal: ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -343,7 +348,9 @@ def _plane(normal: ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     # Squares neither overflow nor underflow.
     along = direction / np.abs(direction).max()
     along = along / np.linalg.norm(along)
-    axis = np.eye(3)[0 if abs(along[0]) < 1.0 - 1e-9 else 1]
+    axis = np.array([1.0, 0.0, 0.0])
+    if abs(along[0]) > 1.0 - 1e-9:
+        axis = np.array([0.0, 1.0, 0.0])
     across = axis - (axis @ along) * along
     across /= np.linalg.norm(across)
     return across, np.cross(along, across), along
