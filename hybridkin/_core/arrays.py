@@ -71,10 +71,8 @@ def real_array(value: Numbers | Transform, name: str) -> NDArray:
             kind = np.float32 if array.dtype == np.float32 else np.float64
             return np.require(array, kind, ["C", "W"])
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        kind = TypeError if isinstance(error, TypeError) else ValueError
-        raise kind(
-            f"`{name}` must be numeric, got {value!r:.200} ({error})."
-        ) from error
+        need = f"`{name}` must be numeric, got {value!r:.200} ({error})."
+        raise (TypeError if type(error) is TypeError else ValueError)(need) from error
     hint = " Complex data not supported." if array.dtype.kind == "c" else ""
     raise ValueError(f"`{name}` must be numeric, got {value!r:.200}.{hint}")
 
@@ -140,17 +138,20 @@ def check_shape(
     In `need`, digits are lengths, equal letters are equal lengths, a leading "..." is any axes.
     """
     got = tuple(value.shape)
-    sizes = [str(size) for size in need if size != "..."]
-    axes = got[-len(sizes) :] if len(sizes) < len(need) else got
-    lengths = {
-        size: int(size) if size.isdigit() else n
-        for size, n in zip(sizes, axes, strict=False)
-    }
-    if tuple(lengths.get(size) for size in sizes) != axes:
+    sizes = [*map(str, need)]
+    axes = got
+    if sizes[:1] == ["..."]:
+        sizes = sizes[1:]
+        axes = got[max(0, len(got) - len(sizes)) :]
+    lengths: dict[str, int] = {}
+    matches = len(sizes) == len(axes)
+    for size, length in zip(sizes, axes, strict=False):
+        expected = int(size) if size.isdigit() else lengths.setdefault(size, length)
+        matches &= length == expected
+    if not matches:
         shape = ", ".join(map(str, need)) + "," * (len(need) == 1)
-        raise ValueError(
-            f"`{name}` must have shape ({shape}), got {got}{why and '; '}{why}."
-        )
+        reason = f"; {why}" if why else ""
+        raise ValueError(f"`{name}` must have shape ({shape}), got {got}{reason}.")
 
 
 def shaped(
@@ -177,12 +178,10 @@ def table(value: Any, name: str) -> Any:
     return value if name == "X" and hasattr(value, "columns") else array
 
 
-def labels(groups: object, n_rows: int) -> NDArray:
+def labels(groups: ArrayLike | Tensor, n_rows: int) -> NDArray:
     """Return the label of the motion of every row, shape (N,)."""
     if isinstance(groups, Tensor):
-        as_tensor(groups, "groups")
-    if isinstance(groups, Tensor):
-        names = groups.numpy(force=True)
+        names = as_tensor(groups, "groups").numpy(force=True)
     else:
         names = np.asarray(groups)
     check_shape(names, "groups", [n_rows], "one entry for each row of the log")

@@ -23,15 +23,15 @@ def in_blocks(
     check_tensor(q, "q")
     if q.ndim == 0:
         return function(q)  # which raises
-    blocks = q.reshape(math.prod(q.shape[:-1]), q.shape[-1]).split(size)
-    results = [function(rows) for rows in blocks]
-    whole = [
-        torch.cat([a.flatten(1) for a in part]) for part in zip(*results, strict=True)
-    ]
-    pairs = zip(whole, results[0], strict=True)
-    return tuple(
-        result.reshape(*q.shape[:-1], *part.shape[1:]) for result, part in pairs
-    )
+    lead = q.shape[:-1]
+    blocks = q.reshape(math.prod(lead), q.shape[-1]).split(size)
+    by_block = [function(rows) for rows in blocks]
+    results = []
+    for parts in zip(*by_block, strict=True):
+        # Flattened, because a tensor of many axes in transposed memory is slow to join.
+        whole = torch.cat([part.flatten(1) for part in parts])
+        results.append(whole.reshape(*lead, *parts[0].shape[1:]))
+    return tuple(results)
 
 
 def check_tensor(value: Tensor, name: str, size: int | str = "n") -> None:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linprog
+from scipy.linalg import qr
 
 _EXCITED = 0.01  # of the largest spread
 # of the largest value: a range below it is none.
@@ -15,7 +15,7 @@ _ROUNDING = 4.0 * np.finfo(np.float64).eps
 _POINT = 1e-6  # of the largest value: the range of rows of a single configuration
 _COUNTS = 1e-4  # of a step: numbers this close to multiples of a step are whole counts
 _AS_ROUNDED = 2.0  # variances of rounding: what moves less is not distinguished from it
-_INSIDE = 0.05  # part of a unit vector outside a span that counts as zero
+_MENTIONED = 0.05  # of the largest part of a direction
 
 
 class Directions(NamedTuple):
@@ -71,45 +71,20 @@ def _steps(X: NDArray) -> NDArray:
 def few_terms(directions: NDArray) -> NDArray:
     """Return a sparse basis (K, P) of the span of orthonormal rows (K, P).
 
-    For each entry, fixed to 1, minimise the sum of absolute entries; take the shortest independent.
+    Each row is the only one with a part along its own entry, the reduced row echelon form.
     """
-    K, P = directions.shape
-    if K < 2:
-        return directions
-    cost = np.concatenate([np.zeros(K), np.ones(P)])
-    eye = np.eye(P)
-    above = np.block([[directions.T, -eye], [-directions.T, -eye]])
-
-    def shortest(held: NDArray) -> NDArray:
-        equal = np.concatenate([held, np.zeros(P)])[None]
-        solution = linprog(
-            cost, above, np.zeros(2 * P), equal, [1.0], bounds=(None, None)
-        ).x
-        # if it fails, the nearest vector.
-        a = held if solution is None else solution[:K]
-        return a / np.linalg.norm(a)
-
-    columns = directions.T[np.linalg.norm(directions, axis=0) > _INSIDE]
-    candidates = [shortest(held) for held in columns]
-    candidates.sort(
-        key=lambda a: np.abs(a @ directions).sum() / np.abs(a @ directions).max()
-    )
-    chosen: list[NDArray] = []
-    while len(chosen) < K:
-        taken = np.array(chosen).reshape(-1, K)
-        rest = np.linalg.svd(taken)[2][len(chosen) :]  # spans the remaining directions
-        free = [a for a in candidates if np.linalg.norm(rest @ a) > _INSIDE]
-        chosen.append(free[0] if free else shortest(rest[0]))
-    return np.array(chosen) @ directions
+    pivots = qr(directions, mode="r", pivoting=True)[1][: len(directions)]
+    return np.linalg.solve(directions[:, pivots], directions)
 
 
 def in_terms(directions: NDArray, names: Sequence[str]) -> str:
     """Return directions of q (n, k) in words, each by few of the named actuators."""
-    words = []
+    sentences = []
     for move in few_terms(directions.T):
         lead = np.argmax(np.abs(move) > 0.5 * np.abs(move).max())
-        terms = zip(names, move / move[lead], strict=True)
-        words.append(
-            " ".join(f"{at:+.2g} {name}" for name, at in terms if abs(at) > 0.05)
-        )
-    return "; ".join(words)
+        words = []
+        for name, part in zip(names, move / move[lead], strict=True):
+            if abs(part) > _MENTIONED:
+                words.append(f"{part:+.2g} {name}")
+        sentences.append(" ".join(words))
+    return "; ".join(sentences)

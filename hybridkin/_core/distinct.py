@@ -41,11 +41,10 @@ def distinct_rows(
     place : ndarray of int of shape (N,)
         Index into `first` for each row; -1 for rows of weight 0.
     """
-    if groups is None:
-        labels = np.zeros(len(X))
-    else:
-        labels = np.unique(groups, return_inverse=True)[1]
-    rows = np.column_stack([as_array(X), as_array(y), labels]).astype(np.float64)
+    columns = [as_array(X), as_array(y)]
+    if groups is not None:
+        columns.append(np.unique(groups, return_inverse=True)[1])
+    rows = np.column_stack(columns).astype(np.float64)
     rows += 0.0  # -0.0 equals 0.0
     times = np.ones(len(rows)) if weights is None else as_array(weights)
     if runs:
@@ -53,15 +52,17 @@ def distinct_rows(
         keys = np.cumsum(np.append(True, (rows[1:] != rows[:-1]).any(axis=1)))
     else:
         counted = np.flatnonzero(times)
-        keys = rows[counted].view(np.dtype((np.void, rows.itemsize * rows.shape[1])))[
-            :, 0
-        ]
+        whole_row = np.dtype((np.void, rows.itemsize * rows.shape[1]))
+        keys = rows[counted].view(whole_row)[:, 0]
     _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
     order = np.argsort(first)
     place = np.full(len(rows), -1)
     place[counted] = np.argsort(order)[inverse]
     counts = np.bincount(place[counted], weights=times[counted])
-    return counted[first[order]], None if (counts == 1.0).all() else counts, place
+    first = counted[first[order]]
+    if (counts == 1.0).all():
+        return first, None, place
+    return first, counts, place
 
 
 def at_place(values: NDArray, place: NDArray) -> NDArray:

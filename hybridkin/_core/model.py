@@ -5,8 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable
-from functools import partial
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 
 import torch
 from numpy.typing import NDArray
@@ -24,23 +23,18 @@ if TYPE_CHECKING:
     from pytorch_kinematics import Transform3d
     from typing_extensions import Self
 
-
-class _Closed(NamedTuple):
-    """A tensor as it is pickled; torch's own pickles contain memory addresses."""
-
-    array: NDArray
-    device: str
+Function = Callable[[Tensor], Tensor]
+"""A function that works row by row."""
 
 
 class Portable:
     """An object whose pickle and joblib hash are the same in every process.
 
     Tensors, also those in dicts, are pickled as plain arrays. They are restored on their device,
-    else on the first device of its kind, else on the CPU. What belongs to the process is not
-    pickled.
+    or on the CPU if this machine lacks it. What belongs to the process is not pickled.
     """
 
-    def __init_subclass__(cls, **options: Any) -> None:
+    def __init_subclass__(cls, **options: object) -> None:
         """Register a class that sets a `layout`, for plans and for files."""
         super().__init_subclass__(**options)
         layout = vars(cls).get("layout")
@@ -49,37 +43,43 @@ class Portable:
 
     def __getstate__(self) -> dict[str, Any]:
         state = vars(self).copy()  # one copy: another thread may add its program
-        return _closed(
-            {k: value for k, value in state.items() if "_program" != k != "_lock"}
-        )
+        state.pop("_program", None)
+        state.pop("_lock", None)
+        return _portable(state)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(_opened(state))
+        vars(self).update(state)
 
 
-def _closed(value: object) -> Any:
-    if isinstance(value, dict):
-        return type(value)((key, _closed(entry)) for key, entry in value.items())
-    tensor = isinstance(value, Tensor)
-    return _Closed(value.numpy(force=True), str(value.device)) if tensor else value
+def _portable(state: dict[str, Any]) -> dict[str, Any]:
+    """Return a state, and the dicts in it, with all tensors as arrays."""
+    portable = type(state)()
+    for name, value in state.items():
+        if isinstance(value, Tensor):
+            value = _Pickled(value)
+        elif isinstance(value, dict):
+            value = _portable(value)
+        portable[name] = value
+    return portable
 
 
-def _opened(value: object) -> Any:
-    if isinstance(value, dict):
-        return type(value)((key, _opened(entry)) for key, entry in value.items())
-    if not isinstance(value, _Closed):
-        return value
-    return torch.tensor(value.array, device=_present(torch.device(value.device)))
+class _Pickled:
+    """A tensor that is pickled as an array; torch's own pickles contain memory addresses."""
+
+    def __init__(self, tensor: Tensor) -> None:
+        self.array = tensor.numpy(force=True)
+        self.device = str(tensor.device)
+
+    def __reduce__(self) -> tuple[Callable[..., Tensor], tuple[NDArray, str]]:
+        return _restored, (self.array, self.device)
 
 
-def _present(device: torch.device) -> torch.device:
-    """Return a device, or the first one of its kind, or the CPU, whatever this machine has."""
-    count = torch.cuda.device_count() if device.type == "cuda" else 0
-    if device.type != "cpu" and count == 0:
-        return torch.device("cpu")
-    if device.index is not None and device.index >= count > 0:
-        return torch.device(device.type, 0)
-    return device
+def _restored(array: NDArray, device: str) -> Tensor:
+    tensor = torch.tensor(array)
+    try:
+        return tensor.to(device)
+    except (AssertionError, RuntimeError):  # this machine lacks the device
+        return tensor
 
 
 class PortableModule(Portable, nn.Module):
@@ -102,15 +102,13 @@ class PortableModule(Portable, nn.Module):
         layout = self.layout
         if not layout.kind:
             raise TypeError(_only_code(self))
-        buffers = {
-            name: None if a is None else a.detach() for name, a in self._buffers.items()
-        }
-        stored = Stored.of(
-            layout.kind,
-            {name: buffers[name] for name in layout.arrays},
-            {name: _described(self._modules.get(name)) for name in layout.parts},
-            **{name: vars(self)[name] for name in layout.settings},
-        )
+        parts = {name: _described(self._modules.get(name)) for name in layout.parts}
+        settings = {name: vars(self)[name] for name in layout.settings}
+        arrays = {}
+        for name in layout.arrays:
+            buffer = self._buffers[name]
+            arrays[name] = None if buffer is None else buffer.detach()
+        stored = Stored.of(layout.kind, arrays, parts, **settings)
         for name in layout.derived:
             stored.derived[name] = as_array(self.get_buffer(name).detach())
         return stored
@@ -118,18 +116,13 @@ class PortableModule(Portable, nn.Module):
     @classmethod
     def from_stored(cls, stored: Stored, restore: Restore) -> Self:
         """Return the module built from a description; `restore` builds its parts."""
-        parts = {name: stored.parts.get(name) for name in cls.layout.parts}
-        return cls(
-            **stored.tensors(**cls.layout.arrays),
-            **{
-                name: stored.value(name, kind)
-                for name, kind in cls.layout.settings.items()
-            },
-            **{
-                name: None if part is None else restore(part)
-                for name, part in parts.items()
-            },
-        )
+        arguments: dict[str, Any] = dict(stored.tensors(**cls.layout.arrays))
+        for name, kind in cls.layout.settings.items():
+            arguments[name] = stored.value(name, kind)
+        for name in cls.layout.parts:
+            part = stored.parts.get(name)
+            arguments[name] = None if part is None else restore(part)
+        return cls(**arguments)
 
     if TYPE_CHECKING:  # attributes that no statement assigns are buffers
 
@@ -159,17 +152,15 @@ class ForwardModel(PortableModule):
 
     def html_rows(self) -> dict[str, object]:
         """Return names and values that a notebook shows of the model."""
-        parts = self.named_children()
-        return {
+        rows: dict[str, object] = {
             "structure": self.extra_repr() or None,
             "actuators": self.n_actuators or "not known",
             "outputs": self.n_outputs or "not known",
-            **{
-                name: part.html_rows()
-                for name, part in parts
-                if isinstance(part, ForwardModel)
-            },
         }
+        for name, part in self.named_children():
+            if isinstance(part, ForwardModel):
+                rows[name] = part.html_rows()
+        return rows
 
     @property
     def limits(self) -> dict[str, Any]:
@@ -308,28 +299,15 @@ class FunctionModel(ForwardModel):
     Parameters
     ----------
     function : nn.Module or callable
-        Works row by row. If it has the methods ``forward_and_jacobian`` or ``jacobian``,
-        ``in_domain`` or the attribute ``n_actuators``, they are used.
+        Works row by row.
     jacobian : callable, optional
-        Maps q to dx/dq (..., m, n). Default: the module's own, else reverse mode.
+        Maps q to dx/dq (..., m, n). Default: reverse mode.
     """
 
-    def __init__(
-        self, function: Callable[..., Any], jacobian: Callable[..., Any] | None = None
-    ) -> None:
+    def __init__(self, function: Function, jacobian: Function | None = None) -> None:
         super().__init__()
         self.function = function
-        names = ("jacobian", "forward_and_jacobian", "in_domain", "n_actuators")
-        own_jacobian, pair, self.own_domain, n = (
-            getattr(function, name, None) for name in names
-        )
-        if jacobian is None:
-            self.own_jacobian = own_jacobian
-            self.own_pair = pair
-        else:
-            self.own_jacobian = jacobian
-            self.own_pair = None
-        self.n_actuators = int(n or 0)
+        self.derivative = jacobian
 
     def frozen(self) -> Self:
         """Return this model: a function is called as it is, and may not have copies."""
@@ -341,18 +319,9 @@ class FunctionModel(ForwardModel):
 
     def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return x (..., m) and dx/dq (..., m, n)."""
-        if self.own_pair is not None:
-            return self.own_pair(q)
-        if self.own_jacobian is not None:
-            return self(q), _checked(self.own_jacobian(q))
-        return reverse_jacobian(self, q)
-
-    def domain_distance(self, q: Tensor) -> Tensor:
-        """Return 0 inside the domain of the function and 2 outside, shape (...)."""
-        if self.own_domain is None:
-            return super().domain_distance(q)
-        inside = torch.as_tensor(self.own_domain(q), device=q.device)
-        return torch.where(inside, 0.0, 2.0).to(q)
+        if self.derivative is None:
+            return reverse_jacobian(self, q)
+        return self(q), _checked(self.derivative(q))
 
 
 @runtime_checkable
@@ -370,7 +339,7 @@ def as_forward_model(model: object) -> ForwardModel:
     model : ForwardModel, nn.Module, callable, (callable, callable) or fitted estimator
         A function or module maps q ``(..., n)`` to x ``(..., m)`` row by row, torch to torch; a
         pair is such a function and its Jacobian ``(..., m, n)``. A fitted estimator is replaced
-        by its ``module_``.
+        by its ``module_``. A module with more than `forward` derives from `ForwardModel`.
 
     Returns
     -------
@@ -394,11 +363,11 @@ def as_forward_model(model: object) -> ForwardModel:
     if isinstance(model, ForwardModel):
         return model
     if isinstance(model, (tuple, list)):
-        if len(model) != 2 or not all(callable(part) for part in model):
-            raise TypeError(
-                f"`model` must be two callables, q -> x and its Jacobian, got {model!r}."
-            )
-        return FunctionModel(*model)
+        if len(model) == 2 and callable(model[0]) and callable(model[1]):
+            return FunctionModel(*model)
+        raise TypeError(
+            f"`model` must be two callables, q -> x and its Jacobian, got {model!r}."
+        )
     if isinstance(model, Fitted):
         return as_forward_model(model.module_)
     if not callable(model):
@@ -442,24 +411,31 @@ def jacobian(model: object, q: Tensor) -> Tensor:
     return as_forward_model(model).jacobian(q)
 
 
-def reverse_jacobian(
-    function: Callable[[Tensor], Tensor], q: Tensor
-) -> tuple[Tensor, Tensor]:
+def reverse_jacobian(function: Function, q: Tensor) -> tuple[Tensor, Tensor]:
     """Return x and dx/dq by one backward pass per output coordinate."""
     keep = q.requires_grad and torch.is_grad_enabled()
     with torch.enable_grad():
         leaf = q if keep else q.detach().requires_grad_(True)
         x = function(leaf)
         J = slopes(x, leaf, create_graph=keep)
-    return (x, J) if keep else (x.detach(), J.detach())
+    if keep:
+        return x, J
+    return x.detach(), J.detach()
 
 
 def slopes(x: Tensor, leaf: Tensor, create_graph: bool = False) -> Tensor:
     """Return dx/dq (..., m, n) for rows x (..., m) computed from the rows of a leaf tensor q."""
-    slope = partial(
-        grad, create_graph=create_graph, retain_graph=True, materialize_grads=True
-    )
-    return torch.stack([slope(a.sum(), leaf)[0] for a in x.unbind(-1)], dim=-2)
+    rows = []
+    for component in x.unbind(-1):
+        (slope,) = grad(
+            component.sum(),
+            leaf,
+            create_graph=create_graph,
+            retain_graph=True,
+            materialize_grads=True,
+        )
+        rows.append(slope)
+    return torch.stack(rows, dim=-2)
 
 
 def _checked(x: object) -> Tensor:
@@ -472,13 +448,14 @@ def _checked(x: object) -> Tensor:
 
 
 def _described(module: nn.Module | None) -> Stored | None:
-    if module is None or isinstance(module, PortableModule):
-        return None if module is None else module.stored()
+    if module is None:
+        return None
+    if isinstance(module, PortableModule):
+        return module.stored()
     if not isinstance(module, nn.ModuleList):
         raise TypeError(_only_code(module))
-    return Stored.of(
-        "list", parts={str(k): _described(part) for k, part in enumerate(module)}
-    )
+    parts = {str(k): _described(part) for k, part in enumerate(module)}
+    return Stored.of("list", parts=parts)
 
 
 def _only_code(module: nn.Module) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from hybridkin._core.arrays import identity
 from hybridkin._core.stumpff import stumpff
@@ -13,9 +13,8 @@ def cross_matrix(vector: Tensor) -> Tensor:
     """Return the cross-product matrices (..., 3, 3) of vectors (..., 3)."""
     x, y, z = vector.unbind(-1)
     zero = torch.zeros_like(x)
-    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(
-        -1, (3, 3)
-    )
+    entries = [zero, -z, y, z, zero, -x, -y, x, zero]
+    return torch.stack(entries, dim=-1).unflatten(-1, (3, 3))
 
 
 def rotation(phi: Tensor) -> tuple[Tensor, Tensor]:
@@ -26,7 +25,8 @@ def rotation(phi: Tensor) -> tuple[Tensor, Tensor]:
     """
     K = cross_matrix(phi)
     eye = identity(3, phi)
-    _, f, g, c3, _ = (part[..., None, None] for part in stumpff(phi.square().sum(-1)))
+    functions = stumpff(phi.square().sum(-1)[..., None, None])
+    f, g, c3 = functions.f, functions.g, functions.c3
     return eye + f * K + g * K @ K, eye + g * K + c3 * K @ K
 
 
@@ -68,27 +68,24 @@ def rigid_motion(
 def rotation_vector(R: Tensor) -> Tensor:
     """Return the logarithm (..., 3) of rotations (..., 3, 3) [rad], valid up to half turns.
 
-    It divides by the largest component of the unit quaternion, which is never small.
+    The unit quaternion (w, v) of R satisfies 4 w^2 = 1 + tr R, 4 w v = vee(R - R') and
+    4 v v' = R + R' + (1 - tr R) 1. The largest of its four components is never small; the row of
+    these products with it is divided by its norm. Then phi = 2 atan2(|v|, w) v / |v|.
     """
-    r = [[R[..., i, j] for j in range(3)] for i in range(3)]
-    skew = torch.stack(
-        [r[2][1] - r[1][2], r[0][2] - r[2][0], r[1][0] - r[0][1]], dim=-1
-    )
-    diagonal = torch.stack([r[0][0], r[1][1], r[2][2]], dim=-1)
-    trace = diagonal.sum(-1, keepdim=True)
-    # Row k: 4 q_k times the quaternion (w, x, y, z).
-    symmetric = R + R.mT - torch.diag_embed(2.0 * diagonal)
-    inner = symmetric + torch.diag_embed(1.0 + 2.0 * diagonal - trace)
-    first = torch.cat([1.0 + trace, skew], dim=-1)[..., None, :]
-    whole = torch.cat([first, torch.cat([skew[..., None], inner], dim=-1)], dim=-2)
-    largest = torch.diagonal(whole, dim1=-2, dim2=-1).argmax(-1)[..., None, None]
-    row = whole.gather(-2, largest.expand(*largest.shape[:-1], 4))[..., 0, :]
-    row = row / torch.linalg.vector_norm(row, dim=-1, keepdim=True)
-    row = torch.where(row[..., :1] < 0.0, -row, row)
-    w = row[..., :1]
-    axis = row[..., 1:]
-    square = axis.square().sum(-1, keepdim=True)
+    trace = R.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+    skew = R - R.mT
+    vee = torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], dim=-1)
+    column = vee[..., None]
+    squares = R + R.mT + (1.0 - trace) * identity(3, R)
+    first = torch.cat([1.0 + trace, column.mT], dim=-1)
+    products = torch.cat([first, torch.cat([column, squares], dim=-1)], dim=-2)
+    largest = products.diagonal(dim1=-2, dim2=-1).argmax(-1)[..., None, None]
+    quaternion = products.take_along_dim(largest, dim=-2)[..., 0, :]
+    quaternion = nn.functional.normalize(quaternion, dim=-1)
+    quaternion = torch.where(quaternion[..., :1] < 0.0, -quaternion, quaternion)
+    w, v = quaternion.split([1, 3], dim=-1)
+    square = v.square().sum(-1, keepdim=True)
     tiny = square < 1e-12
     size = torch.where(tiny, 1.0, square).sqrt()
     ratio = torch.where(tiny, 2.0 + square / 3.0, 2.0 * torch.atan2(size, w) / size)
-    return ratio * axis
+    return ratio * v

@@ -94,13 +94,14 @@ class Stored:
         **settings
             Values that JSON can express; arrays and tuples become lists.
         """
-        numbers = {
-            name: as_array(a) for name, a in (arrays or {}).items() if a is not None
-        }
-        models = {
-            name: part for name, part in (parts or {}).items() if part is not None
-        }
-        return cls(kind, plain(settings), numbers, models)
+        stored = cls(kind, plain(settings))
+        for name, array in (arrays or {}).items():
+            if array is not None:
+                stored.arrays[name] = as_array(array)
+        for name, part in (parts or {}).items():
+            if part is not None:
+                stored.parts[name] = part
+        return stored
 
     def value(self, key: str, kinds: Any) -> Any:
         """Return a setting of one of these types.
@@ -119,13 +120,10 @@ class Stored:
             kinds = (kinds,)
         if type(value) is int and float in kinds and int not in kinds:
             value = float(value)
-        if (None if value is None else type(value)) not in kinds:
-            names = " or ".join(
-                "null" if kind is None else kind.__name__ for kind in kinds
-            )
-            raise ValueError(
-                f"`{key}` of {self.kind!r} must be {names}, got {value!r:.60}"
-            )
+        kind = None if value is None else type(value)
+        if kind not in kinds:
+            need = f"must be one of {kinds}, got {value!r:.60}"
+            raise ValueError(f"`{key}` of {self.kind!r} {need}")
         return value
 
     def list_of(self, kind: type, key: str) -> list[Any]:
@@ -215,12 +213,10 @@ def params_of(estimator: BaseEstimator) -> dict[str, Any]:
     The device, and a random state that is not a number, become None.
     """
     params = plain(estimator.get_params(deep=False))
-    lost = {
-        name
-        for name in ("device", "random_state")
-        if not isinstance(params.get(name), int)
-    }
-    return {name: None if name in lost else value for name, value in params.items()}
+    for name in {"device", "random_state"} & {*params}:
+        if type(params[name]) is not int:
+            params[name] = None
+    return params
 
 
 def estimator_of(cls: type[_Estimator], params: dict[str, Any]) -> _Estimator:

@@ -13,10 +13,9 @@ _SERIES_END = (
 )
 # Coefficients of c3 and c4 by powers of s, highest first; float32 needs fewer.
 _DEGREE = {torch.float64: 7, torch.float32: 4}
-_SERIES = tuple(
-    ((-1.0) ** j / math.factorial(2 * j + 3), (-1.0) ** j / math.factorial(2 * j + 4))
-    for j in range(max(_DEGREE.values()), -1, -1)
-)
+_SERIES = [
+    [(-1.0) ** j / math.factorial(2 * j + k) for k in (3, 4)] for j in range(7, -1, -1)
+]
 
 
 class Stumpff(NamedTuple):

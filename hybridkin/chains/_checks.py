@@ -21,15 +21,10 @@ _TURNS = 4.0 * math.pi  # [rad]; the angle of a tendon is never larger
 
 
 def float_dtype(dtype: object) -> torch.dtype:
-    """Return the torch dtype given by torch, NumPy or a string."""
-    name = str(np.dtype(dtype) if isinstance(dtype, type) else dtype).removeprefix(
-        "torch."
-    )
-    if name not in ("float64", "float32"):
-        raise ValueError(
-            f"`dtype` must be torch.float64 or torch.float32, got {dtype!r}."
-        )
-    return torch.float64 if name == "float64" else torch.float32
+    """Return a caller's dtype of torch."""
+    if dtype is torch.float64 or dtype is torch.float32:
+        return dtype
+    raise ValueError(f"`dtype` must be torch.float64 or torch.float32, got {dtype!r}.")
 
 
 def lengths_of(

@@ -112,22 +112,27 @@ def _pivoted(maps_of: Callable[[Tensor], Tensor], full: Tensor, x: Tensor) -> Te
     """
     n = x.shape[1] - 1
     bits = 2 ** torch.arange(n, device=x.device)
-    at = torch.arange(len(x), device=x.device)
-    here = ((full @ x.T >= 0) * bits[:, None]).sum(0)
-    codes = here.clone()
+    places = torch.arange(len(x), device=x.device)  # of the rows that still change
+    guess = ((full @ x.T >= 0) * bits[:, None]).sum(0)
+    codes = guess.clone()
     for step in range(HK_WHOLE_STEPS + 2 ** min(n, HK_MOST_TURNS)):
-        maps = maps_of(here)
+        maps = maps_of(guess)
         stretch = applied(maps, x)
         taut = ((stretch >= 0) * bits).sum(-1)
-        if step >= HK_WHOLE_STEPS:  # one at a time, ignoring rounding errors
+        if (
+            step >= HK_WHOLE_STEPS
+        ):  # the first wrong tendon alone, ignoring rounding errors
             rounding = 4.0 * torch.finfo(x.dtype).eps * applied(maps.abs(), x.abs())
-            wrong = (taut ^ here) & ((stretch.abs() > rounding) * bits).sum(-1)
-            taut = here ^ (wrong & -wrong)
-        moved = (taut != here).nonzero()[:, 0]
-        if not len(moved):
+            certain = ((stretch.abs() > rounding) * bits).sum(-1)
+            wrong = (taut ^ guess) & certain
+            taut = guess ^ (wrong & -wrong)  # its lowest bit
+        changed = (taut != guess).nonzero()[:, 0]
+        if not len(changed):
             break
-        at, x, here = (part.index_select(0, moved) for part in (at, x, taut))
-        codes[at] = here
+        places = places[changed]
+        x = x[changed]
+        guess = taut[changed]
+        codes[places] = guess
     return codes
 
 
@@ -152,17 +157,11 @@ class FindTaut(torch.autograd.Function):
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[Any, ...], *args: Any) -> tuple[Tensor, int]:
-        find = args[0]
-        tensors = args[1:]
-        dims = in_dims[1:]
-        if all(
-            dim is None for dim in dims[1:]
-        ):  # the same robot: the batch is more rows
-            rows = tensors[0].movedim(dims[0], 0)
-            codes = FindTaut.apply(find, rows.flatten(0, 1), *tensors[1:])
-            return codes.unflatten(0, rows.shape[:2]), 0
-        n = info.batch_size
-        pairs = zip(tensors, dims, strict=True)
-        each = [[a] * n if dim is None else a.unbind(dim) for a, dim in pairs]
-        results = [FindTaut.apply(find, *parts) for parts in zip(*each, strict=True)]
-        return torch.stack(results), 0
+        find, *tensors = args
+        codes = []
+        for k in range(info.batch_size):
+            parts = []
+            for tensor, dim in zip(tensors, in_dims[1:], strict=True):
+                parts.append(tensor if dim is None else tensor.select(dim, k))
+            codes.append(FindTaut.apply(find, *parts))
+        return torch.stack(codes), 0

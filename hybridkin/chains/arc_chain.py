@@ -139,6 +139,13 @@ class ArcChain(MarkedChain):
         return bool((self.gains == 1.0).all())
 
     @property
+    def units(self) -> str | list[str]:
+        """Unit of q, or of each actuator; with gains any, for example counts."""
+        if not self.in_metres:
+            return "as in training"
+        return "m" if self.stage is None else ["rad"] + ["m"] * (self.n_actuators - 1)
+
+    @property
     def rest(self) -> Tensor:
         """The q (n,) at which tendons are not displaced and chambers have length 0."""
         return torch.zeros_like(self.gains)

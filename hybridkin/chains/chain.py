@@ -60,6 +60,11 @@ class Chain(PoseModel):
         """Size of the robot, shape () [m]."""
         raise NotImplementedError
 
+    @property
+    def units(self) -> str | list[str]:
+        """Unit of q, or of each actuator."""
+        return "as in training"
+
     def geometry(self) -> dict[str, Tensor]:
         """Return the geometry by name, as in the constructor; entries that are None are omitted."""
         entries = {name: self._buffers[name] for name in self._entries}

@@ -6,10 +6,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from hybridkin._core.arrays import as_tensor, check_shape, labels, real_array
+from hybridkin._core.arrays import check_shape, labels, real_array
 from hybridkin.native.library import available, play
 
 __all__ = ["PlayOperator", "PlayState"]
@@ -68,7 +68,7 @@ class PlayOperator:
                 f"`width` must be one or (n,) finite numbers, zero or more, got {width!r}."
             )
 
-    def apply(self, q: object, state: PlayState | None = None) -> tuple[Any, PlayState]:
+    def apply(self, q: Any, state: PlayState | None = None) -> tuple[Any, PlayState]:
         """Return the effective changes of a motion, and the state at its end.
 
         Parameters
@@ -92,9 +92,7 @@ class PlayOperator:
         """
         return self._run(q, state, "q", lead=False)
 
-    def command(
-        self, y: object, state: PlayState | None = None
-    ) -> tuple[Any, PlayState]:
+    def command(self, y: Any, state: PlayState | None = None) -> tuple[Any, PlayState]:
         """Return the commands that give the effective changes y: the inverse of `apply`.
 
         A moving tendon gets a command half the width ahead; a tendon at rest keeps its command.
@@ -142,16 +140,11 @@ class PlayOperator:
         """
         rows = real_array(q, "q")
         check_shape(rows, "q", ("N", "n"))
-        if not isinstance(q, Tensor):
-            q = rows
-        groups = labels(groups, len(q))
-        order = np.argsort(groups, kind="stable")  # a motion's rows keep their order
-        starts = np.flatnonzero(groups[order][1:] != groups[order][:-1]) + 1
-        parts = [self.apply(q[at])[0] for at in np.split(order, starts)]
-        back = np.argsort(order)
-        if isinstance(q, Tensor):
-            return torch.cat(parts)[back]
-        return np.concatenate(parts)[back]
+        names = labels(groups, len(rows))
+        effective = np.empty_like(rows)
+        for name in np.unique(names):
+            effective[names == name], _ = self.apply(rows[names == name])
+        return _like(effective, q)
 
     def __repr__(self) -> str:
         return f"PlayOperator(width={self.width.tolist()})"
@@ -160,65 +153,62 @@ class PlayOperator:
         self, motion: Any, state: PlayState | None, name: str, *, lead: bool
     ) -> tuple[Any, PlayState]:
         """Return the effective changes of commands, or the reverse (`lead`), and the last state."""
-        rows = motion if isinstance(motion, Tensor) else real_array(motion, name)
-        if isinstance(motion, Tensor):
-            rows = motion.to(as_tensor(motion, name).dtype)
+        rows = real_array(motion, name)
         check_shape(rows, name, ("T", self.width.size if self.width.ndim else "n"))
         if not rows.shape[1]:
             raise ValueError(f"`{name}` must hold at least one actuator, got none.")
-        if not _is_finite(rows):
+        if not np.isfinite(rows).all():
             raise ValueError(f"`{name}` must be finite, got NaN or infinity.")
-        if state is None and not len(rows):
-            raise ValueError(
-                f"`{name}` must hold at least one row if `state` is not given."
-            )
-        if state is None:
+        if state is not None:
+            start = _checked(state, rows.shape[1])
+        elif len(rows):
             start = PlayState(rows[0], rows[0])
         else:
-            start = _checked(state, rows.shape[1])
-        if isinstance(rows, Tensor):
-            return self._by_torch(rows, start, lead)
+            need = "must hold at least one row if `state` is not given"
+            raise ValueError(f"`{name}` {need}.")
+        half = self.width / 2
         if len(rows) and rows.dtype == np.float64 and available():
-            result, *last = play(rows, start, self.width / 2, lead)
-            return result, PlayState(*last)
-        result, last = self._by_torch(torch.tensor(rows, device="cpu"), start, lead)
-        return result.numpy(), PlayState(last.command.numpy(), last.effective.numpy())
-
-    def _by_torch(
-        self, rows: Tensor, start: PlayState, lead: bool
-    ) -> tuple[Tensor, PlayState]:
-        command, effective = (
-            torch.as_tensor(a, device=rows.device).to(rows) for a in start
-        )
-        half = as_tensor(self.width / 2, "width").to(rows)
-        result = []
-        for row in rows:
-            if lead:
-                ahead = row + half * torch.sign(row - effective)
-                command = torch.where(row == effective, command, ahead)
-                effective = row
-            else:
-                effective = torch.minimum(
-                    torch.maximum(effective, row - half), row + half
-                )
-                command = row
-            result.append(command if lead else effective)
-        state = PlayState(command, effective)
-        return (torch.stack(result) if result else rows.clone()), state
+            result, command, effective = play(rows, start, half, lead)
+        else:
+            result, command, effective = _moved(rows, start, half, lead)
+        last = PlayState(_like(command, motion), _like(effective, motion))
+        return _like(result, motion), last
 
 
-def _is_finite(a: Any) -> bool:
-    return bool((a.isfinite() if isinstance(a, Tensor) else np.isfinite(a)).all())
+def _moved(
+    rows: NDArray, start: PlayState, half: NDArray, lead: bool
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Return effective changes (or with `lead` commands), last command and effective change."""
+    command, effective = start
+    half = half.astype(rows.dtype)
+    result = np.empty_like(rows)
+    for t, row in enumerate(rows):
+        if lead:
+            ahead = row + half * np.sign(row - effective)
+            command = np.where(row == effective, command, ahead)
+            effective = row
+            result[t] = command
+        else:
+            effective = np.clip(effective, row - half, row + half)
+            command = row
+            result[t] = effective
+    return result, command, effective
 
 
-def _checked(state: object, n: int) -> PlayState:
+def _like(values: NDArray, caller: NDArray | Tensor) -> Any:
+    """Return values as a tensor if the caller gave one."""
+    if isinstance(caller, Tensor):
+        return torch.tensor(values, device=caller.device)
+    return values
+
+
+def _checked(state: PlayState, n: int) -> PlayState:
     """Return a caller's state for n tendons, checked."""
-    parts = state if isinstance(state, (tuple, list)) else ()
-    vectors = [real_array(part, "state") for part in parts]
-    good = len(vectors) == 2 and all(
-        a.shape == (n,) and np.isfinite(a).all() for a in vectors
-    )
-    if not good:
-        need = f"must hold two finite vectors of shape ({n},)"
-        raise ValueError(f"`state` {need}, got {state!r:.200}.")
+    vectors = []
+    for part in state:
+        vector = real_array(part, "state")
+        if vector.shape != (n,) or not np.isfinite(vector).all():
+            need = f"must hold two finite vectors of shape ({n},)"
+            raise ValueError(f"`state` {need}, got {state!r:.200}.")
+        vectors.append(vector)
     return PlayState(*vectors)

@@ -32,6 +32,7 @@ FORMAT = "hybridkin-model"
 VERSION = 3
 _HEADER = "hybridkin"
 _CHECKSUM = "sha256"
+_KINDS = {"kind": str, "settings": dict, "arrays": dict, "parts": dict}
 _UNREADABLE = (
     SafetensorError,
     AttributeError,
@@ -45,22 +46,24 @@ Header = dict[str, Any]
 Arrays = dict[str, NDArray]
 
 
-def packed(stored: Stored) -> tuple[Header, Arrays]:
-    """Return a description as JSON entries and arrays, each distinct array once."""
-    arrays: Arrays = {}
-    names: dict[tuple[str, tuple[int, ...], bytes], str] = {}
+class _Packer:
+    """Descriptions as JSON entries, and their arrays, each distinct one once."""
 
-    def entries(stored: Stored, prefix: str) -> Header:
+    def __init__(self) -> None:
+        self.arrays: Arrays = {}
+        self._names: dict[tuple[str, tuple[int, ...], bytes], str] = {}
+
+    def entries(self, stored: Stored, prefix: str = "") -> Header:
         references = {}
         for name, array in stored.arrays.items():
             content = hashlib.sha256(array.tobytes()).digest()
-            references[name] = names.setdefault(
-                (array.dtype.name, array.shape, content), prefix + name
-            )
-            arrays[references[name]] = array
-        parts = {
-            key: entries(part, f"{prefix}{key}.") for key, part in stored.parts.items()
-        }
+            key = (array.dtype.name, array.shape, content)
+            reference = self._names.setdefault(key, prefix + name)
+            references[name] = reference
+            self.arrays[reference] = array
+        parts = {}
+        for name, part in stored.parts.items():
+            parts[name] = self.entries(part, f"{prefix}{name}.")
         return {
             "kind": stored.kind,
             "settings": stored.settings,
@@ -68,44 +71,50 @@ def packed(stored: Stored) -> tuple[Header, Arrays]:
             "parts": parts,
         }
 
-    return entries(stored, ""), arrays
+
+def packed(stored: Stored) -> tuple[Header, Arrays]:
+    """Return a description as JSON entries and arrays, each distinct array once."""
+    packer = _Packer()
+    return packer.entries(stored), packer.arrays
+
+
+class _Unpacker:
+    """Descriptions from the entries of a header; equal parts become one object."""
+
+    def __init__(self, arrays: Arrays) -> None:
+        self.arrays = arrays
+        self._described: dict[str, Stored] = {}
+
+    def described(self, header: Header) -> Stored:
+        entries = {name: header[name] for name in _KINDS}
+        for name, kind in _KINDS.items():
+            if type(entries[name]) is not kind:
+                raise ValueError(
+                    f"`{name}` must be a {kind.__name__}, got {entries[name]!r:.60}"
+                )
+        text = json.dumps(entries, sort_keys=True)
+        if text not in self._described:
+            stored = Stored(header["kind"], header["settings"])
+            for name, reference in header["arrays"].items():
+                stored.arrays[name] = self.arrays[reference]
+            for name, part in header["parts"].items():
+                stored.parts[name] = self.described(part)
+            self._described[text] = stored
+        return self._described[text]
 
 
 def unpacked(header: Header, arrays: Arrays) -> Stored:
-    """Return the description that `packed` wrote; raise a ValueError if it is not one.
+    """Return the description that `packed` wrote; raise a ValueError or KeyError if it is not one.
 
     Equal parts become one object, as in the model.
     """
     for name, array in arrays.items():
-        if (
-            array.dtype == np.float64
-            and not (countable(array) | ~np.isfinite(array)).all()
-        ):
+        numbers = array[np.isfinite(array)]
+        if not countable(numbers).all():
             raise ValueError(
                 f"the numbers of {name!r:.60} must be less than {LARGEST:g}"
             )
-    found: dict[str, Stored] = {}
-    kinds = {"kind": str, "settings": dict, "arrays": dict, "parts": dict}
-
-    def described(header: Header) -> Stored:
-        entries = [header.get(key) for key in kinds] if isinstance(header, dict) else []
-        if [type(entry) for entry in entries] != [*kinds.values()]:
-            raise ValueError(f"a part must hold {', '.join(kinds)}, got {header!r:.60}")
-        missing = [name for name in header["arrays"].values() if name not in arrays]
-        if missing:
-            raise ValueError(f"the array {missing[0]!r:.60} is missing")
-        entry = json.dumps({key: header[key] for key in kinds}, sort_keys=True)
-        if entry not in found:
-            arrays_of_entry = {
-                key: arrays[name] for key, name in header["arrays"].items()
-            }
-            parts = {key: described(part) for key, part in header["parts"].items()}
-            found[entry] = Stored(
-                header["kind"], header["settings"], arrays_of_entry, parts
-            )
-        return found[entry]
-
-    return described(header)
+    return _Unpacker(arrays).described(header)
 
 
 def write(path: Path, header: Header, arrays: Arrays) -> None:
@@ -131,26 +140,31 @@ def write(path: Path, header: Header, arrays: Arrays) -> None:
 
 def read(path: Path) -> tuple[Header, Arrays]:
     """Return header and arrays of a file; raise if it is damaged or of another version."""
-    if path.is_dir():
-        names = sorted(file.name for file in path.glob("[!.]*.safetensors"))
-        hint = f"; it contains {names[0]}." if names else " without a saved model."
-        raise FileNotFoundError(
-            f"`path` must name a saved model, got the folder {path}{hint}"
-        )
     if not path.is_file():
         raise FileNotFoundError(
-            f"`path` must name a saved model, got {path}: no such file."
+            f"`path` must name a saved model, got {path}, which is no file."
         )
     try:
         with safe_open(path, framework="numpy") as file:
             metadata = file.metadata() or {}
-            header = json.loads(metadata[_HEADER], parse_constant=_refused)
+            header: Header = dict(
+                json.loads(metadata[_HEADER], parse_constant=_refused)
+            )
             arrays = {name: file.get_tensor(name) for name in file.keys()}
     except _UNREADABLE as error:
         raise ValueError(
             f"{path} is not a model saved by hybridkin ({error!r})."
         ) from error
-    _check_version(path, header)
+    if header.get("format") != FORMAT:
+        raise ValueError(
+            f"{path} is not a model saved by hybridkin: its header does not match."
+        )
+    if header.get("version") != VERSION:
+        raise ValueError(
+            f"{path} has format version {header.get('version')!r:.40}, but this hybridkin reads "
+            f"version {VERSION}; install the hybridkin that wrote it, or save the model again "
+            f"(written with {header.get('versions')!r:.200})."
+        )
     if metadata.get(_CHECKSUM) != _checksum(metadata[_HEADER], arrays):
         raise ValueError(
             f"{path} is damaged: its content does not match its checksum. Copy it again, or save "
@@ -159,34 +173,15 @@ def read(path: Path) -> tuple[Header, Arrays]:
     return header, arrays
 
 
-def _check_version(path: Path, header: Any) -> None:
-    is_ours = isinstance(header, dict) and header.get("format") == FORMAT
-    if not is_ours or type(header.get("version")) is not int or header["version"] < 1:
-        raise ValueError(
-            f"{path} is not a model saved by hybridkin: its header does not match."
-        )
-    if header["version"] != VERSION:
-        versions = header.get("versions")
-        writer = versions.get("hybridkin") if isinstance(versions, dict) else None
-        named = f", {writer[:40]}" if isinstance(writer, str) else ""
-        raise ValueError(
-            f"{path} has format version {header['version']}, but this hybridkin reads version "
-            f"{VERSION}; install the hybridkin that wrote it{named}, or save the model again."
-        )
-
-
 def _refused(constant: str) -> None:
     raise ValueError(f"{constant} is no JSON value")
 
 
 def _checksum(text: str, arrays: Arrays) -> str:
-    names = sorted(arrays)
-    manifest = [
-        text,
-        [[name, arrays[name].dtype.name, arrays[name].shape] for name in names],
-    ]
-    digest = hashlib.sha256(json.dumps(manifest).encode())
-    for name in names:
-        array = arrays[name]
-        digest.update(array.astype(array.dtype.newbyteorder("<"), copy=False).tobytes())
+    """Return the SHA-256 of the header, and of names, types, shapes and bytes of all arrays."""
+    shapes = [[k, a.dtype.name, a.shape] for k, a in sorted(arrays.items())]
+    digest = hashlib.sha256(json.dumps([text, shapes]).encode())
+    for _, array in sorted(arrays.items()):
+        little_endian = array.astype(array.dtype.newbyteorder("<"), copy=False)
+        digest.update(little_endian.tobytes())
     return digest.hexdigest()

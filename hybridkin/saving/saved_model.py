@@ -9,7 +9,6 @@ import time
 from collections.abc import Mapping
 from datetime import datetime, timezone
 from pathlib import Path
-from types import NoneType
 from typing import Any
 
 import numpy as np
@@ -20,9 +19,7 @@ from hybridkin._core.arrays import as_path
 from hybridkin._core.model import ForwardModel
 from hybridkin._core.stored import plain
 from hybridkin._core.version import __version__
-from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
-from hybridkin.chains.rigid import RigidChain
 from hybridkin.hybrid.description import hybrid_of, restorer, stored_hybrid, training_of
 from hybridkin.hybrid.estimator import HybridForwardModel
 from hybridkin.learning.elm import ELMRegressor
@@ -193,29 +190,20 @@ def model_header(path: str | Path) -> dict[str, Any]:
 
 
 def _checked(training: Mapping[str, Any] | None) -> dict[str, Any]:
-    if not isinstance(training, (Mapping, NoneType)):
-        raise TypeError(
-            f"`training` must be a mapping of names to numbers, got {training!r:.80}."
-        )
-    entries = plain(dict(training or {}))
     try:
-        json.dumps(entries)
-    except TypeError as error:
-        raise TypeError(
-            f"`training` must hold numbers, strings and lists of them, got {training!r}."
-        ) from error
-    return entries
+        notes = plain(dict(training or {}))
+        json.dumps(notes)
+    except (TypeError, ValueError) as error:
+        need = "must map names to numbers, strings and lists of them"
+        raise TypeError(f"`training` {need}, got {training!r:.200}.") from error
+    return notes
 
 
 def _units(model: object, output: str = "position") -> dict[str, str | list[str]]:
     if not isinstance(model, Chain):
         return {"q": "as in training", "x": "as in training"}
-    q: str | list[str] = "as in training"  # of a chain with gains, for example counts
-    if isinstance(model, RigidChain):
-        q = model.units
-    elif isinstance(model, ArcChain) and model.in_metres:
-        q = "m" if model.stage is None else ["rad"] + ["m"] * (model.n_actuators - 1)
-    return {"q": q, "x": "m" if output == "position" else ["m"] * 3 + ["rad"] * 3}
+    x = "m" if output == "position" else ["m"] * 3 + ["rad"] * 3
+    return {"q": model.units, "x": x}
 
 
 def _domain(model: HybridForwardModel) -> dict[str, Any]:

@@ -184,16 +184,6 @@ def test_taut_and_soft_is_the_plain_chain(routing, rng):
         assert_close(chain(q), torch.stack(expected), rtol=0, atol=1e-9)
 
 
-def test_soft_by_default_and_near_the_plain_chain(rng):
-    plain = ConstantCurvatureChain(RADII, lengths=LENGTHS, routing="base")
-    q = random_q(rng, 50).unflatten(1, (3, 3))
-    q = (q - q.mean(-1, keepdim=True)).flatten(1)
-    bends = plain.arcs(q)[1]
-    for zeros, part in ((0.0, 0.08), (1e-3, 0.02)):
-        chain = ElasticTendonChain(RADII, LENGTHS, tendon_zeros=zeros)
-        assert (chain.arcs(q)[1] - bends).norm() < part * bends.norm()
-
-
 def test_tendons_may_be_renamed_and_the_robot_turned(rng):
     chain, q = robot(base=None), random_q(rng, 20)
     order = torch.tensor([2, 0, 1, 3, 5, 4, 8, 7, 6])
@@ -207,16 +197,6 @@ def test_tendons_may_be_renamed_and_the_robot_turned(rng):
     turned = chain.with_geometry(angles=chain.angles + 0.7, rest_bends=chain.rest_bends @ turn.T)
     expected = torch.cat([chain(q)[:, :2] @ turn.T, chain(q)[:, 2:]], dim=1)
     assert_close(turned(q), expected, rtol=0, atol=1e-14)
-
-
-def test_change_of_units(rng):
-    q, chain = random_q(rng, 20), robot()
-    units = {"radii": 1e3, "lengths": 1e3, "offsets": 1e3, "tendon_zeros": 1e3}
-    units["bending_stiffness"] = 1e6
-    geometry = chain.geometry()
-    in_mm = chain.with_geometry(**{name: unit * geometry[name] for name, unit in units.items()})
-    assert_close(in_mm(1e3 * q), 1e3 * chain(q), rtol=1e-12, atol=1e-11)
-    assert_close(in_mm.tensions(1e3 * q), 1e3 * chain.tensions(q), rtol=0, atol=1e-12)
 
 
 @each_robot
@@ -238,16 +218,6 @@ def test_closed_form_jacobians_are_those_of_autograd(chain, rng):
         for take in (torch.func.jacrev, torch.func.jacfwd)
     ]
     assert_close(*second, rtol=0, atol=1e-12 * float(second[0].abs().max()))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["through", "pre-tensioned", "sixteen tendons"])
-def test_gradcheck(name, rng):
-    chain = ROBOTS[name]
-    q = random_q(rng, 2, chain.n_actuators).requires_grad_()
-    assert torch.autograd.gradcheck(chain, q)
-    assert torch.autograd.gradgradcheck(chain, q)
-    assert torch.autograd.gradcheck(chain.tensions, q)
 
 
 def test_at_a_kink_the_derivative_is_the_taut_side():
@@ -293,28 +263,6 @@ def test_robots_and_rows_may_be_mapped_over(rng):
     )
     each = torch.stack([expected[0, 0], expected[1, 1]])
     assert_close(vmap(tips)(radii, q), each, rtol=0, atol=1e-13)
-
-
-@pytest.mark.slow
-def test_with_geometry_is_differentiable_and_leaves_the_chain(rng):
-    chain, q = robot(), random_q(rng, 3)
-    before = {name: value.clone() for name, value in chain.geometry().items()}
-    expected = chain(q)
-    for name in ("radii", "angles", "lengths", "rest_bends", "axial_stiffness", "offsets"):
-        value = (1.01 * before[name]).requires_grad_()
-        assert torch.autograd.gradcheck(
-            lambda value: chain.with_geometry(**{name: value}).forward_and_jacobian(q),  # noqa: B023
-            value,
-        )
-    radii = torch.stack([chain.radii, 1.1 * chain.radii])
-    tips = torch.func.vmap(lambda own: chain.with_geometry(radii=own)(q))(radii)
-    assert_close(tips[0], expected, rtol=0, atol=1e-13)
-    assert_close(tips[1], chain.with_geometry(radii=radii[1])(q), rtol=0, atol=1e-13)
-    both = torch.func.vmap(lambda own, row: chain.with_geometry(radii=own)(row))(radii, q[:2])
-    assert_close(both[0], expected[0], rtol=0, atol=1e-13)
-    assert_close(chain.geometry(), before, rtol=0, atol=0)
-    with pytest.raises(ValueError, match="stiffness"):
-        chain.with_geometry(stiffness=radii[0])
 
 
 def test_what_is_kept_follows_the_geometry(rng):
@@ -373,26 +321,6 @@ def test_absurd_displacements_end(rng):
             assert torch.isfinite(x).all()
 
 
-@pytest.mark.slow
-def test_another_tip(rng):
-    whole, q = robot(), random_q(rng, 4)
-    for at in (0.3, 1.0, 1.5, 3.0):
-        chain = whole.with_tip(at)
-        x, J = chain.forward_and_jacobian(q)
-        if at == int(at):
-            assert_close(x, whole.poses(q)[:, int(at), :3, 3], rtol=0, atol=1e-15)
-        else:
-            assert_close(x, whole.backbone(q)[:, round(20 * at)], rtol=0, atol=1e-15)
-        expected = torch.func.vmap(torch.func.jacrev(chain))(q)
-        assert_close(J, expected, rtol=0, atol=1e-12 * float(J.abs().max()))
-        tangents = torch.eye(9, dtype=torch.float64)
-        slope = chain.geometry_jacobian(q, {"angles": tangents})
-        expected = torch.func.jacfwd(lambda v: chain.with_geometry(angles=v)(q))(chain.angles)  # noqa: B023
-        assert_close(slope, expected, rtol=0, atol=1e-11 * float(slope.abs().max()))
-    assert repr(whole) == "ElasticTendonChain(3 segments, 9 actuators, routing 'base')"
-    assert "tip at 0.3" in repr(whole.with_tip(0.3))
-
-
 def logged(truth, rng, n=300):
     """Return displacements that let tendons go slack, and the tips."""
     q = random_q(rng, n)
@@ -420,17 +348,6 @@ def test_calibration_finds_stiffness_rest_bends_and_zeros(rng):
         assert result.identifiable[name].all()
         scale = float(geometry[name].abs().max())
         assert_close(result.values[name] / scale, geometry[name] / scale, rtol=0, atol=1e-6)
-
-
-@pytest.mark.slow
-def test_calibration_turns_the_rings(rng):
-    truth = robot()
-    q, x = logged(truth, rng)
-    start = truth.with_geometry(angles=truth.angles + 0.8)
-    result = calibrate(start, q, x, ("base", "angles", *PLANTED, "tool"))
-    assert result.rmse < 1e-8
-    new = random_q(rng, 50)
-    assert_close(result.chain(new), truth(new), rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize(

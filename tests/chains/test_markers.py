@@ -73,14 +73,6 @@ def test_all_derivatives_of_several_markers(chain):
     assert_close(marked.geometry_jacobian(q, tangents), expected, atol=1e-9, rtol=1e-9)
 
 
-def test_two_markers_have_the_jacobians_of_both(chain):
-    marked, q = chain.with_markers([(0, 0.5), (2, 1.0)]), rows_of(chain)
-    x, J = marked.forward_and_jacobian(q)
-    each = [chain.with_tip(at).forward_and_jacobian(q) for at in (0.5, 3.0)]
-    for found, parts in zip((x, J), zip(*each, strict=True), strict=True):
-        assert_close(found, torch.cat(parts, dim=1), rtol=0, atol=1e-14)
-
-
 @pytest.mark.parametrize("k", range(4))
 def test_the_compiled_core_has_one_marker(chain, k):
     """Beside the backbone torch computes it."""

@@ -1,5 +1,3 @@
-import runpy
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -39,34 +37,6 @@ def test_play_by_hand():
 def test_no_width_is_the_identity(q):
     close(PlayOperator(0.0).apply(q)[0], q)
     close(PlayOperator(0.0).command(q)[0], q)
-
-
-@CHECKS
-@given(q=ROWS, width=WIDTHS, repeats=st.integers(2, 4))
-def test_speed_does_not_matter(q, width, repeats):
-    """A command held, or reached in smaller steps, leads to the same."""
-    play = PlayOperator(width)
-    y, _ = play.apply(q)
-    close(play.apply(np.repeat(q, repeats, axis=0))[0][::repeats], y)
-    parts = np.linspace(0.0, 1.0, repeats + 1)[1:, None]
-    ways = [a + parts * (b - a) for a, b in pairwise(q)]
-    slow = np.concatenate([q[:1], *ways])
-    close(play.apply(slow)[0][::repeats], y)
-
-
-@CHECKS
-@given(q=ROWS, width=WIDTHS, more=st.floats(0.0, 0.01))
-def test_more_command_is_never_less_effect(q, width, more):
-    play = PlayOperator(width)
-    push = more * np.linspace(0.0, 1.0, q.size).reshape(q.shape)
-    assert (play.apply(q + push)[0] >= play.apply(q)[0] - 1e-15).all()
-
-
-@CHECKS
-@given(q=ROWS, width=WIDTHS)
-def test_effect_stays_within_half_the_width(q, width):
-    y, _ = PlayOperator(width).apply(q)
-    assert (np.abs(y - q) <= np.asarray(width) / 2 + 1e-15).all()
 
 
 @CHECKS
@@ -183,16 +153,6 @@ def test_widths_are_doubled_while_the_largest_is_the_best():
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:the calibrated model has a median")  # what such play hides
-def test_no_width_is_wider_than_the_range():
-    truth, q, x, groups = log_of(0.01, 1e-4)
-    with pytest.warns(UserWarning, match="calibration gave unphysical values"):
-        fit = fit_play(truth, q, x, groups, (3e-3,), ("radii",))
-    close(fit.widths, np.array([0.0, 3e-3, 6e-3, np.ptp(q, axis=0).max()]))
-    assert fit.width == fit.widths[-1]
-
-
-@pytest.mark.slow
 def test_no_play_is_kept_where_there_is_none():
     truth, q, x, groups = log_of(0.0, 1e-3)
     fit = fit_play(truth, q, x, groups, (0.1e-3, 0.4e-3), ("radii",), loss="soft_l1")
@@ -205,26 +165,3 @@ def test_one_motion_is_too_few():
     truth, q, x, _ = log_of(0.0, 0.0)
     with pytest.raises(ValueError, match="at least two motions"):
         fit_play(truth, q, x, np.zeros(len(q)))
-
-
-@pytest.mark.slow
-def test_example_shows_what_slack_costs(data_home, monkeypatch):
-    monkeypatch.setenv("HYBRIDKIN_DATA", str(data_home))
-    space = runpy.run_path(str(EXAMPLE))
-    data, results = space["data"], space["found"]["5 folds"]
-    assert sorted(np.concatenate([test for test, _ in results])) == [*range(len(data.q))]
-    plain, elastic = (
-        1e3
-        * np.mean(
-            [np.linalg.norm(one[name] - data.x[test], axis=1).mean() for test, one in results]
-        )
-        for name in ("plain", "elastic")
-    )
-    assert elastic < 4.2
-    assert elastic < 0.6 * plain
-
-
-def test_example_says_when_the_recording_is_absent(tmp_path, monkeypatch, capsys):
-    monkeypatch.setenv("HYBRIDKIN_DATA", str(tmp_path))
-    runpy.run_path(str(EXAMPLE))
-    assert "Skipped: ftdcr_v4/train.csv is not part of hybridkin" in capsys.readouterr().out

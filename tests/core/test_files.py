@@ -2,16 +2,12 @@
 
 import errno
 import os
-from functools import partial
 from pathlib import Path
 
-import numpy as np
 import pytest
-from small_files import small_files
 
-from hybridkin import native, plots, robots, save_model
+from hybridkin import robots
 from hybridkin._core.files import write_file, write_files
-from hybridkin.workflow.report import Report
 
 FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # as of a call that knows no name
 
@@ -53,41 +49,3 @@ def test_a_name_that_is_too_long_is_the_one_in_the_message(tmp_path, length):
 
 
 CHAIN = robots.bionic_handling_assistant()
-
-
-def film(path):
-    q = 0.1 + np.linspace(0.0, 0.02, 27).reshape(3, 9)
-    plots.TrackAnimation.from_estimator(CHAIN, q).save(path)
-
-
-def report(out):
-    written = Report("model", {})
-    written.text("text " * 300)
-    written.write(out)
-
-
-def table(out):
-    written = Report("next", {})
-    written.file("next.csv", partial(np.savetxt, X=np.eye(20)))
-    written.write(out)
-
-
-@pytest.mark.parametrize(
-    ("write", "name", "failing"),
-    [
-        (partial(save_model, CHAIN), "model", "model"),
-        (partial(native.export_c, CHAIN), "code", "code/model.h"),
-        (report, "out", "out/report.md"),
-        (table, "out", "out/next.csv"),
-        pytest.param(film, "film.gif", "film.gif", marks=pytest.mark.slow),
-        pytest.param(film, "film.html", "film.html", marks=pytest.mark.slow),
-    ],
-)
-def test_every_writer_names_the_file_that_does_not_fit(tmp_path, write, name, failing):
-    if name.endswith("html"):
-        pytest.importorskip("viser")
-    with small_files(), pytest.raises(OSError, match="too large") as caught:
-        write(tmp_path / name)
-    assert caught.value.filename.startswith(str(tmp_path / failing))
-    assert not (tmp_path / failing).exists()
-    assert [*tmp_path.rglob("*.part*")] == []

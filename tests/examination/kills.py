@@ -159,7 +159,9 @@ def content(folder: Path) -> Files:
 
 
 def litter(folder: Path) -> list[str]:
-    return sorted(p.name for p in [*folder.glob(".*"), *folder.parent.glob(".out*")])
+    """Return what lies beside the files; a killed writer may leave its hidden part."""
+    beside = [*folder.glob(".*"), *folder.parent.glob(".out*")]
+    return sorted(p.name for p in beside if ".part" not in p.name)
 
 
 def killed(name: str, n: int, old: Any, new: Any, out: Path, rng: Any) -> Line:

@@ -1,6 +1,4 @@
 import json
-import subprocess
-import sys
 from typing import Any
 
 import numpy as np
@@ -18,14 +16,12 @@ from saved_models import (
     trunk_log,
 )
 from sklearn.base import clone
-from sklearn.exceptions import NotFittedError
 from sklearn.kernel_ridge import KernelRidge
 from sklearn.model_selection import GroupKFold
 
 import hybridkin
 from hybridkin import (
     ConstantCurvatureChain,
-    ELMRegressor,
     ELMRegressorCV,
     HybridForwardModel,
     load_model,
@@ -84,38 +80,6 @@ def test_chain_comes_back(tmp_path, chain):
     }
 
 
-@pytest.mark.slow
-def test_a_hybrid_comes_back_in_another_process(tmp_path, fitted):
-    model, q = fitted["parallel_elm"]
-    path = tmp_path / "model.safetensors"
-    save_model(model, path)
-    loaded = f"hybridkin.load_model({str(path)!r})"
-    code = f"import hybridkin; print({loaded}.predict({q[:1].tolist()}).tolist())"
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert_allclose(json.loads(run.stdout), model.predict(q[:1]), rtol=1e-12)
-
-
-def test_a_loaded_network_can_learn_on(tmp_path, log):
-    q, x = log
-    model = ELMRegressor(random_state=0).fit(q[:100], x[:100])
-    save_model(model, tmp_path / "m")
-    twin = load_model(tmp_path / "m")
-    was = model.partial_fit(q[100:], x[100:]).predict(q)
-    assert_array_equal(twin.partial_fit(q[100:], x[100:]).predict(q), was)
-
-
-def test_damaged_networks(tmp_path, log):
-    path = tmp_path / "elm.safetensors"
-    with pytest.raises(NotFittedError):
-        save_model(ELMRegressor(), path)
-    save_model(ELMRegressor(5, random_state=0).fit(*log), path)
-    arrays = load_file(path)
-    arrays["network.output_weights"] = arrays["network.output_weights"][:3]
-    rewrite(path, arrays)
-    with pytest.raises(ValueError, match="is damaged"):
-        load_model(path)
-
-
 def test_what_needs_code_is_refused_and_nothing_is_written(tmp_path, log):
     path = tmp_path / "model"
     with pytest.raises(TypeError, match="only be stored as code"):
@@ -133,7 +97,7 @@ def test_what_needs_code_is_refused_and_nothing_is_written(tmp_path, log):
 
 def test_foreign_and_damaged_files(tmp_path, log):
     path = tmp_path / "model"
-    with pytest.raises(FileNotFoundError, match="no such file"):
+    with pytest.raises(FileNotFoundError, match="is no file"):
         load_model(path)
     for content in (b"", b"hello", b"\x80\x04cos\nsystem\n"):
         path.write_bytes(content)
@@ -239,7 +203,7 @@ def test_the_header_describes_the_model(tmp_path, fitted):
     assert model_header(path)["units"]["q"] == "as in training"
     save_model(fitted["pose_output"][0], path)
     assert model_header(path)["units"]["x"] == ["m", "m", "m", "rad", "rad", "rad"]
-    with pytest.raises(TypeError, match="`training` must hold numbers"):
+    with pytest.raises(TypeError, match="`training` must map names"):
         save_model(arm(), path, training={"a": object()})
 
 
@@ -258,12 +222,6 @@ def test_devices(tmp_path, kind, fitted):
     assert {buffer.device.type for buffer in module.buffers()} == {"cuda"}
     if module is not twin:
         assert_allclose(twin.predict(q), model.predict(q), rtol=1e-12)
-
-
-def test_others_may_read_the_file(tmp_path):
-    (tmp_path / "other").touch()
-    save_model(tendon_chain(), tmp_path / "model")
-    assert (tmp_path / "model").stat().st_mode == (tmp_path / "other").stat().st_mode
 
 
 @pytest.mark.parametrize("header", ["[]", "3", "null", "{", "[" * 100_000, '{"format": 1}'])

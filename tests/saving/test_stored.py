@@ -78,7 +78,7 @@ def test_entries_are_checked_when_they_are_read():
     assert np.isnan(stored.array("n", "k", finite=False)).all()
     wrong = [
         ("`missing` of 'thing' is missing", lambda: stored.value("missing", str)),
-        ("`flag` of 'thing' must be int or null", lambda: stored.value("flag", (int, None))),
+        ("`flag` of 'thing' must be one of", lambda: stored.value("flag", (int, None))),
         ("must be a list of str", lambda: stored.list_of(str, "names")),
         ("the part 'x' of 'thing' is missing", lambda: stored.part("x")),
         ("the array 'x' of 'thing' is missing", lambda: stored.array("x")),
