@@ -86,8 +86,8 @@ def test_the_compiled_core_has_one_marker(chain, k):
     assert (program_of(one) is not None) == (k > 1 and program_of(chain) is not None)
 
 
-def test_several_markers_have_no_kernel(chain):
-    with pytest.raises(plan.NoKernel, match="several markers"):
+def test_markers_beside_the_backbone_have_no_kernel(chain):
+    with pytest.raises(plan.NoKernel, match="beside the backbone"):
         plan.Plan(chain.with_markers(MARKERS).stored())
 
 
