@@ -7,7 +7,7 @@ TESTS := -q -n auto --maxprocesses 4 --dist worksteal
 # More threads than cores make torch many times slower; the processes share the cores.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: paper test quick view-test bench examine coverage check docs clean dist oldest native
+.PHONY: paper test quick view-test bench examine coverage check docs clean dist oldest native claims-quick
 
 paper: $(VENV)/.native
 	$(BIN)/python examples/paper --out $(OUT)
@@ -24,6 +24,10 @@ view-test: $(VENV)/.browser $(VENV)/.native
 
 bench: $(VENV)/.bench $(VENV)/.native
 	$(BIN)/python -m pytest -q tests/benchmarks --benchmark-enable --benchmark-quiet
+
+# The published figures that take under a minute each, beside the committed ones.
+claims-quick: $(VENV)/.native
+	$(BIN)/python examples/studies/claims.py
 
 # A shortened examination; docs/reliability.md has the figures of the full one.
 examine: $(VENV)/.examine $(VENV)/.native

@@ -262,7 +262,7 @@ def hybrids_report(
     parts = {"few rows": curves, "outside the training range": outside}
     parts["held-out motions"] = motions
     lines = [
-        line for study, entries in parts.items() for line in _lines(study, entries)
+        line for study, entries in parts.items() for line in csv_lines(study, entries)
     ]
     add_csv(report, "hybrids.csv", _COLUMNS, lines)
     return report
@@ -289,7 +289,7 @@ def stored_entries(path: Any) -> dict[str, list[dict[str, Any]]]:
     return found
 
 
-def _lines(study: str, entries: list[dict[str, Any]]) -> list[list[Any]]:
+def csv_lines(study: str, entries: list[dict[str, Any]]) -> list[list[Any]]:
     """Return one line for each model, size and test; of auto with its cross-validated error."""
     lines, by_size = [], study == "few rows"
     for case, test in _tests(entries):

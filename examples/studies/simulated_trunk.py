@@ -6,5 +6,6 @@ from pathlib import Path
 sys.path.append(str(Path(__file__).parents[1]))  # where the package `paper` lies
 
 from paper import PAPER_ELM, TrunkPlant, make_trunk, paper_protocol
+from paper.tables import table1
 
-__all__ = ["PAPER_ELM", "TrunkPlant", "make_trunk", "paper_protocol"]
+__all__ = ["PAPER_ELM", "TrunkPlant", "make_trunk", "paper_protocol", "table1"]

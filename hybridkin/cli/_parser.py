@@ -503,19 +503,25 @@ def _animate(command: argparse.ArgumentParser) -> None:
 
 
 def _export(command: argparse.ArgumentParser) -> None:
-    """Write a model as C code for a controller.
+    """Write a model as C code, for MATLAB, or as a functional mock-up unit.
 
     Writes a header, a source file, a test and a CMakeLists.txt. The code needs only math.h. With
     --dt it also has the step of inverse kinematics, within the limits of the robot description and
-    the training range.
+    the training range. --fmu writes a unit for Simulink and other tools instead (FMI 3.0), --mex a
+    C file and its help for MATLAB and Octave.
 
     Some examples:
       hybridkin export model --out robot_c --name robot
       hybridkin export model --out robot_c --name robot --dtype float32 --dt 0.001
+      hybridkin export model --fmu robot.fmu --name robot --dt 0.01
+      hybridkin export model --mex --out matlab --name robot --dt 0.01
     """
     add = command.add_argument
     _add_model(command)
-    add("--out", type=Path, required=True, metavar="DIR", help="folder for the code")
+    where = command.add_mutually_exclusive_group(required=True)
+    where.add_argument("--out", type=Path, metavar="DIR", help="folder for the code")
+    where.add_argument("--fmu", type=Path, metavar="FILE", help="write this unit")
+    add("--mex", action="store_true", help="for MATLAB and Octave")
     add("--name", default="model", help="name of files and functions (model)")
     add(
         "--dtype",

@@ -321,9 +321,16 @@ def _animate(arguments: argparse.Namespace, stages: Stages) -> _Result:
 
 def _export(arguments: argparse.Namespace, stages: Stages) -> _Result:
     loaded = hybridkin.workflow.open_model(arguments.model, arguments.robot)
+    if arguments.fmu is not None:
+        kind = "fmu"
+    elif arguments.mex:
+        kind = "mex"
+    else:
+        kind = "c"
     report = hybridkin.workflow.export_model(
         loaded,
-        arguments.out,
+        arguments.fmu or arguments.out,
+        kind=kind,
         name=arguments.name,
         dtype=arguments.dtype,
         dt=arguments.dt,

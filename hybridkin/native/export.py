@@ -11,7 +11,7 @@ import tempfile
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -26,6 +26,7 @@ from hybridkin._core.stored import Stored
 from hybridkin._core.version import __version__
 
 _FOLDER = Path(__file__).parent
+ABOUT_Q = "q in metres, or in radians for revolute joints, as in the model."
 _REAL = {"float64": "double", "float32": "float"}
 # of the test, relative to the largest numbers.
 _TOLERANCE = {
@@ -79,7 +80,7 @@ def export_c(
     *,
     name: str = "model",
     dtype: str = "float64",
-    about_q: str = "q in metres, or in radians for revolute joints, as in the model.",
+    about_q: str = ABOUT_Q,
 ) -> list[Path]:
     """Write a model or inverse kinematics as C99 code for a controller; return the files.
 
@@ -120,6 +121,67 @@ def export_c(
     >>> [path.name for path in paths]
     ['trunk.h', 'trunk.c', 'trunk_test.c', 'CMakeLists.txt', 'README.md']
     """
+    project = c_project(model, name=name, dtype=dtype, about_q=about_q)
+    texts = dict(project.texts)
+    paths = [Path(folder) / file for file in (*texts, "README.md")]
+    for path in paths:
+        if path.exists() and "hybridkin" not in path.read_text(errors="replace"):
+            raise FileExistsError(
+                f"`folder` has a {path.name} of another origin; use another."
+            )
+    measured = _measured(f"{name}.c", texts)
+    texts["README.md"] = filled("README.md", {**project.entries, "MEASURED": measured})
+    write_files(
+        folder,
+        {file: partial(Path.write_text, data=text) for file, text in texts.items()},
+    )
+    return paths
+
+
+class CProject(NamedTuple):
+    """A model, or one step of inverse kinematics, in C.
+
+    Attributes
+    ----------
+    controller : InverseKinematics or None
+        What the step is of.
+    plan : Plan
+        The numbers.
+    home : ndarray of shape (n,)
+        A typical q, within the limits.
+    entries : dict
+        What templates are filled with.
+    texts : dict
+        Header, source, test and CMakeLists.txt by the name of the file.
+    """
+
+    controller: _Controller | None
+    plan: Plan
+    home: NDArray
+    entries: dict[str, Any]
+    texts: dict[str, str]
+
+    @property
+    def limits(self) -> NDArray:
+        """Limits q_min, q_max, dq_max and ddq_max of a step, shape (4, n)."""
+        return _limits(self.plan)[0]
+
+    @property
+    def gains(self) -> tuple[float, float, float]:
+        """Gain (negative: 1 / period), beta [1/s] and period [s] of a step."""
+        n = self.plan.n_inputs
+        (gain, beta, dt) = self.plan.data[self.plan.begin(self.plan.root) + 6 * n :][:3]
+        return float(gain), float(beta), float(dt)
+
+
+def c_project(
+    model: object,
+    *,
+    name: str = "model",
+    dtype: str = "float64",
+    about_q: str = ABOUT_Q,
+) -> CProject:
+    """Return a model or inverse kinematics in C, see `export_c`, without writing files."""
     if dtype not in _REAL:
         raise ValueError(f'`dtype` must be "float64" or "float32", got {dtype!r}.')
     if not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
@@ -143,12 +205,6 @@ def export_c(
         f"{name}_test.c": "check.c",
     }
     sources["CMakeLists.txt"] = "CMakeLists.txt"
-    paths = [Path(folder) / file for file in (*sources, "README.md")]
-    for path in paths:
-        if path.exists() and "hybridkin" not in path.read_text(errors="replace"):
-            raise FileExistsError(
-                f"`folder` has a {path.name} of another origin; use another."
-            )
     entries = {
         **dict(
             NAME=name,
@@ -165,19 +221,15 @@ def export_c(
         STEP_H="step.h", STEP_C="step.c", TICKS="ticks.c", STEP_README="step.md"
     )
     for key, template in parts.items():
-        entries[key] = "" if controller is None else _filled(template, entries)
+        entries[key] = "" if controller is None else filled(template, entries)
 
-    texts = {file: _filled(template, entries) for file, template in sources.items()}
-    entries["MEASURED"] = _measured(f"{name}.c", texts)
-    texts["README.md"] = _filled("README.md", entries)
-    write_files(
-        folder,
-        {file: partial(Path.write_text, data=text) for file, text in texts.items()},
-    )
-    return paths
+    texts = {file: filled(template, entries) for file, template in sources.items()}
+    home = _middle(modules[0], plan, controller)[0].astype(dtype).astype(float)
+    return CProject(controller, plan, home, entries, texts)
 
 
-def _filled(template: str, entries: dict[str, Any]) -> str:
+def filled(template: str, entries: dict[str, Any]) -> str:
+    """Return the text of a template with its entries."""
     text = _with_headers(_FOLDER / "templates" / template)
     return re.sub(r"@(\w+)@", lambda found: str(entries[found[1]]), text)
 
@@ -213,8 +265,8 @@ def _code(plan: Plan, controller: _Controller | None, dtype: str) -> dict[str, A
     ]
     fields = {
         "DEFINES": "\n".join(["#define HK_FLOAT"] * (dtype == "float32") + lines),
-        "CODE": _literals(plan.code),
-        "DATA": _literals(plan.data.astype(dtype)),
+        "CODE": literals(plan.code),
+        "DATA": literals(plan.data.astype(dtype)),
         **dict(M=plan.lengths(at)[1], MODEL=at, ROOT=plan.root, CALL="forward(q, x)"),
         "BYTES": len(plan.data) * (8 if dtype == "float64" else 4) + 4 * len(plan.code),
         "OPERATIONS": f"{_operations(plan):,}",
@@ -225,7 +277,7 @@ def _code(plan: Plan, controller: _Controller | None, dtype: str) -> dict[str, A
         fields |= zip(("Q_MIN", "Q_MAX", "DQ_MAX", "DDQ_MAX"), words, strict=True)
         fields |= {"DT": dt, "CALL": "step(&state, target, NULL, NULL)"}
         sentence = "limits.md" if np.isfinite(limits).any() else "no_limits.md"
-        fields["LIMITS"] = _filled(sentence, fields)
+        fields["LIMITS"] = filled(sentence, fields)
         m = plan.n_outputs
         fields["NEWTON"] = (
             f"{10 * plan.n_inputs**2 + (20 + 7 * m * m) * plan.n_inputs:,}"
@@ -281,7 +333,7 @@ def _limits(plan: Plan) -> tuple[NDArray, float]:
     return limits, float(numbers[6 * n + 2])
 
 
-def _literals(values: NDArray) -> str:
+def literals(values: NDArray) -> str:
     """Return numbers as the entries of a C array."""
     single = "f" if values.dtype == np.float32 else ""
     cast = "" if single else "(double)"
@@ -295,17 +347,23 @@ def _literals(values: NDArray) -> str:
     return "\n    " + ",\n    ".join(lines) + ",\n"
 
 
+def _middle(
+    module: ForwardModel, plan: Plan, controller: _Controller | None
+) -> tuple[NDArray, NDArray]:
+    """Return the middle and half the width of usual q: between the limits, or of the model."""
+    if controller is not None and np.isfinite(_limits(plan)[0][:2]).all():
+        low, high, *_ = _limits(plan)[0]
+        return 0.5 * (low + high), 0.5 * (high - low)
+    return _usual(module, plan.n_inputs)
+
+
 def _vectors(
     modules: list[ForwardModel], plan: Plan, controller: _Controller | None, dtype: str
 ) -> dict[str, Any]:
     """Return the data of the test: inputs, and the outputs that torch computes."""
     doubles = [copy.deepcopy(module).double() for module in modules]
     rng = np.random.default_rng(0)
-    center, half = _usual(doubles[0], plan.n_inputs)
-    if controller is not None and np.isfinite(_limits(plan)[0][:2]).all():
-        low, high, *_ = _limits(plan)[0]
-        center = 0.5 * (low + high)
-        half = 0.5 * (high - low)
+    center, half = _middle(modules[0], plan, controller)
     # Eight usual rows, then rows at growing distance from the center; the last one is NaN.
     far = np.concatenate(
         [np.linspace(0.0, 0.7, 8), np.linspace(0.8, 5.0, 8), [math.nan]]
@@ -328,7 +386,7 @@ def _vectors(
     return {
         "ROWS": len(rows),
         **fields,
-        **{key: _literals(a) for key, a in arrays.items()},
+        **{key: literals(a) for key, a in arrays.items()},
     }
 
 

@@ -1,4 +1,4 @@
-"""A model as C code for a controller, with a step of inverse kinematics if requested."""
+"""A model in C, for MATLAB or as a functional mock-up unit, with a step if requested."""
 
 from __future__ import annotations
 
@@ -7,10 +7,19 @@ from pathlib import Path
 
 import numpy as np
 
+from hybridkin._core.arrays import one_of
 from hybridkin.native.export import export_c
+from hybridkin.native.fmu import export_fmu
+from hybridkin.native.mex import export_mex
 from hybridkin.workflow.domain import Domain, PathLimits, path_limits
 from hybridkin.workflow.model import LoadedModel
 from hybridkin.workflow.report import Report
+
+_TITLES = {
+    "c": "C code",
+    "fmu": "Functional mock-up unit",
+    "mex": "MATLAB and Octave",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,23 +48,26 @@ def export_model(
     loaded: LoadedModel,
     out: str | Path,
     *,
+    kind: str = "c",
     name: str = "model",
     dtype: str = "float64",
     dt: float | None = None,
     limits: PathLimits | None = None,
 ) -> Report[Export]:
-    """Write a model as C code, see `native.export_c`.
+    """Write a model for another system, see `native.export_c`, `export_fmu` and `export_mex`.
 
     Parameters
     ----------
     loaded : LoadedModel
         The model, as from `open_model`.
     out : str or Path
-        Folder to write into.
+        Folder to write into; of a functional mock-up unit the file.
+    kind : {"c", "fmu", "mex"}, default="c"
+        C code, a functional mock-up unit, or C code for MATLAB and Octave.
     name : str, default="model"
         Name of the files and functions.
     dtype : {"float64", "float32"}, default="float64"
-        Number type of the code.
+        Number type of C code.
     dt : float, optional
         Control period [s]. If given, a step of inverse kinematics is written, too; it prefers a
         configuration in the domain of the model. Default: the model alone.
@@ -67,19 +79,28 @@ def export_model(
     Report of Export
         What was written.
     """
+    one_of(kind, "kind", _TITLES)
+    if kind != "c" and dtype != "float64":
+        raise ValueError('`dtype` must be "float64" here; "float32" is for C code.')
     model = loaded.module
     if dt is None:
         limits = None
     else:
         limits = limits or path_limits(loaded)
         model = Domain(loaded, limits).solver(dt=dt)
-    report = Report("C code", Export(loaded.n_actuators, dtype, dt, limits))
+    report = Report(_TITLES[kind], Export(loaded.n_actuators, dtype, dt, limits))
     report.text(f"{name}: {loaded.n_actuators} actuators, {dtype}.")
     if limits is not None:
         report.text(f"Steps of {dt:g} s within limits: {limits.source}.")
     about_q = _about_q(loaded)
     report.text(about_q)
-    report.paths = export_c(model, out, name=name, dtype=dtype, about_q=about_q)
+    words = {"name": name, "about_q": about_q}
+    if kind == "fmu":
+        report.paths = [export_fmu(model, out, **words)]
+    elif kind == "mex":
+        report.paths = export_mex(model, out, **words)
+    else:
+        report.paths = export_c(model, out, dtype=dtype, **words)
     return report
 
 

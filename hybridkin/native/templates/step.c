@@ -24,17 +24,16 @@ void @NAME@_reset(@NAME@_state *state, const @REAL@ *q) {
     state->error = state->sigma_min = (real)NAN;
 }
 
-void @NAME@_step(@NAME@_state *state, const @REAL@ *target, const @REAL@ *dx,
-    const @REAL@ *measured) {
-    real work[STEP_WORK], all[IK_STATE_SIZE(@N@, @TASK@, @WIDTH@)] = {0};
-    const ik_settings ik = ik_settings_of(code, data, @ROOT@, work);
-    const ik_state now = ik_state_of(&ik, all);
+static void step_within(const ik_settings *ik, @NAME@_state *state, const @REAL@ *target,
+    const @REAL@ *dx, const @REAL@ *measured) {
+    real all[IK_STATE_SIZE(@N@, @TASK@, @WIDTH@)] = {0};
+    const ik_state now = ik_state_of(ik, all);
     for (int i = 0; i < @WIDTH@; i++) {
         now.target[i] = target[i];
         now.tip[i] = measured ? measured[i] : (real)0;
     }
     for (int i = 0; i < @TASK@; i++) {
-        now.feed[i] = dx ? ik.dt * dx[i] : (real)0;
+        now.feed[i] = dx ? ik->dt * dx[i] : (real)0;
         now.offset[i] = state->offset[i];
     }
     for (int j = 0; j < @N@; j++) {
@@ -42,11 +41,11 @@ void @NAME@_step(@NAME@_state *state, const @REAL@ *target, const @REAL@ *dx,
         now.dq[j] = state->dq[j];
     }
     all[IK_MODE] = (real)(IK_HAS_TARGET + (dx ? IK_HAS_FEED : 0) + (measured ? IK_HAS_TIP : 0));
-    all[IK_PERIOD] = ik.dt;
+    all[IK_PERIOD] = ik->dt;
     all[IK_MEMORY] = state->memory;
-    if (!ik_tick(&ik, all)) { /* no rotation: not known */
+    if (!ik_tick(ik, all)) { /* no rotation: not known */
         now.target[0] = now.tip[0] = (real)NAN;
-        ik_tick(&ik, all);
+        ik_tick(ik, all);
     }
     for (int i = 0; i < @TASK@; i++) state->offset[i] = now.offset[i];
     for (int i = 0; i < @WIDTH@; i++) state->x[i] = now.x[i];
@@ -59,4 +58,11 @@ void @NAME@_step(@NAME@_state *state, const @REAL@ *target, const @REAL@ *dx,
         state->dq[j] = now.dq[j];
         state->held[j] = now.held[j] > (real)0;
     }
+}
+
+void @NAME@_step(@NAME@_state *state, const @REAL@ *target, const @REAL@ *dx,
+    const @REAL@ *measured) {
+    real work[STEP_WORK];
+    const ik_settings ik = ik_settings_of(code, data, @ROOT@, work);
+    step_within(&ik, state, target, dx, measured);
 }

@@ -1,0 +1,106 @@
+"""Repeat the quick ones of the published figures, and compare them with the committed ones.
+
+    python examples/studies/claims.py
+
+Table 1 without networks, on the simulated trunk; the mechanical models and quadratics with few
+rows and on held-out motions of two recorded robots, where `HYBRIDKIN_DATA` names the recordings.
+Exit code 1 if a figure differs by more than 2 % and 0.02 mm.
+"""
+
+from __future__ import annotations
+
+import csv
+import sys
+import time
+from pathlib import Path
+
+import hybrid_cases
+from hybrids import csv_lines, examine
+from simulated_trunk import table1
+
+from hybridkin import datasets
+
+ROOT = Path(__file__).parents[2]
+DATA = ROOT / "docs" / "data"
+MODELS = (
+    "mechanical, nominal",
+    "mechanical, calibrated",
+    "data alone, quadratic",
+    "parallel, quadratic",
+    "serial, quadratic",
+)
+TOLERANCE = 0.02  # relative; processors round differently, and calibrations stop early
+LEAST = 0.02  # [mm], the tables have two digits
+
+
+def committed_figures():
+    """Return the committed mean errors [mm] by study, case, test, rows and model."""
+    figures = {}
+    for name in ("table1.csv", "hybrids.csv"):
+        with open(DATA / name, newline="", encoding="utf-8") as file:
+            for row in csv.DictReader(file):
+                keys = ("study", "case", "test", "rows", "model")
+                figures[tuple(row[key] for key in keys)] = float(row["mean_mm"])
+    return figures
+
+
+def table1_figures():
+    """Return the errors of Table 1 without networks: 20 test sets."""
+    figures = {}
+    for entry in table1(datasets.load_trunk(), 20, 0, n_jobs=1):
+        model = f"{entry['model']}, {entry['learner']}".removesuffix(", -")
+        key = ("table 1", "simulated trunk", "20 test sets", "1900", model)
+        figures[key] = 1e3 * entry["test"]["mean"]
+    return figures
+
+
+def hybrid_figures():
+    """Return the errors of quick models on recorded robots: few rows, and held-out motions."""
+    folds = [
+        case for case in hybrid_cases.motion_cases(None, 2) if "5 folds" in case.tests
+    ]
+    studies = {
+        "few rows": hybrid_cases.armlab_cases((25, 50, 100), 3, 1000, None),
+        "held-out motions": folds,
+    }
+    figures = {}
+    for study, cases in studies.items():
+        for _, case, test, rows, model, mean, *_ in csv_lines(
+            study, examine(cases, MODELS)
+        ):
+            figures[study, case, test, str(rows), model] = mean
+    return figures
+
+
+def write_table1():
+    """Write docs/data/table1.csv anew."""
+    with open(DATA / "table1.csv", "w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["study", "case", "test", "rows", "model", "mean_mm"])
+        for key, mean in table1_figures().items():
+            writer.writerow([*key, f"{mean:.2f}"])
+
+
+def compared(part):
+    """Print the figures of a part beside the committed ones; return how many differ."""
+    start = time.perf_counter()
+    figures = part()
+    committed = committed_figures()
+    different = 0
+    for key, mean in figures.items():
+        if key not in committed:
+            continue
+        same = abs(mean - committed[key]) <= LEAST + TOLERANCE * committed[key]
+        different += not same
+        mark = "" if same else "  <- differs"
+        print(f"{' | '.join(key)}: {mean:.2f} mm, committed {committed[key]:.2f}{mark}")
+    shared = len(committed.keys() & figures.keys())
+    seconds = time.perf_counter() - start
+    print(f"{part.__name__}: {shared} figures, {different} differ, {seconds:.0f} s\n")
+    return different
+
+
+if __name__ == "__main__":
+    if sys.argv[1:] == ["--write"]:
+        write_table1()
+    raise SystemExit(int(compared(table1_figures) + compared(hybrid_figures) > 0))

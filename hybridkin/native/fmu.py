@@ -1,0 +1,297 @@
+"""A model or a controller as a functional mock-up unit (FMI 3.0), for Simulink and other tools."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+import zipfile
+from pathlib import Path
+from typing import NamedTuple
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridkin._core.files import write_file
+from hybridkin._core.version import __version__
+from hybridkin.native.export import ABOUT_Q, CProject, c_project, filled, literals
+
+_FLAGS = (
+    "-std=c99 -O2 -fPIC -shared -fvisibility=hidden -fno-math-errno -fno-trapping-math"
+)
+_SYSTEMS = {"linux": "linux", "darwin": "darwin", "win32": "windows"}
+_PROCESSORS = {"AMD64": "x86_64", "arm64": "aarch64"}
+_SUFFIXES = {"linux": ".so", "darwin": ".dylib", "win32": ".dll"}
+_LIMITS = {"q_min": "low", "q_max": "high", "dq_max": "speed", "ddq_max": "accel"}
+_TIME = 0  # value reference
+
+
+class Variable(NamedTuple):
+    """A variable of a unit.
+
+    Attributes
+    ----------
+    name : str
+        Name.
+    causality : {"input", "output", "parameter"}
+        What it is for the user of the unit.
+    about : str
+        Meaning and unit.
+    shape : tuple of int
+        Its dimensions; () for a number.
+    start : ndarray or None
+        Value before the user sets one; None for outputs.
+    """
+
+    name: str
+    causality: str
+    about: str
+    shape: tuple[int, ...]
+    start: NDArray | None = None
+
+    @property
+    def size(self) -> int:
+        """Numbers in it."""
+        return int(np.prod(self.shape))
+
+
+def export_fmu(
+    model: object,
+    path: str | Path,
+    *,
+    name: str = "model",
+    about_q: str = ABOUT_Q,
+) -> Path:
+    """Write a model or inverse kinematics as a functional mock-up unit, and return the file.
+
+    The unit is one of FMI 3.0 for co-simulation, with a library for this machine and its sources,
+    from which others can be compiled. Of a model it has the input q and the outputs x, J and
+    domain_distance. Of inverse kinematics it has the inputs target, velocity and measured (NaN:
+    no measurement), the outputs command, tip (that of the model), error and status (0 a step
+    without limits, 1 limits restricted it, 2 held, because an input is not finite), and as
+    parameters the start, the limits, gain, beta and memory. A step of the simulation must be a
+    multiple of its period.
+
+    Parameters
+    ----------
+    model : ForwardModel, fitted HybridForwardModel or ELMRegressor, or InverseKinematics
+        As for `export_c`.
+    path : str or Path
+        The file, such as "trunk.fmu".
+    name : str, default="model"
+        Name of the unit in the other tool.
+    about_q : str
+        Unit and sign of q in sentences, for the description of the unit.
+
+    Returns
+    -------
+    Path
+        The file written.
+
+    Raises
+    ------
+    NoKernel
+        If a part of the model cannot be written in C.
+    RuntimeError
+        Without a C compiler.
+
+    References
+    ----------
+    Modelica Association, Functional Mock-up Interface 3.0.1 (2023).
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from hybridkin import native, robots
+    >>> file = tempfile.mkdtemp() + "/trunk.fmu"
+    >>> native.export_fmu(robots.bionic_handling_assistant(), file, name="trunk").name
+    'trunk.fmu'
+    """
+    project = c_project(model, name=name, about_q=about_q)
+    variables = _variables(project)
+    texts = {f"{name}.c": project.texts[f"{name}.c"]}
+    texts[f"{name}.h"] = project.texts[f"{name}.h"]
+    token = hashlib.sha256(texts[f"{name}.c"].encode()).hexdigest()[:32]
+    entries = {**project.entries, **_entries(variables), "TOKEN": token}
+    if project.controller is None:
+        entries["INSTANCE"] = ""
+        entries["UPDATE"] = filled("fmu_model.c", entries)
+    else:
+        entries["INSTANCE"] = f"{name}_state state;"
+        entries["UPDATE"] = filled("fmu_step.c", entries)
+    texts["fmu.c"] = filled("fmu.c", entries)
+    description = _description(project, variables, token)
+    library = _compiled(texts)
+    suffix = _SUFFIXES[sys.platform]
+
+    def write(staging: Path) -> None:
+        with zipfile.ZipFile(staging, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("modelDescription.xml", description)
+            archive.writestr(f"binaries/{_platform()}/{name}{suffix}", library)
+            archive.writestr("sources/buildDescription.xml", _build_description(name))
+            for file, text in texts.items():
+                archive.writestr(f"sources/{file}", text)
+
+    path = Path(path)
+    write_file(path, write)
+    return path
+
+
+def _variables(project: CProject) -> list[Variable]:
+    """Return the variables of the unit, in the order of their value references."""
+    plan = project.plan
+    n = plan.n_inputs
+    if project.controller is None:
+        m = plan.n_outputs
+        about_q = project.entries["ABOUT_Q"]
+        return [
+            Variable("q", "input", about_q, (n,), project.home),
+            Variable("x", "output", "tip [m]", (m,)),
+            Variable("jacobian", "output", "dx/dq, row by row", (m, n)),
+            Variable("domain_distance", "output", "at most 1 inside the domain", ()),
+        ]
+    target = np.ravel(project.controller.tracker(project.home).x)
+    width = target.shape
+    rows = (plan.n_outputs,)
+    (gain, beta, _) = project.gains
+    number = np.array
+    variables = [
+        Variable("target", "input", project.entries["ABOUT_TARGET"], width, target),
+        Variable("velocity", "input", "of the target [m/s]", rows, np.zeros(rows)),
+        Variable("measured", "input", "tip, or NaN", width, np.full(width, np.nan)),
+        Variable("start", "parameter", "command at rest", (n,), project.home),
+        Variable("gain", "parameter", "of the error [1/s]", (), number(gain)),
+        Variable("beta", "parameter", "of the posture [1/s]", (), number(beta)),
+        Variable("memory", "parameter", "of measurements [s]", (), number(0.0)),
+        Variable("command", "output", project.entries["ABOUT_Q"], (n,)),
+        Variable("tip", "output", "of the model at the command, as target", width),
+        Variable("error", "output", "distance to the target [m]", ()),
+        Variable("status", "output", "0 free, 1 at limits, 2 held", ()),
+    ]
+    for limit, values in zip(_LIMITS, project.limits, strict=True):
+        if np.isfinite(values).all():
+            about = f"{_LIMITS[limit]} of q, in its unit and s"
+            variables.append(Variable(limit, "parameter", about, (n,), values))
+    return variables
+
+
+def _place(variable: Variable) -> str:
+    """Return the name in C of where a variable begins."""
+    return f"V_{variable.name.upper()}"
+
+
+def _entries(variables: list[Variable]) -> dict[str, str]:
+    """Return what the C code must know of the variables."""
+    offsets = []
+    table = []
+    starts: list[NDArray] = []
+    begin = 0
+    for variable in variables:
+        offsets.append(f"{_place(variable)} = {begin}")
+        may_be_set = int(variable.start is not None)
+        table.append(f"{{{begin}, {variable.size}, {may_be_set}}}")
+        start = np.zeros(variable.size) if variable.start is None else variable.start
+        starts.append(np.ravel(start))
+        begin += variable.size
+    parameters = []
+    for variable in variables:
+        if variable.name in _LIMITS:
+            field = _LIMITS[variable.name]
+            parameters.append(f"    ik.{field} = values + {_place(variable)};")
+    return {
+        "OFFSETS": f"{', '.join(offsets)}, VALUES = {begin}",
+        "VARIABLES": ", ".join(table),
+        "STARTS_OF_VALUES": literals(np.concatenate(starts)),
+        "PARAMETERS": "\n".join(parameters),
+    }
+
+
+def _description(project: CProject, variables: list[Variable], token: str) -> bytes:
+    """Return modelDescription.xml."""
+    name = project.entries["NAME"]
+    root = ElementTree.Element(
+        "fmiModelDescription",
+        fmiVersion="3.0",
+        modelName=name,
+        instantiationToken=token,
+        description=f"{project.entries['TITLE']}. {project.entries['ABOUT_Q']}",
+        generationTool=f"hybridkin {__version__}",
+    )
+    unit = ElementTree.SubElement(
+        root,
+        "CoSimulation",
+        modelIdentifier=name,
+        canGetAndSetFMUState="true",
+        canHandleVariableCommunicationStepSize="true",
+    )
+    if project.controller is not None:
+        unit.set("fixedInternalStepSize", repr(project.gains[2]))
+    listed = ElementTree.SubElement(root, "ModelVariables")
+    structure = ElementTree.SubElement(root, "ModelStructure")
+    ElementTree.SubElement(
+        listed,
+        "Float64",
+        name="time",
+        valueReference=str(_TIME),
+        causality="independent",
+        variability="continuous",
+    )
+    for reference, variable in enumerate(variables, start=1):
+        entry = ElementTree.SubElement(
+            listed,
+            "Float64",
+            name=variable.name,
+            valueReference=str(reference),
+            causality=variable.causality,
+            description=variable.about,
+        )
+        if variable.causality == "parameter":
+            entry.set("variability", "tunable")
+        if variable.start is not None:
+            numbers = (repr(float(number)) for number in np.ravel(variable.start))
+            entry.set("start", " ".join(numbers).replace("nan", "NaN"))
+        for size in variable.shape:
+            ElementTree.SubElement(entry, "Dimension", start=str(size))
+    for kind in ("Output", "InitialUnknown"):
+        for reference, variable in enumerate(variables, start=1):
+            if variable.causality == "output":
+                ElementTree.SubElement(structure, kind, valueReference=str(reference))
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
+
+
+def _build_description(name: str) -> bytes:
+    """Return sources/buildDescription.xml, from which importers compile the unit."""
+    root = ElementTree.Element("fmiBuildDescription", fmiVersion="3.0")
+    build = ElementTree.SubElement(root, "BuildConfiguration", modelIdentifier=name)
+    files = ElementTree.SubElement(build, "SourceFileSet", language="C99")
+    ElementTree.SubElement(files, "SourceFile", name="fmu.c")
+    return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
+
+
+def _platform() -> str:
+    """Return the name of this machine's kind in FMI."""
+    processor = platform.machine()
+    return f"{_PROCESSORS.get(processor, processor)}-{_SYSTEMS[sys.platform]}"
+
+
+def _compiled(texts: dict[str, str]) -> bytes:
+    """Return the shared library of the unit."""
+    compiler = shutil.which("cc")
+    if compiler is None:
+        raise RuntimeError(
+            "a functional mock-up unit holds a compiled library, and there is no C compiler: "
+            "install one (apt install gcc), or use `export_c`."
+        )
+    with tempfile.TemporaryDirectory() as home:
+        for file, text in texts.items():
+            (Path(home) / file).write_text(text)
+        library = Path(home) / "unit.so"
+        command = [compiler, *shlex.split(_FLAGS), "fmu.c", "-o", str(library), "-lm"]
+        subprocess.run(command, check=True, cwd=home)
+        return library.read_bytes()

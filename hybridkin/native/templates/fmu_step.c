@@ -1,0 +1,41 @@
+/* The command, the tip that the model predicts for it, and what is known of the last step. */
+static void write_outputs(instance_t *unit) {
+    double *values = unit->values;
+    real work[STEP_WORK], J[@TASK@ * @N@];
+    const ik_settings ik = ik_settings_of(code, data, @ROOT@, work);
+    values[V_STATUS] = isnan(unit->state.sigma_min) ? 2.0 : 0.0;
+    for (int j = 0; j < @N@; j++) {
+        values[V_COMMAND + j] = unit->state.q[j];
+        if (unit->state.held[j] && values[V_STATUS] == 0.0) values[V_STATUS] = 1.0;
+    }
+    ik_model(&ik, unit->state.q, values + V_TIP, J);
+    values[V_ERROR] = unit->state.error;
+}
+
+/* At rest at the start command. */
+static void start_unit(instance_t *unit) {
+    @NAME@_reset(&unit->state, unit->values + V_START);
+    write_outputs(unit);
+    unit->values[V_STATUS] = 0.0;
+}
+
+/* As many periods as fit into the step, with the limits and gains of the instance. */
+static int step_unit(instance_t *unit, double step) {
+    const double *values = unit->values;
+    const double periods = floor(step / @DT@ + 0.5);
+    real work[STEP_WORK];
+    ik_settings ik = ik_settings_of(code, data, @ROOT@, work);
+    if (periods < 1.0 || fabs(step - periods * @DT@) > 1e-6 * step) return FMI_ERROR;
+@PARAMETERS@
+    ik.gain = values[V_GAIN];
+    ik.beta = values[V_BETA];
+    unit->state.memory = values[V_MEMORY];
+    /* Without a measurement, and without a memory of the last one, the tip is that of the model. */
+    const double *measured = values + V_MEASURED;
+    for (int i = 0; i < @WIDTH@ && measured; i++)
+        if (isnan(values[V_MEASURED + i]) && !(values[V_MEMORY] > 0.0)) measured = NULL;
+    for (int k = 0; k < (int)periods; k++)
+        step_within(&ik, &unit->state, values + V_TARGET, values + V_VELOCITY, measured);
+    write_outputs(unit);
+    return FMI_OK;
+}
