@@ -328,7 +328,6 @@ ENTRIES = {
             "dt": 0.1,
         },
     ),
-    "workflow.json_text": (workflow.json_text, {"record": {"a": 1.0, "b": "c"}}),
     "workflow.describe": (workflow.describe, {"loaded": LOADED}),
     "workflow.read_log": (
         workflow.read_log,

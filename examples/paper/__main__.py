@@ -17,7 +17,7 @@ from pathlib import Path
 
 sys.path.append(str(Path(__file__).parents[1]))  # where the package `paper` lies
 
-from hybridkin.cli._terminal import Stages, shown
+from hybridkin.cli._terminal import Stages
 from hybridkin.cli._values import count
 from paper.report import run_paper
 
@@ -69,7 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             n_jobs=options.jobs,
             progress=stages,
         )
-    print("\n  ".join([f"{shown(report)}\n\nWrote", *map(str, paths)]))
+    print("\n  ".join([f"{report.plain()}\n\nWrote", *map(str, paths)]))
 
 
 if __name__ == "__main__":

@@ -1,22 +1,14 @@
-"""What a user sees while a command runs: stages, notes and warnings; and tables of results."""
+"""What a user sees while a command runs: stages, notes and warnings."""
 
 from __future__ import annotations
 
 import re
 import sys
 import time
-from collections.abc import Sequence
-from functools import partial
-from typing import TYPE_CHECKING, Any
 
-from rich import box
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Column, Table
 from rich.text import Text
-
-if TYPE_CHECKING:
-    from hybridkin.workflow import Report
 
 _PATIENCE = 15.0  # seconds between two lines of progress in files and pipes
 _LONG = 30.0  # seconds of a stage from which on the remaining time is of interest
@@ -78,7 +70,7 @@ class Stages:
         if important or not self.quiet:
             print(text, file=sys.stderr)
 
-    def warn(self, message: object, *_: Any) -> None:
+    def warn(self, message: object, *_: object) -> None:
         """Print a warning, of those that differ in numbers only the first."""
         text = str(message)
         kind = re.sub(r"[\d.]+", "", text)
@@ -105,24 +97,3 @@ class Stages:
 
 def _in_words(seconds: float) -> str:
     return f"{seconds:.1f} s" if seconds < 60.0 else f"{seconds / 60.0:.1f} min"
-
-
-def shown(report: Report[Any]) -> str:
-    """Return a report as text, with ruled tables on a terminal and plain ones elsewhere."""
-    console = Console()
-    if console.is_terminal:
-        return report.plain(partial(_ruled, console))
-    return report.plain()
-
-
-def _ruled(
-    console: Console, header: Sequence[str], rows: Sequence[Sequence[str]]
-) -> str:
-    first, *remaining = map(Text, header)
-    columns = [Column(first), *(Column(title, justify="right") for title in remaining)]
-    table = Table(*columns, box=box.SIMPLE_HEAD)
-    for row in rows:
-        table.add_row(*map(Text, row))
-    with console.capture() as caught:
-        console.print(table)
-    return caught.get().strip("\n")

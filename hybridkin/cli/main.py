@@ -13,7 +13,7 @@ import threading
 import warnings
 import webbrowser
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -28,7 +28,7 @@ from hybridkin._core.units import METRES
 from hybridkin.cli import _demo as demo
 from hybridkin.cli._init import answered, description
 from hybridkin.cli._parser import failed, parser
-from hybridkin.cli._terminal import Stages, shown
+from hybridkin.cli._terminal import Stages
 
 if TYPE_CHECKING:
     from hybridkin.chains.chain import Chain
@@ -47,58 +47,36 @@ _Result = tuple["Report[Any]", int]
 """The report of a command, and its exit code."""
 
 
-@dataclass(frozen=True)
-class View:
-    """The address of a live view."""
-
-    address: str
-
-
-@dataclass(frozen=True, eq=False)
-class NewRobot:
-    """The columns of a new robot description, and the check of the log it was given."""
-
-    columns: LogFormat
-    log_check: LogReport | None
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code, see `hybridkin --help`."""
     arguments = parser().parse_args(argv)
-    before = _stamps(arguments)
+    stages = Stages(arguments.quiet)
     try:
-        stages = Stages(arguments.quiet)
-        # Several threads cost many times the CPU time: the matrices are small.
         _ = hybridkin.robots  # loads the libraries whose threads are limited
+        # Several threads cost many times the CPU time: the matrices are small.
         with (
             contextlib.closing(stages),
             warnings.catch_warnings(),
-            _interruptible(),
+            _terminable(),
             one_thread(),
         ):
             warnings.filterwarnings("default", category=UserWarning)
             warnings.showwarning = stages.warn
             report, code = _RUN[arguments.command](arguments, stages)
-    except (KeyboardInterrupt, EOFError) as stop:  # EOFError: no answer to a question
-        if _stamps(arguments) == before:
-            fate = "nothing was written"
-        else:
-            fate = "files were written"
-        signal_code = 143 if isinstance(stop, _Terminated) else 130
-        return failed(f"interrupted; {fate}", signal_code, arguments.json)
+    except _Terminated:
+        return failed("interrupted", 143, arguments.json)
+    except (KeyboardInterrupt, EOFError):  # EOFError: no answer to a question
+        return failed("interrupted", 130, arguments.json)
     except _OF_INPUT as error:
         return failed(f"error: {error}", 2, arguments.json)
-    text = report.json() if arguments.json else shown(report)
+    text = report.json() if arguments.json else report.plain()
     if report.paths and not arguments.json:
         text = "\n  ".join([f"{text}\n\nWrote", *map(str, report.paths)])
     try:
         print(text, flush=True)
-    except OSError as error:
+    except BrokenPipeError:  # `head` has what it wants
         # For the flush at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        if not isinstance(error, BrokenPipeError):  # `head` has what it wants
-            message = f"error: the result cannot be printed: {error}"
-            return failed(message, 2, as_json=False)
     return code
 
 
@@ -107,47 +85,20 @@ class _Terminated(KeyboardInterrupt):
 
 
 @contextlib.contextmanager
-def _interruptible() -> Iterator[None]:
-    """Let SIGTERM interrupt as SIGINT does, unless the caller handles these signals.
+def _terminable() -> Iterator[None]:
+    """Let SIGTERM raise `_Terminated`, so that files are closed and removed on the way out."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
 
-    An error after a signal is the interrupt: C code turns it into an ImportError during an import.
-    """
-    usual = {signal.SIGTERM: signal.SIG_DFL, signal.SIGINT: signal.default_int_handler}
-    in_main_thread = threading.current_thread() is threading.main_thread()
-    ours = [
-        n
-        for n, handler in usual.items()
-        if in_main_thread and signal.getsignal(n) is handler
-    ]
-    caught: list[KeyboardInterrupt] = []
+    def stop(number: int, frame: object) -> None:
+        raise _Terminated
 
-    def stop(number: int, _: object) -> None:
-        caught.append(
-            _Terminated() if number == signal.SIGTERM else KeyboardInterrupt()
-        )
-        raise caught[-1]
-
-    for number in ours:
-        signal.signal(number, stop)
+    usual = signal.signal(signal.SIGTERM, stop)
     try:
         yield
-    except _OF_INPUT as error:
-        if caught:
-            raise caught[-1] from error
-        raise
     finally:
-        for number in ours:
-            signal.signal(number, usual[number])
-
-
-def _stamps(arguments: argparse.Namespace) -> dict[Path, tuple[int, int]]:
-    """Return the files of --out, each with its number and time on the disk."""
-    out = vars(arguments).get("out") or Path(os.devnull)
-    stamps = {}
-    for file in out.glob("[!.]*") if out.is_dir() else [out]:
-        if file.is_file():
-            stamps[file] = (file.stat().st_ino, file.stat().st_mtime_ns)
-    return stamps
+        signal.signal(signal.SIGTERM, usual)
 
 
 def _next(arguments: argparse.Namespace, stages: Stages) -> _Result:
@@ -251,7 +202,7 @@ def _view(arguments: argparse.Namespace, stages: Stages) -> _Result:
             webbrowser.open(address)
         with contextlib.suppress(KeyboardInterrupt):
             shown_robot.wait()
-    report = hybridkin.workflow.Report(f"View of {loaded.name}", View(address))
+    report = hybridkin.workflow.Report(f"View of {loaded.name}", {"address": address})
     report.text("The view is closed.")
     return report, 0
 
@@ -386,7 +337,7 @@ def _init(arguments: argparse.Namespace, stages: Stages) -> _Result:
             delimiter=arguments.delimiter,
         ).report
         _note(check, stages)
-    record = NewRobot(log_format, check)
+    record = {"columns": log_format, "log_check": check}
     report = workflow.Report(f"{robot.name}: {robot.n_actuators} actuators", record)
     look = ["hybridkin", "view", str(out)]
     if log is not None:
@@ -465,10 +416,10 @@ def _limits(
 
 def _scaled_limits(arguments: argparse.Namespace, loaded: LoadedModel) -> Limits:
     """Return the limits of the arguments, in the log's unit and sign, which may swap the ends."""
-    limits = {
-        name: vars(arguments)[name] for name in ("q_min", "q_max", "dq_max", "ddq_max")
-    }
-    return hybridkin.robots.Limits(**limits).scaled(loaded.log_format().q_factor)
+    limits = hybridkin.robots.Limits(
+        arguments.q_min, arguments.q_max, arguments.dq_max, arguments.ddq_max
+    )
+    return limits.scaled(loaded.log_format().q_factor)
 
 
 def _note(found: LogReport, stages: Stages) -> None:

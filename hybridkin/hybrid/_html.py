@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from hybridkin._core.html import numbers
 
 
@@ -22,7 +20,7 @@ def fitted_rows(model: Any) -> dict[str, object]:
         "domain": _domain(model),
     }
     if model.radius_ is not None:
-        rows["radius"] = _radius(model)
+        rows["estimated error radius"] = str(model.radius_)
     if model.play_ is not None:
         rows["backlash"] = f"{numbers(model.play_.width)} (unit of q)"
     if model.module_ is not model.fitted_module_:
@@ -83,16 +81,6 @@ def _error(model: Any) -> dict[str, str]:
     if model._learned.held_out:
         return {"held-out error": words}
     return {"training error": words}
-
-
-def _radius(model: Any) -> str:
-    radius = model.radius_
-    covered = f"{100 * radius.coverage:g} % of the tips"
-    if np.isfinite(radius.inside):
-        return f"{_mm(radius.inside)} covers {covered} inside the domain"
-    return (
-        f"not known: {covered} need at least {radius.least_groups} groups in the domain"
-    )
 
 
 def _range(model: Any) -> dict[str, object]:

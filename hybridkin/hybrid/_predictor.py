@@ -181,7 +181,11 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if "module_" not in vars(self):
             return ""
         title = f"{type(self).__name__}: what the fit found"
-        return html_table(title, fitted_rows(self))
+        return html_table(title, self.html_rows())
+
+    def html_rows(self) -> dict[str, object]:
+        """Return names and values of what the fit found, which a notebook shows."""
+        return fitted_rows(self)
 
     @property
     def _chain(self) -> Chain | None:

@@ -35,6 +35,12 @@ class Radius(NamedTuple):
         """The least number of groups that gives a finite radius."""
         return ceil(self.coverage / (1.0 - self.coverage) - _ROUNDING)
 
+    def __str__(self) -> str:
+        covered = f"{100.0 * self.coverage:g} % of the tips"
+        if self.inside < inf:
+            return f"{1e3 * self.inside:.3g} mm covers {covered} inside the domain"
+        return f"not known: {covered} need at least {self.least_groups} groups in the domain"
+
 
 def conformal_radius(
     spec: Spec, rows: Rows, coverage: float

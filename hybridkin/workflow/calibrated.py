@@ -170,12 +170,9 @@ def write_parameters(report: Report, parameters: Sequence[CalibratedParameter]) 
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """What a fit reports of a calibration; see `CalibrationResult`."""
+    """What a fit reports of a calibration: its free parameters, and what is not identified."""
 
-    values: dict[str, NDArray]
-    std_errors: dict[str, NDArray]
     rmse: float
-    identifiable: dict[str, NDArray]
     unidentified: Sequence[str]
     warnings: Sequence[str]
     entries: Sequence[CalibratedParameter]
@@ -193,19 +190,16 @@ class Calibration:
         for parameter in calibrated_parameters(start, result):
             entries.append(parameter.checked(others))
         return cls(
-            values=result.values,
-            std_errors=result.std_errors,
             rmse=result.rmse,
-            identifiable=result.identifiable,
             unidentified=result.unidentified,
             warnings=warnings,
             entries=entries,
         )
 
-    def write(self, report: Report, title: str) -> None:
+    def write(self, report: Report) -> None:
         """Add the calibration, and what the log does not identify, to a report."""
         report.text(
-            f"## {title}",
+            "## Calibration on all motions",
             f"Root mean square tip error {millimetres(self.rmse, '.2f')} (training rows). Standard "
             "errors assume independent rows and are too small for rows close in time. A parameter "
             f"is identified if the data narrow its prior at least {IDENTIFIED:.0f} times, and if "

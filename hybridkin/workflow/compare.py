@@ -23,7 +23,6 @@ from hybridkin.calibration.choice import GeometryChoice, choose_geometry
 from hybridkin.calibration.measured import distances, folds
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.robots import RobotDescription
-from hybridkin.datasets import Log
 from hybridkin.hybrid.estimator import HybridForwardModel, fit_quietly
 from hybridkin.hybrid.log_distance import held_out_distances
 from hybridkin.learning.elm_cv import ELMRegressorCV
@@ -31,7 +30,7 @@ from hybridkin.learning.regressor_modules import error_module
 from hybridkin.native.library import evaluate
 from hybridkin.workflow.calibrated import CalibratedParameter, calibrated_parameters
 from hybridkin.workflow.choices import choice_in_words
-from hybridkin.workflow.log import MeasuredLog, checked
+from hybridkin.workflow.log import MeasuredLog
 from hybridkin.workflow.report import Progress, quiet
 
 NOMINAL = "mechanical, nominal"
@@ -118,18 +117,6 @@ class Comparison:
         return {name: np.nanmean(e, axis=1) for name, e in self.markers.items()}
 
 
-class Rows(NamedTuple):
-    """Rows of a log: q (N, n), x (N, 3 K) [m], and the motion of every row (N,)."""
-
-    q: NDArray
-    x: NDArray
-    motions: NDArray
-
-    def take(self, rows: NDArray) -> Rows:
-        """Return some of the rows."""
-        return Rows(self.q[rows], self.x[rows], self.motions[rows])
-
-
 @dataclass(frozen=True, eq=False)
 class Mechanical:
     """The mechanical model of a robot, calibrated to rows.
@@ -154,8 +141,19 @@ class Mechanical:
     geometry: GeometryChoice | None
     messages: list[str]
 
+    @property
+    def parameters(self) -> str:
+        """Name of the set of parameters that is calibrated, if the robot says "auto"."""
+        return "" if self.geometry is None else self.geometry.name
+
+    @property
+    def tried(self) -> dict[str, dict[str, float]]:
+        """Errors of the sets that were tried, "cv" and "io" [m]."""
+        errors = {} if self.geometry is None else self.geometry.errors
+        return {name: error.known() for name, error in errors.items()}
+
     @classmethod
-    def of(cls, robot: RobotDescription, rows: Rows, loss: str) -> Mechanical:
+    def of(cls, robot: RobotDescription, rows: MeasuredLog, loss: str) -> Mechanical:
         """Return the mechanical model of a robot."""
         chain = robot.chain
         if chain is None:
@@ -179,7 +177,7 @@ class Mechanical:
         result, of_fit = fit_geometry(chain, rows.q, rows.x, names, loss, start=start)
         return cls(result.chain, chain, result, geometry, messages + of_fit)
 
-    def rivals(self, rows: Rows, loss: str) -> Iterator[CalibratedParameter]:
+    def rivals(self, rows: MeasuredLog, loss: str) -> Iterator[CalibratedParameter]:
         """Yield the parameters of all other sets with nearly the same errors, calibrated."""
         rivals = () if self.geometry is None else self.geometry.rivals
         for rival in rivals:
@@ -233,16 +231,14 @@ def _auto(
 
 
 def with_play_detected(
-    settings: FitSettings,
-    log: MeasuredLog,
-    rows: Rows,
-    mechanical: Mechanical,
+    settings: FitSettings, rows: MeasuredLog, mechanical: Mechanical
 ) -> FitSettings:
     """Return settings whose `play` is not "detect"."""
     if settings.play != "detect":
         return settings
     play = None
-    if mechanical.start is not None and settings.auto and log.named and not log.n_late:
+    in_order = rows.named and not rows.n_late
+    if mechanical.start is not None and settings.auto and in_order:
         model = HybridForwardModel(mechanical.model, "drop", play="auto")
         fit_quietly(model, rows.q, rows.x, rows.motions)
         play = None if model.play_ is None else "auto"
@@ -250,9 +246,9 @@ def with_play_detected(
 
 
 def compare_by_group(
-    log: Log,
+    rows: MeasuredLog,
     robot: RobotDescription,
-    settings: FitSettings = DEFAULTS,
+    settings: FitSettings,
     *,
     n_jobs: int | None = -1,
     progress: Progress = quiet,
@@ -262,17 +258,16 @@ def compare_by_group(
     Whole motions are held out. In each fold, the geometry is chosen and calibrated on the training
     motions, and every model is fitted to them. ``error_model="auto"`` is fitted once; the table has
     each of its candidates, ``candidates_``, and itself. The prediction for a motion therefore never
-    uses data of this motion. With `play` "detect" one choice is made on all motions: whether the
-    folds look for backlash.
+    uses data of this motion.
 
     Parameters
     ----------
-    log : Log
-        As from `read_log` or `datasets.load_log`; without groups it is cut into 10 parts.
+    rows : MeasuredLog
+        The rows to compare on.
     robot : RobotDescription
         Nominal kinematics, and the parameters to calibrate.
-    settings : FitSettings, optional
-        Loss, folds and models.
+    settings : FitSettings
+        Loss, folds and models, see `with_play_detected`.
     n_jobs : int, optional
         Largest number of processes.
     progress : callable, optional
@@ -283,18 +278,13 @@ def compare_by_group(
     Comparison
         Errors [m] by model and row, the fold of each row, and the choices of each fold.
     """
-    log = checked(log, robot.chain, robot.base_is_free)
-    rows = Rows(log.q, log.x, log.motions)
-    if settings.play == "detect":
-        mechanical = Mechanical.of(robot, rows, settings.loss)
-        settings = with_play_detected(settings, log, rows, mechanical)
-    parts = folds(log.q, log.motions, settings.n_folds)
+    parts = folds(rows.q, rows.motions, settings.n_folds)
     jobs = []
     for train, test in parts:
         jobs.append(
-            delayed(_one_fold)(robot, settings, rows.take(train), rows.take(test))
+            delayed(_one_fold)(robot, settings, rows.rows(train), rows.rows(test))
         )
-    most = max(1, len(log.q) // _ROWS_PER_PROCESS[settings.auto])
+    most = max(1, len(rows.q) // _ROWS_PER_PROCESS[settings.auto])
     # Otherwise torch and BLAS start threads in every process, which wait for each other.
     workers = Parallel(
         n_jobs=min(effective_n_jobs(n_jobs or 1), len(parts), most),
@@ -309,11 +299,11 @@ def compare_by_group(
     for result in results:
         fold_results.append(result)
         progress(stage, len(fold_results), len(parts))
-    fold = np.empty(len(log.q), dtype=int)
-    distance = np.empty(len(log.q))
+    fold = np.empty(len(rows.q), dtype=int)
+    distance = np.empty(len(rows.q))
     markers = {}
     for name in _in_all(fold_results):
-        markers[name] = np.empty((len(log.q), log.x.shape[1] // 3))
+        markers[name] = np.empty((len(rows.q), rows.x.shape[1] // 3))
     for k, ((_, test), result) in enumerate(zip(parts, fold_results, strict=True)):
         fold[test] = k
         distance[test] = result.distance
@@ -333,7 +323,10 @@ class _FoldResult(NamedTuple):
 
 @one_thread()  # the processes share the cores already
 def _one_fold(
-    robot: RobotDescription, settings: FitSettings, train: Rows, test: Rows
+    robot: RobotDescription,
+    settings: FitSettings,
+    train: MeasuredLog,
+    test: MeasuredLog,
 ) -> _FoldResult:
     """Return the errors of every model on test rows after a fit to training rows."""
     mechanical = Mechanical.of(robot, train, settings.loss)
@@ -365,7 +358,9 @@ def _one_fold(
     return _FoldResult(errors, distance, choices)
 
 
-def _nominal(robot: RobotDescription, chain: Chain, rows: Rows, loss: str) -> Chain:
+def _nominal(
+    robot: RobotDescription, chain: Chain, rows: MeasuredLog, loss: str
+) -> Chain:
     """Return the described chain, with a fitted base if the base is calibrated."""
     if not robot.base_is_free:
         return chain
@@ -373,7 +368,9 @@ def _nominal(robot: RobotDescription, chain: Chain, rows: Rows, loss: str) -> Ch
     return result.chain
 
 
-def _held_out(model: HybridForwardModel, module: ForwardModel, test: Rows) -> NDArray:
+def _held_out(
+    model: HybridForwardModel, module: ForwardModel, test: MeasuredLog
+) -> NDArray:
     """Return the errors (N, K) of the markers on test rows by a module of the fitted model."""
     q = test.q
     if model.play_ is not None:

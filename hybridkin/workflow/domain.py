@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -47,9 +47,9 @@ class PathLimits:
 
     q_min: NDArray
     q_max: NDArray
-    dq_max: NDArray | None
-    ddq_max: NDArray | None
     source: str
+    dq_max: NDArray | None = None
+    ddq_max: NDArray | None = None
 
     @property
     def span(self) -> NDArray:
@@ -105,20 +105,22 @@ def path_limits(
     trained = robots.Limits()
     if within_fit or described.q_min is None or described.q_max is None:
         trained = loaded.trained_range or trained
-    limits = described.narrowed(loaded.half_play).intersect(trained)
-    given = robots.Limits(**overrides).narrowed(loaded.half_play)
-    limits = replace(limits, **{name: vars(given)[name] for name in overrides})
-    if limits.q_min is None or limits.q_max is None:
+    limits = vars(described.narrowed(loaded.half_play).intersect(trained))
+    given = vars(robots.Limits(**overrides).narrowed(loaded.half_play))
+    limits = limits | {name: given[name] for name in overrides}
+    values = {}
+    for name, value in limits.items():
+        if value is not None:
+            values[name] = np.broadcast_to(value, n).astype(float)
+    if not {"q_min", "q_max"} <= {*values}:
         raise ValueError(
             "`q_min` and `q_max` must be given (--q-min, --q-max), or written as [limits] in the "
             "robot description, because this model has no training range."
         )
-    low = _of_actuators(limits.q_min, n)
-    high = _of_actuators(limits.q_max, n)
-    if (low > high).any():
+    if (values["q_min"] > values["q_max"]).any():
         raise ValueError(
             "`q_min` must not exceed `q_max`, including half the backlash and the training range, "
-            f"got {low.tolist()} and {high.tolist()} m; check their unit and sign."
+            f"got {values['q_min']} and {values['q_max']} m; check their unit and sign."
         )
     sources = []
     if described.q_min is not None:
@@ -130,14 +132,7 @@ def path_limits(
         source = "given"
     elif "q_min" in overrides or "q_max" in overrides:
         source = f"given and {source}"
-    speed = None if limits.dq_max is None else _of_actuators(limits.dq_max, n)
-    acceleration = None if limits.ddq_max is None else _of_actuators(limits.ddq_max, n)
-    return PathLimits(low, high, speed, acceleration, source)
-
-
-def _of_actuators(value: ArrayLike, n: int) -> NDArray:
-    """Return one value for each of n actuators (n,)."""
-    return np.broadcast_to(np.asarray(value, dtype=float), n).copy()
+    return PathLimits(**values, source=source)
 
 
 @dataclass(frozen=True, eq=False)

@@ -92,10 +92,7 @@ class HeldOutErrors(Errors):
 
 @dataclass(frozen=True)
 class ExpectedErrors:
-    """Mean errors to expect of a robot, and the errors that 95 % do not exceed [m].
-
-    Of rows (N,), or their means over rows.
-    """
+    """Mean errors (N,) to expect of a robot, and the errors that 95 % do not exceed [m]."""
 
     mean: NDArray
     p95: NDArray

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +12,13 @@ from numpy.typing import NDArray
 import hybridkin
 from hybridkin.calibration.measured import distances
 from hybridkin.datasets import Log, LogReport
-from hybridkin.workflow.choices import RadiusEntry
+from hybridkin.hybrid.estimator import HybridForwardModel
 from hybridkin.workflow.errors import Errors
-from hybridkin.workflow.fit_record import errors_of_markers, write_markers
+from hybridkin.workflow.fit_record import (
+    add_histogram,
+    errors_of_markers,
+    write_markers,
+)
 from hybridkin.workflow.log import MeasuredLog, checked, write_check
 from hybridkin.workflow.model import LoadedModel
 from hybridkin.workflow.report import Report, check_out
@@ -27,8 +30,8 @@ _FIGURES = ("error_histogram.png", "workspace.png")
 class LogErrors(Errors):
     """Errors of rows of a log [m], and the shares of them in the domain and in the radius."""
 
-    share_in_domain: float | None = None
-    share_in_radius: float | None = None
+    share_in_domain: float
+    share_in_radius: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,8 +42,6 @@ class Evaluation:
     ----------
     command, model, log : str
         "evaluate", and the sources.
-    split : str
-        The kind of the motions, in words.
     log_check : LogReport
         Findings of the check of the log.
     all : LogErrors
@@ -54,16 +55,13 @@ class Evaluation:
         Errors of fitted rows and of other rows.
     held_out : Errors or None
         Errors of the fit on held-out motions, if rows were fitted.
-    markers : list of Errors or None
-        Errors of every marker, base to tip; None for a single one.
-    radius : RadiusEntry or None
-        The estimated error radius of the model.
+    markers : list of Errors
+        Errors of every marker, base to tip; empty for a single one.
     """
 
     command: str = "evaluate"
     model: str
     log: str
-    split: str
     log_check: LogReport
     all: LogErrors
     motions: Mapping[str, LogErrors]
@@ -71,71 +69,36 @@ class Evaluation:
     fitted: LogErrors | None
     new: LogErrors | None
     held_out: Errors | None
-    markers: Sequence[Errors] | None
-    radius: RadiusEntry | None
+    markers: Sequence[Errors]
 
     @property
     def judged(self) -> Errors:
         """The errors that count: of new rows; if all were fitted, those on held-out motions."""
         return self.new or self.held_out or self.all
 
-    def _write(self, report: Report[Any]) -> None:
-        """Add the record to a report."""
-        write_check(report, self.log_check)
-        report.text("## Errors by motion, largest first")
-        if self.fitted_rows is None:
-            report.text(
-                "The model does not say which rows it was fitted to; they have smaller errors."
-            )
-        if self.fitted_rows:
-            report.text(
-                f"**{self.fitted_rows} of {self.all.rows} rows were fitted: their errors are "
-                "training errors.** To test the model, evaluate a log of other motions."
-            )
-        entries: dict[str, Errors] = {"all rows": self.all}
-        if self.fitted is not None:
-            parts = {
-                "new rows": self.new,
-                "fitted rows": self.fitted,
-                "held out in the fit": self.held_out,
-            }
-            entries |= {name: part for name, part in parts.items() if part is not None}
-        largest_first = sorted(self.motions.items(), key=lambda item: -item[1].mean)
-        columns = ["rows", "mean", "median", "p95", "max"]
-        if self.all.share_in_domain is not None:
-            columns.append("share_in_domain")
-        if self.radius is not None:
-            columns.append("share_in_radius")
-        report.errors(entries | dict(largest_first), columns)
-        if self.radius is not None:
-            report.text(f"{self.radius.words} Rows without a radius do not count.")
-        write_markers(report, self.markers, "all rows")
-
 
 @dataclass(frozen=True, eq=False)
 class _RowErrors:
     """The tip error of every row (N,) [m], and whether it is in the domain and in the radius.
 
-    What the model does not know is None; of rows without a radius `in_radius` is NaN.
+    NaN stands for what is not known, and for the radius outside the domain.
     """
 
     error: NDArray
-    in_domain: NDArray | None = None
-    in_radius: NDArray | None = None
+    in_domain: NDArray
+    in_radius: NDArray
 
     def of(self, rows: NDArray) -> LogErrors:
         """Return the errors of some rows."""
         return LogErrors.of(
             self.error[rows],
-            share_in_domain=_share(self.in_domain, rows),
-            share_in_radius=_share(self.in_radius, rows),
+            share_in_domain=_share(self.in_domain[rows]),
+            share_in_radius=_share(self.in_radius[rows]),
         )
 
 
-def _share(values: NDArray | None, rows: NDArray) -> float | None:
-    if values is None:
-        return None
-    known = values[rows][~np.isnan(values[rows])]
+def _share(values: NDArray) -> float:
+    known = values[~np.isnan(values)]
     return float(known.mean()) if known.size else np.nan
 
 
@@ -182,9 +145,6 @@ def evaluate_log(
     predicted = loaded.predict(log.q, motion)
     markers = distances(predicted, log.x)
     errors = _row_errors(loaded, log.q, motion, markers)
-    motions = {}
-    for name in dict.fromkeys(measured.motions):
-        motions[str(name)] = errors.of(measured.motions == name)
     fitted = loaded.was_fitted(log.q, log.x, measured.motions)
     fitted_errors = None
     new_errors = None
@@ -192,10 +152,12 @@ def evaluate_log(
         fitted_errors = errors.of(fitted)
     if fitted is not None and not fitted.all():
         new_errors = errors.of(~fitted)
+    motions = {}
+    for name in dict.fromkeys(measured.motions):
+        motions[str(name)] = errors.of(measured.motions == name)
     record = Evaluation(
         model=str(loaded.path),
         log=log.source,
-        split=measured.split,
         log_check=measured.report,
         all=errors.of(np.ones(len(log.q), dtype=bool)),
         motions=motions,
@@ -204,10 +166,9 @@ def evaluate_log(
         new=new_errors,
         held_out=None if fitted_errors is None else loaded.held_out,
         markers=errors_of_markers(markers),
-        radius=RadiusEntry.of(loaded.hybrid),
     )
     report = Report(f"{loaded.name}: errors on {Path(log.source).name}", record)
-    record._write(report)
+    _write_errors(report, loaded.hybrid)
     if out is not None:
         _add_figures(report, loaded, measured, predicted, motion)
         report.write(out)
@@ -217,16 +178,52 @@ def evaluate_log(
 def _row_errors(
     loaded: LoadedModel, q: NDArray, motion: NDArray, markers: NDArray
 ) -> _RowErrors:
-    error = np.nanmean(markers, axis=1)
+    in_domain = np.full(len(q), np.nan)
+    in_radius = in_domain
     hybrid = loaded.hybrid
-    if hybrid is None:
-        return _RowErrors(error)
-    in_domain = hybrid.in_domain(q, groups=motion)
-    if hybrid.radius_ is None:
-        return _RowErrors(error, in_domain)
-    _, radius = hybrid.predict(q, return_radius=True, groups=motion)
-    inside = np.nanmax(markers, axis=1) <= radius
-    return _RowErrors(error, in_domain, np.where(np.isinf(radius), np.nan, inside))
+    if hybrid is not None:
+        in_domain = hybrid.in_domain(q, groups=motion).astype(float)
+    if hybrid is not None and hybrid.radius_ is not None:
+        _, radius = hybrid.predict(q, return_radius=True, groups=motion)
+        inside = np.nanmax(markers, axis=1) <= radius
+        in_radius = np.where(np.isinf(radius), np.nan, inside)
+    return _RowErrors(np.nanmean(markers, axis=1), in_domain, in_radius)
+
+
+def _write_errors(
+    report: Report[Evaluation], hybrid: HybridForwardModel | None
+) -> None:
+    """Add the errors to a report."""
+    record = report.record
+    write_check(report, record.log_check)
+    report.text("## Errors by motion, largest first")
+    if record.fitted_rows is None:
+        report.text(
+            "The model does not say which rows it was fitted to; they have smaller errors."
+        )
+    if record.fitted_rows:
+        report.text(
+            f"**{record.fitted_rows} of {record.all.rows} rows were fitted: their errors are "
+            "training errors.** To test the model, evaluate a log of other motions."
+        )
+    entries: dict[str, Errors] = {"all rows": record.all}
+    if record.fitted is not None:
+        parts = {
+            "new rows": record.new,
+            "fitted rows": record.fitted,
+            "held out in the fit": record.held_out,
+        }
+        entries |= {name: part for name, part in parts.items() if part is not None}
+    largest_first = sorted(record.motions.items(), key=lambda item: -item[1].mean)
+    columns = ["rows", "mean", "median", "p95", "max"]
+    if hybrid is not None:
+        columns += ["share_in_domain", "share_in_radius"]
+    report.errors(entries | dict(largest_first), columns)
+    if hybrid is not None and hybrid.radius_ is not None:
+        report.text(
+            f"Estimated error radius: {hybrid.radius_}. Rows without a radius do not count."
+        )
+    write_markers(report, record.markers, "all rows")
 
 
 def _add_figures(
@@ -238,10 +235,7 @@ def _add_figures(
 ) -> None:
     plots = hybridkin.plots
     errors = np.nanmean(distances(predicted, log.x), axis=1)
-    figure, ax = plots.new_figure(6.0, 3.6)
-    plots.ErrorHistogramDisplay({loaded.kind: errors}).plot(ax, unit="mm")
-    ax.set(ylabel="rows")
-    report.figure("error_histogram", figure, "Tip errors of all rows.")
+    add_histogram(report, {loaded.kind: errors}, "Tip errors of all rows.")
     figure, ax = plots.new_figure(6.4, 5.2, subplot_kw={"projection": "3d"})
     row = int(np.argsort(errors)[int(0.95 * len(errors))])
     body = None

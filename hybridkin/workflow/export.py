@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -22,28 +21,6 @@ _TITLES = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class Export:
-    """What `export_model` wrote.
-
-    Attributes
-    ----------
-    n_actuators : int
-        Size of q.
-    dtype : str
-        Number type of the code.
-    dt : float or None
-        Control period [s] of the step, None without.
-    limits : PathLimits or None
-        Limits of the step, None without.
-    """
-
-    n_actuators: int
-    dtype: str
-    dt: float | None
-    limits: PathLimits | None
-
-
 def export_model(
     loaded: LoadedModel,
     out: str | Path,
@@ -53,8 +30,8 @@ def export_model(
     dtype: str = "float64",
     dt: float | None = None,
     limits: PathLimits | None = None,
-) -> Report[Export]:
-    """Write a model for another system, see `native.export_c`, `export_fmu` and `export_mex`.
+) -> Report[dict[str, object]]:
+    """Write a model as C code, see `native.export_c`.
 
     Parameters
     ----------
@@ -76,21 +53,20 @@ def export_model(
 
     Returns
     -------
-    Report of Export
-        What was written.
+    Report of dict
+        Number type "dtype", control period "dt" [s] and "limits" of the step.
     """
     one_of(kind, "kind", _TITLES)
     if kind != "c" and dtype != "float64":
         raise ValueError('`dtype` must be "float64" here; "float32" is for C code.')
+    record: dict[str, object] = {"dtype": dtype, "dt": dt}
+    report = Report(_TITLES[kind], record)
+    report.text(f"{name}: {loaded.n_actuators} actuators, {dtype}.")
     model = loaded.module
-    if dt is None:
-        limits = None
-    else:
+    if dt is not None:
         limits = limits or path_limits(loaded)
         model = Domain(loaded, limits).solver(dt=dt)
-    report = Report(_TITLES[kind], Export(loaded.n_actuators, dtype, dt, limits))
-    report.text(f"{name}: {loaded.n_actuators} actuators, {dtype}.")
-    if limits is not None:
+        record["limits"] = limits
         report.text(f"Steps of {dt:g} s within limits: {limits.source}.")
     about_q = _about_q(loaded)
     report.text(about_q)

@@ -2,42 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-
-import numpy as np
 
 import hybridkin
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.workflow.model import LoadedModel
 from hybridkin.workflow.report import Progress, Report, quiet
 from hybridkin.workflow.track import LEAD_IN, TARGET, read_track
-
-
-@dataclass(frozen=True)
-class Film:
-    """A written film.
-
-    Attributes
-    ----------
-    path : str
-        The file.
-    bytes : int
-        Its size.
-    frames : int
-        Number of frames.
-    fps : float
-        Frames per second.
-    duration_s : float or None
-        Duration of the motion [s], None if the commands have no times.
-    """
-
-    path: str
-    bytes: int
-    frames: int
-    fps: float
-    duration_s: float | None
 
 
 def animate_track(
@@ -49,7 +21,7 @@ def animate_track(
     speed: float = 1.0,
     n_frames: int = 150,
     progress: Progress = quiet,
-) -> Report[Film]:
+) -> Report[dict[str, object]]:
     """Write a film or an interactive page of a robot that follows a file of commands.
 
     Parameters
@@ -72,8 +44,8 @@ def animate_track(
 
     Returns
     -------
-    Report of Film
-        What was written.
+    Report of dict
+        Number of "frames" and "bytes", frames per second "fps".
     """
     if loaded.chain is None:
         raise ValueError(
@@ -104,15 +76,10 @@ def animate_track(
         )
     except RuntimeError as error:  # no program to write films with
         raise ValueError(str(error)) from error
-    record = Film(
-        path=str(out),
-        bytes=out.stat().st_size,
-        frames=len(film.rows),
-        fps=speed * film.fps,
-        duration_s=None if log.time is None else float(np.ptp(log.time)),
-    )
+    fps = speed * film.fps
+    size = out.stat().st_size
+    record = {"frames": len(film.rows), "fps": fps, "bytes": size}
     report = Report(f"{loaded.name}: film of {path}", record)
-    size = f"{record.bytes / 1e6:.2f} MB"
-    report.text(f"{record.frames} frames, {record.fps:.3g} a second, {size}")
+    report.text(f"{len(film.rows)} frames, {fps:.3g} a second, {size / 1e6:.2f} MB")
     report.paths = [out]
     return report

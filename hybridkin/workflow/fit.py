@@ -11,14 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from hybridkin.chains.constant_curvature import ConstantCurvatureChain
-from hybridkin.chains.elastic_tendons import ElasticTendonChain
 from hybridkin.chains.robots import RobotDescription
 from hybridkin.datasets import Log
 from hybridkin.hybrid.estimator import HybridForwardModel, fit_quietly
 from hybridkin.saving.saved_model import save_model
 from hybridkin.workflow.calibrated import Calibration, deviations
-from hybridkin.workflow.choices import AutoChoice, RadiusEntry, choice_in_words
+from hybridkin.workflow.choices import auto_in_words, choice_in_words
 from hybridkin.workflow.compare import (
     AUTO,
     DATA_QUADRATIC,
@@ -27,7 +25,6 @@ from hybridkin.workflow.compare import (
     Comparison,
     FitSettings,
     Mechanical,
-    Rows,
     compare_by_group,
     models_to_save,
     with_play_detected,
@@ -35,7 +32,6 @@ from hybridkin.workflow.compare import (
 from hybridkin.workflow.errors import HeldOutErrors, Promise
 from hybridkin.workflow.fit_record import (
     FitRecord,
-    ParameterChoice,
     add_error_figures,
     errors_of_markers,
     largest_errors,
@@ -99,15 +95,14 @@ def fit_log(
     complete = checked(log, robot.chain, robot.base_is_free)
     _check(complete, robot, settings)
     complete.check(force)
-    data = complete.thinned(settings.max_rows)
-    rows = Rows(data.q, data.x, data.motions)
+    rows = complete.thinned(settings.max_rows)
     progress("calibration", 0, 1)
     mechanical = Mechanical.of(robot, rows, settings.loss)
     messages = [*mechanical.messages, *_suspicions(complete, mechanical)]
     for message in messages:
         warnings.warn(message, stacklevel=2)
-    settings = with_play_detected(settings, complete, rows, mechanical)
-    compared = compare_by_group(data, robot, settings, n_jobs=n_jobs, progress=progress)
+    settings = with_play_detected(settings, rows, mechanical)
+    compared = compare_by_group(rows, robot, settings, n_jobs=n_jobs, progress=progress)
     saved = AUTO if settings.auto else _best_to_save(compared)
     report_fit = partial(progress, f"fitting {saved} to all motions")
     report_fit(0, 1)
@@ -129,7 +124,7 @@ def fit_log(
     record = FitRecord(
         log=Path(log.source).name,
         robot=robot.name,
-        rows=len(data.q),
+        rows=len(rows.q),
         n_whole=len(complete.q),
         n_motions=len(np.unique(complete.motions)),
         split=complete.split,
@@ -143,12 +138,11 @@ def fit_log(
         log_check=complete.report,
         worst=largest_errors(compared, rows.motions),
         markers=errors_of_markers(compared.markers[saved]),
-        auto=AutoChoice.of(model),
-        radius=RadiusEntry.of(model),
-        plane=LoadedModel(robot.name, Path(out), model, robot).plane_in_words(),
-        parameters=ParameterChoice.of(mechanical.geometry),
+        auto=model.cv_results_,
+        words=_in_words(LoadedModel(robot.name, Path(out), model, robot), model),
+        tried=mechanical.tried,
+        calibrated=mechanical.parameters,
         calibration=_calibration(mechanical, rows, settings.loss, messages),
-        calibration_of_saved=_elastic_calibration(robot, model),
     )
     report = Report(f"{robot.name}: hybrid model of {record.log}", record)
     write_comparison(report)
@@ -169,16 +163,10 @@ def _check(log: MeasuredLog, robot: RobotDescription, settings: FitSettings) -> 
         )
     if settings.play in (None, "detect"):
         return
-    if robot.chain is None:
+    if robot.chain is None or not settings.auto or not log.named:
         raise ValueError(
-            "`play` requires a robot with segments: its width is a length."
-        )
-    if not settings.auto:
-        raise ValueError("`play` requires `auto=True`; remove --no-auto.")
-    if not log.named:
-        raise ValueError(
-            "`play` needs motions with rows in order of time; name the column of the motions: "
-            "--groups COLUMN, or groups = in [log]."
+            "`play` requires a robot with segments, `auto=True` (no --no-auto), and motions that a "
+            "column names (--groups COLUMN, or groups = in [log])."
         )
     log.check_order("`play`")
 
@@ -201,7 +189,7 @@ def _best_to_save(compared: Comparison) -> str:
 
 
 def _calibration(
-    mechanical: Mechanical, rows: Rows, loss: str, messages: Sequence[str]
+    mechanical: Mechanical, rows: MeasuredLog, loss: str, messages: Sequence[str]
 ) -> Calibration | None:
     if mechanical.start is None or mechanical.result is None:
         return None
@@ -209,19 +197,14 @@ def _calibration(
     return Calibration.of(mechanical.start, mechanical.result, messages, others)
 
 
-def _elastic_calibration(
-    robot: RobotDescription, model: HybridForwardModel
-) -> Calibration | None:
-    """Return the calibration of the elastic tendons if auto chose them instead of the chain."""
-    chain = robot.chain
-    calibration = model.calibration_
-    if chain is None or calibration is None or robot.calibrate == "auto":
-        return None
-    if not isinstance(model.mechanical_model_, ElasticTendonChain):
-        return None
-    if isinstance(chain, ConstantCurvatureChain):
-        chain = ElasticTendonChain.from_chain(chain)
-    return Calibration.of(chain, calibration)
+def _in_words(loaded: LoadedModel, model: HybridForwardModel) -> list[str]:
+    """Return what a model chose, its error radius, and motions that its log lacks."""
+    words = auto_in_words(model)
+    if model.radius_ is not None:
+        words.append(f"Estimated error radius: {model.radius_}.")
+    if loaded.plane_in_words():
+        words.append(loaded.plane_in_words())
+    return words
 
 
 def _add_model(

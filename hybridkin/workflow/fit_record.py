@@ -10,13 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import hybridkin
-from hybridkin.calibration.choice import GeometryChoice
 from hybridkin.datasets import LogReport
 from hybridkin.workflow.calibrated import Calibration
-from hybridkin.workflow.choices import AutoChoice, RadiusEntry
 from hybridkin.workflow.compare import (
     AUTO,
-    BACKLASH,
     CALIBRATED,
     DATA_LINEAR,
     HYBRID_ELM,
@@ -28,20 +25,13 @@ from hybridkin.workflow.report import Report
 
 _SHOWN = (CALIBRATED, DATA_LINEAR, HYBRID_ELM, "hybrid, parallel ELM", AUTO)
 _MOST = 5  # motions of largest errors
-_MECHANICAL = (
+_KINDS_OF_MODELS = (
     '"Nominal": the robot description, with a fitted base if the base is calibrated. "Calibrated": '
-    'with the geometry fitted to the log. "Data-driven": without a mechanical model. "Hybrid": the '
-    "calibrated model plus a learned residual."
-)
-_AUTO = (
-    ' "Parallel": the residual acts at the tip, "serial": inside the robot. "ELM" is a network, '
-    '"auto" the chosen one of the hybrids, or a blend of several.'
-)
-_WITH_BACKLASH = (
-    ' "With backlash": the calibrated model at the motion of the actuators, as hybrids.'
-)
-_NO_MECHANICAL = (
-    'The robot has no segments: "hybrid" models correct the linear model of the data.'
+    'with the geometry fitted to the log. "With backlash": the calibrated model at the motion of '
+    'the actuators. "Data-driven": without a mechanical model. "Hybrid": the calibrated model, or '
+    'for a robot without segments the linear one, plus a learned residual. "Parallel": the '
+    'residual acts at the tip, "serial": inside the robot. "ELM" is a network, "auto" the chosen '
+    "one of the hybrids, or a blend of several."
 )
 
 
@@ -86,39 +76,6 @@ class Training:
 
 
 @dataclass(frozen=True)
-class ParameterChoice:
-    """The set of parameters that is calibrated, and the errors (cv, io) of all tried sets [m]."""
-
-    taken: str
-    tried: Mapping[str, Mapping[str, float]]
-
-    @classmethod
-    def of(cls, geometry: GeometryChoice | None) -> ParameterChoice | None:
-        """Return the choice; None if the description names the parameters."""
-        if geometry is None:
-            return None
-        tried = {name: errors.known() for name, errors in geometry.errors.items()}
-        return cls(geometry.name, tried)
-
-    def write(self, report: Report[Any]) -> None:
-        """Add the choice to a report."""
-        report.text(
-            "## What is calibrated",
-            f"Calibrated: **{self.taken}**. The table has mean tip errors in mm: on held-out "
-            "motions, and outside, on the outer 35 % of the rows after a fit to the inner 40 %. "
-            "Sets with more than 1.1 times the least held-out error are excluded. The score of the "
-            "others is the held-out error times the square of the error outside. Of the sets with "
-            "nearly the least score, the one with the fewest parameters is calibrated.",
-        )
-        rows = []
-        for name, errors in self.tried.items():
-            held_out = 1e3 * errors.get("cv", np.nan)
-            outside = 1e3 * errors.get("io", np.nan)
-            rows.append([name, f"{held_out:.2f}", f"{outside:.2f}"])
-        report.table(["parameters", "held-out motions", "outside"], rows)
-
-
-@dataclass(frozen=True)
 class MotionErrors:
     """Mean errors of some models on a held-out motion [m]."""
 
@@ -141,31 +98,31 @@ class FitRecord(Training):
         Findings of the check of the log.
     worst : list of MotionErrors
         The motions of largest errors.
-    markers : list of Errors or None
-        Errors of every marker of the saved model, base to tip; None for a single one.
-    auto, radius
-        The choices of "auto", and the estimated error radius.
-    plane : str
-        Motions that the log lacks, in words.
-    parameters : ParameterChoice or None
-        What is calibrated, if the robot says "auto".
+    markers : list of Errors
+        Errors of every marker of the saved model, base to tip; empty for a single one.
+    auto : dict or None
+        The choices of "auto", see `HybridForwardModel.cv_results_`.
+    words : list of str
+        What the saved model chose, its error radius, and motions that the log lacks.
+    tried : dict of str to dict
+        If the robot says "auto", the errors of all sets of parameters that were tried [m]: on
+        held-out motions, "cv", and outside the fitted rows, "io".
+    calibrated : str
+        The set that is calibrated.
     calibration : Calibration or None
         The calibration on all motions.
-    calibration_of_saved : Calibration or None
-        That of elastic tendons, if "auto" took them instead.
     """
 
     command: str = "fit"
     choices_by_fold: Sequence[Mapping[str, str]]
     log_check: LogReport
     worst: Sequence[MotionErrors]
-    markers: Sequence[Errors] | None
-    auto: AutoChoice | None
-    radius: RadiusEntry | None
-    plane: str
-    parameters: ParameterChoice | None
+    markers: Sequence[Errors]
+    auto: Mapping[str, Any] | None
+    words: Sequence[str]
+    tried: Mapping[str, Mapping[str, float]]
+    calibrated: str
     calibration: Calibration | None
-    calibration_of_saved: Calibration | None
 
 
 def training_notes(record: FitRecord) -> dict[str, Any]:
@@ -186,7 +143,7 @@ def write_comparison(report: Report[FitRecord]) -> None:
         f"{record.rows} rows{thinned}, {record.n_motions} {record.split}. Each of "
         f"{len(record.choices_by_fold)} folds holds out whole motions. The other motions choose "
         "and fit everything: geometry, features, penalties and blend.",
-        _kinds_of_models(record.held_out),
+        _KINDS_OF_MODELS,
     )
     columns = ("mean", "std_error", "std", "p95", "max", "std_folds")
     report.errors(record.held_out, columns)
@@ -200,20 +157,9 @@ def write_comparison(report: Report[FitRecord]) -> None:
         ratio = record.held_out[first].mean / record.held_out[name].mean
         ratios.append(f"by that of {name}: **{ratio:.2f}**")
     best = min(record.held_out, key=lambda name: record.held_out[name].mean)
-    start = "the calibrated model" if first == CALIBRATED else "the linear model"
     report.text(
-        f"Mean error of {start} divided {', '.join(ratios)}. Least mean error: {best}."
+        f"Mean error of {first} divided {', '.join(ratios)}. Least mean error: {best}."
     )
-
-
-def _kinds_of_models(compared: Mapping[str, object]) -> str:
-    """Return what the names of the compared models mean."""
-    words = _MECHANICAL if CALIBRATED in compared else _NO_MECHANICAL
-    if BACKLASH in compared:
-        words += _WITH_BACKLASH
-    if AUTO in compared:
-        words += _AUTO
-    return words
 
 
 def write_model(report: Report[FitRecord]) -> None:
@@ -237,19 +183,28 @@ def write_model(report: Report[FitRecord]) -> None:
         f"chosen in each fold: {'; '.join(by_fold)}."
     )
     write_markers(report, record.markers, f"{record.saved}, on held-out motions")
-    if record.auto is not None:
-        report.text(" ".join(record.auto.words))
-    if record.radius is not None:
-        report.text(record.radius.words)
-    if record.plane:
-        report.text(record.plane)
-    if record.parameters is not None:
-        record.parameters.write(report)
+    report.text(*record.words)
+    if record.tried:
+        _write_tried(report, record)
     if record.calibration is not None:
-        record.calibration.write(report, "Calibration on all motions")
-    if record.calibration_of_saved is not None:
-        title = "Calibration of the elastic tendons that auto chose"
-        record.calibration_of_saved.write(report, title)
+        record.calibration.write(report)
+
+
+def _write_tried(report: Report[Any], record: FitRecord) -> None:
+    """Add the sets of parameters that were tried."""
+    report.text(
+        "## What is calibrated",
+        f"Calibrated: **{record.calibrated}**. The table has mean tip errors in mm: on held-out "
+        "motions, and outside, on the outer 35 % of the rows after a fit to the inner 40 %. "
+        "Sets with more than 1.1 times the least held-out error are excluded. The score of the "
+        "others is the held-out error times the square of the error outside. Of the sets with "
+        "nearly the least score, the one with the fewest parameters is calibrated.",
+    )
+    rows = []
+    for name, errors in record.tried.items():
+        in_mm = [f"{1e3 * errors.get(key, np.nan):.2f}" for key in ("cv", "io")]
+        rows.append([name, *in_mm])
+    report.table(["parameters", "held-out motions", "outside"], rows)
 
 
 def shown_models(compared: Mapping[str, object]) -> list[str]:
@@ -272,36 +227,39 @@ def largest_errors(compared: Comparison, motions: NDArray) -> list[MotionErrors]
     return entries
 
 
-def errors_of_markers(errors: NDArray) -> list[Errors] | None:
-    """Return the errors of every marker from those of rows (N, K), NaN: not measured."""
+def errors_of_markers(errors: NDArray) -> list[Errors]:
+    """Return the errors of several markers from those of rows (N, K), NaN: not measured."""
     if errors.shape[1] == 1:
-        return None
+        return []
     return [Errors.of(column[~np.isnan(column)]) for column in errors.T]
 
 
-def write_markers(
-    report: Report[Any], markers: Sequence[Errors] | None, what: str
-) -> None:
+def write_markers(report: Report[Any], markers: Sequence[Errors], what: str) -> None:
     """Add the errors of several markers, one by one."""
-    if markers is None:
-        return
-    report.text(
-        f"Errors of the markers, base to tip ({what}). Other tables give their mean."
-    )
-    entries = {f"marker {k}": errors for k, errors in enumerate(markers)}
-    report.errors(entries, ("rows", "mean", "p95", "max"))
+    if markers:
+        report.text(
+            f"Errors of the markers, base to tip ({what}). Other tables give their mean."
+        )
+        entries = {f"marker {k}": errors for k, errors in enumerate(markers)}
+        report.errors(entries, ("rows", "mean", "p95", "max"))
 
 
 def add_error_figures(report: Report[Any], errors: Mapping[str, NDArray]) -> None:
     """Add the distributions of the errors (N,) on held-out motions by model."""
-    plots = hybridkin.plots
-    figure, ax = plots.new_figure(8.0, 1.5 + 0.32 * len(errors))
-    plots.ErrorBoxDisplay(errors).plot(ax, unit="mm")
+    figure, ax = hybridkin.plots.new_figure(8.0, 1.5 + 0.32 * len(errors))
+    hybridkin.plots.ErrorBoxDisplay(errors).plot(ax, unit="mm")
     caption = "Tip error on held-out motions: quartiles, 5 and 95 %; larger errors as numbers."
     report.figure("held_out", figure, caption)
-    figure, ax = plots.new_figure(5.5, 3.8)
     shown = shown_models(errors)
     first_and_last = {name: errors[name] for name in (shown[0], shown[-1])}
-    plots.ErrorHistogramDisplay(first_and_last).plot(ax, unit="mm")
+    add_histogram(report, first_and_last, "Tip errors on held-out motions.")
+
+
+def add_histogram(
+    report: Report[Any], errors: Mapping[str, NDArray], caption: str
+) -> None:
+    """Add a histogram of errors (N,) by model."""
+    figure, ax = hybridkin.plots.new_figure(5.5, 3.8)
+    hybridkin.plots.ErrorHistogramDisplay(errors).plot(ax, unit="mm")
     ax.set(ylabel="rows")
-    report.figure("error_histogram", figure, "Tip errors on held-out motions.")
+    report.figure("error_histogram", figure, caption)

@@ -175,14 +175,11 @@ class LoadedModel:
         They are those of held-out motions at the same distance from the log. None if the file does
         not have them.
         """
-        held_out = self.held_out
-        if held_out is None:
+        if self.hybrid is None or "promise" not in self.training:
             return None
-        promise = Promise(held_out.mean, 0.0, held_out.p95 / held_out.mean)
-        if "promise" in self.training:
-            promise = Promise(**self.training["promise"])
-        tested = None if self.hybrid is None else self.hybrid.fitted_module_.tested
-        if self.hybrid is None or tested is None:
+        promise = Promise(**self.training["promise"])
+        tested = self.hybrid.fitted_module_.tested
+        if tested is None:
             return promise.at(np.zeros(len(q)))
         return promise.at(distances(tested, q + self.hybrid.change_.shift))
 

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hybridkin._core.arrays import whole
 from hybridkin._core.units import METRES
@@ -31,33 +29,6 @@ _SHOWN = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)  # rows of the table
 _TOL = 1e-3  # tolerance of the inverse kinematics along a path [m]
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class NextRows:
-    """What `next_rows` chose.
-
-    Attributes
-    ----------
-    command, model : str
-        "next", and the file of the model.
-    n, n_measured : int
-        Number of chosen configurations, and of rows that are already measured.
-    where : str
-        Where the error must be small, in words.
-    limits : PathLimits
-        The limits of the commands.
-    expected_errors : ndarray of shape (n,)
-        The expected error after each configuration [m].
-    """
-
-    command: str = "next"
-    model: str
-    n: int
-    n_measured: int
-    where: str
-    limits: PathLimits
-    expected_errors: NDArray
-
-
 def next_rows(
     loaded: LoadedModel,
     out: str | Path,
@@ -68,7 +39,7 @@ def next_rows(
     path: Trajectory | None = None,
     force: bool = False,
     progress: Progress = quiet,
-) -> Report[NextRows]:
+) -> Report[dict[str, object]]:
     """Choose the configurations to measure next, see `choose_rows`, and write them.
 
     ``next.csv`` has one row per configuration, in the order of the choice: commands in the units,
@@ -98,8 +69,9 @@ def next_rows(
 
     Returns
     -------
-    Report of NextRows
-        The expected errors, and under which limits.
+    Report of dict
+        "expected_errors" (n,) [m] after each configuration, the "limits", "n_measured" rows, and
+        "where" the error must be small, in words.
 
     Raises
     ------
@@ -127,21 +99,22 @@ def next_rows(
     rows, errors = choose_rows(
         loaded.model, candidates, n, measured=measured_q, target=target
     )
-    record = NextRows(
-        model=str(loaded.path),
-        n=n,
-        n_measured=0 if measured_q is None else len(measured_q),
-        where=where,
-        limits=limits,
-        expected_errors=errors,
-    )
+    n_measured = 0 if measured is None else len(measured.q)
+    record = {
+        "command": "next",
+        "model": loaded.path,
+        "n_measured": n_measured,
+        "where": where,
+        "limits": limits,
+        "expected_errors": errors,
+    }
     report = Report(f"{loaded.name}: {n} configurations to measure next", record)
     shown = sorted({k for k in _SHOWN if k < n} | {n})
     table = [[str(k), f"{1e3 * errors[k - 1]:.2f}"] for k in shown]
     report.table(["rows", "expected error [mm]"], table)
     report.text(
         f"Expected error {where}, computed without measured tips. It shows when more rows bring "
-        f"little, not how large the error will be. {record.n_measured} rows are already measured. "
+        f"little, not how large the error will be. {n_measured} rows are already measured. "
         f"Limits: {limits.source}."
     )
     log = loaded.log_format()

@@ -28,12 +28,10 @@ if TYPE_CHECKING:
 Progress = Callable[[str, int, int], None]
 """Called with (what, done, total)."""
 
-TableWriter = Callable[[Sequence[str], Sequence[Sequence[str]]], str]
-"""Called with header and rows of a table; returns it as text."""
-
 Record = TypeVar("Record")
 
 _WIDTH = 98
+_FENCE = "```"
 
 
 class _Figure(Protocol):
@@ -101,28 +99,27 @@ class Report(Generic[Record]):
         self.title = title
         self.record = record
         self.paths: list[Path] = []
-        self._markdown: list[str] = []
-        self._plain: list[str | tuple[Sequence[str], Sequence[Sequence[str]]]] = []
+        self._blocks = [f"# {title}"]
         self._files: dict[str, Writer] = {}
-        self.text(f"# {title}")
 
     def text(self, *paragraphs: str) -> None:
         """Add paragraphs."""
-        for paragraph in paragraphs:
-            self._markdown.append(paragraph)
-            self._plain.append(_wrapped(paragraph))
+        self._blocks += paragraphs
 
     def verbatim(self, text: str) -> None:
         """Add lines as they are."""
-        self._markdown.append(f"```\n{text}\n```")
-        self._plain.append(text)
+        self._blocks.append(f"{_FENCE}\n{text}\n{_FENCE}")
 
     def table(self, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-        """Add a table."""
-        ruled = [header, ["---"] * len(header), *rows]
-        lines = ["| " + " | ".join(line) + " |" for line in ruled]
-        self._markdown.append("\n".join(lines))
-        self._plain.append((header, rows))
+        """Add a table, the first column aligned to the left, the others to the right."""
+        widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
+        rule = ["-" * width for width in widths]
+        lines = []
+        for name, *cells in [header, rule, *rows]:
+            aligned = map(str.rjust, cells, widths[1:])
+            line = " | ".join([name.ljust(widths[0]), *aligned])
+            lines.append(f"| {line} |")
+        self._blocks.append("\n".join(lines))
 
     def errors(self, entries: Mapping[str, Errors], columns: Sequence[str]) -> None:
         """Add a table of tip errors [mm] by name; `columns` are attributes of the errors."""
@@ -139,7 +136,7 @@ class Report(Generic[Record]):
 
     def figure(self, name: str, figure: _Figure, caption: str) -> None:
         """Add a figure that becomes `name`.png."""
-        self._markdown.append(f"![{caption}]({name}.png)\n\n*{caption}*")
+        self._blocks.append(f"![{caption}]({name}.png)\n\n*{caption}*")
         self.file(f"{name}.png", figure.savefig)
 
     def file(self, name: str, write: Writer) -> None:
@@ -148,14 +145,18 @@ class Report(Generic[Record]):
 
     def markdown(self) -> str:
         """Return the report as Markdown text."""
-        return "\n\n".join(self._markdown) + "\n"
+        return "\n\n".join(self._blocks) + "\n"
 
-    def plain(self, table: TableWriter | None = None) -> str:
-        """Return the report as text; `table` makes text of header and rows, by default aligned."""
-        write_table = table or _aligned
+    def plain(self) -> str:
+        """Return the report as text for a terminal: without figures, with wrapped lines."""
         texts = []
-        for block in self._plain:
-            texts.append(block if isinstance(block, str) else write_table(*block))
+        for block in self._blocks:
+            if block.startswith(_FENCE):
+                texts.append(block.strip(f"{_FENCE}\n"))
+            elif block.startswith("|"):
+                texts.append(block)
+            elif not block.startswith("!["):
+                texts.append(_wrapped(block))
         return "\n\n".join(texts)
 
     def json(self) -> str:
@@ -183,16 +184,6 @@ class Report(Generic[Record]):
         }
 
 
-def _aligned(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a table as text, the first column aligned to the left, the others to the right."""
-    widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
-    lines = []
-    for name, *cells in [header, *rows]:
-        aligned = map(str.rjust, cells, widths[1:])
-        lines.append("  " + "  ".join([name.ljust(widths[0]), *aligned]))
-    return "\n".join(lines)
-
-
 def _write_text(path: Path, text: str) -> None:
     path.write_text(text, encoding="utf-8")
 
@@ -215,21 +206,18 @@ def check_out(
     `files` and a report are replaced only if the report is one of the same command, or by `force`.
     """
     path = as_path(out, "out")
-    if path.exists() and not path.is_dir():
-        raise FileExistsError(
-            f"`out` must be a folder, got the file {path}; name another one."
-        )
-    parents = [path, *path.absolute().parents]
-    home = next(parent for parent in parents if parent.exists())
-    if not os.access(home, os.W_OK):
-        raise PermissionError(
-            f"`out` must be writable, but {home} is not; name another folder."
+    folder = path.absolute()
+    while not folder.exists():
+        folder = folder.parent
+    if not folder.is_dir() or not os.access(folder, os.W_OK):
+        raise OSError(
+            f"`out` must be a folder that can be written, got {path}; name another one."
         )
     report = path / "report.json"
     entry = f'"command": "{command}"'
     if force or (report.is_file() and entry in report.read_text(errors="replace")):
         return
-    names = (*files, report.name, "report.md")
+    names = (*files, "report.json", "report.md")
     present = [name for name in names if (path / name).exists()]
     if present:
         raise FileExistsError(

@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,7 +22,7 @@ from hybridkin.ik import trajectories
 from hybridkin.ik.results import IKStatus, Track, score
 from hybridkin.ik.trajectories import Trajectory
 from hybridkin.workflow.domain import Domain, PathLimits, path_limits
-from hybridkin.workflow.errors import Errors, ExpectedErrors
+from hybridkin.workflow.errors import Errors
 from hybridkin.workflow.model import LoadedModel, play_widths
 from hybridkin.workflow.path import interpolated
 from hybridkin.workflow.reach import better_place, check_reach
@@ -48,25 +47,6 @@ _DT = 0.02  # period of a path of one point [s]
 _PULLS = (0.2, 0.0)  # pull to the preferred configuration, in each attempt
 
 
-@dataclass(frozen=True, eq=False)
-class LeadIn:
-    """The rows that lead from the robot's configuration to the path.
-
-    Attributes
-    ----------
-    rows : int
-        Their number.
-    duration_s : float
-        Their duration [s].
-    start : ndarray of shape (n,) or None
-        The configuration before them [m]; None: the first command of the path.
-    """
-
-    rows: int
-    duration_s: float
-    start: NDArray | None
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TrackRecord:
     """What `track_path` found.
@@ -77,97 +57,71 @@ class TrackRecord:
         "track", and the file of the model.
     n : int
         Number of points of the path.
-    duration_s : float
-        Its duration [s].
     reached : int
         Number of points that are reached within `tol`.
-    tol : float
-        As given [m].
     errors : Errors
         Errors of the solver [m].
     statuses : dict of str to int
         How many points have each status.
     in_domain : float or None
         Share of the points in the domain of the model, None without a learned part.
-    expected : ExpectedErrors or None
-        Mean errors to expect of the robot in the domain, None if not known.
+    expected : dict of str to float
+        "mean" and "p95" of the errors to expect of the robot in the domain [m], if known.
     play : list of float or None
         Backlash of every actuator [m].
-    lead_in : LeadIn
-        The rows before the path.
+    lead_in : int
+        Number of rows that lead from the robot's configuration to the path.
     limits : PathLimits
         The limits that were kept.
-    largest_speed : float
-        Largest speed of an actuator [m/s].
-    columns : LogFormat
-        Names and units of the columns of ``track.csv``.
-    plane : str
-        Motions that the log lacks, in words.
-    better : str
-        Where the path would lie better in the domain, in words.
     """
 
     command: str = "track"
     model: str
     n: int
-    duration_s: float
     reached: int
-    tol: float
     errors: Errors
     statuses: dict[str, int]
     in_domain: float | None
-    expected: ExpectedErrors | None
+    expected: Mapping[str, float]
     play: list[float] | None
-    lead_in: LeadIn
+    lead_in: int
     limits: PathLimits
-    largest_speed: float
-    columns: LogFormat
-    plane: str
-    better: str
 
-    def _write(self, report: Report[Any]) -> None:
-        """Add the record to a report, in words."""
-        tol = f"{1e3 * self.tol:g} mm"
-        errors = self.errors
-        report.text(
-            f"In the model, {self.reached} of {self.n} points are reached within {tol}. Error of "
-            f"the solver: mean {millimetres(errors.mean)}, 95 % quantile "
-            f"{millimetres(errors.p95)}, max {millimetres(errors.max)}. Limits: "
-            f"{self.limits.source}."
-        )
-        rows = [[status, str(count)] for status, count in self.statuses.items()]
-        report.table(["status", "points"], rows)
-        if self.lead_in.rows:
-            report.text(
-                "Rows with the status LEAD_IN move from the start of the robot to the path: "
-                f"{self.lead_in.rows} in {self.lead_in.duration_s:.2f} s."
-            )
-        pulled_positive = np.all(np.less(self.columns.q_sign, 0))
-        sign = ", shortening positive" if pulled_positive else ""
-        report.text(
-            f"track.csv: q in {self.columns.q_unit}{sign}; x, target and error in "
-            f"{self.columns.x_unit}; t in s."
-        )
-        if self.play is not None:
-            report.text(
-                f"Backlash (play) {millimetres(max(self.play))}: a command jumps by it when its "
-                "actuator reverses. Send q; effective_... is the motion of the actuators."
-            )
-        if self.plane:
-            report.text(self.plane)
-        report.text(self._promise_in_words())
 
-    def _promise_in_words(self) -> str:
-        """Return what to expect of the robot, and where the path would lie better."""
-        words = "The error of the robot is not known: the model has no held-out errors"
-        if self.expected is not None:
-            mean = millimetres(self.expected.mean, ".2g")
-            p95 = millimetres(self.expected.p95, ".2g")
-            words = f"Expect {mean} (95 % below {p95}) of the robot inside the log"
-        if self.in_domain is not None and self.in_domain < 1.0:
-            outside = percent(1.0 - self.in_domain)
-            words += f"; {outside} of the path is outside, where nothing is known"
-        return f"{words}: {self.better}." if self.better else f"{words}."
+def _write(report: Report[TrackRecord], loaded: LoadedModel, better: str) -> None:
+    """Add the record to a report, in words; `better` says where the path would lie better."""
+    record = report.record
+    errors = record.errors
+    report.text(
+        f"In the model, {record.reached} of {record.n} points are reached. Error of the solver: "
+        f"mean {millimetres(errors.mean)}, 95 % quantile {millimetres(errors.p95)}, max "
+        f"{millimetres(errors.max)}. Limits: {record.limits.source}."
+    )
+    rows = [[status, str(count)] for status, count in record.statuses.items()]
+    report.table(["status", "points"], rows)
+    log = loaded.log_format()
+    sign = ", shortening positive" if np.all(np.less(log.q_sign, 0)) else ""
+    report.text(
+        f"track.csv: q in {log.q_unit}{sign}; x, target and error in {log.x_unit}; t in s. Its "
+        f"first {record.lead_in} rows, with the status LEAD_IN, move from the start of the robot "
+        "to the path."
+    )
+    if record.play is not None:
+        report.text(
+            f"Backlash (play) {millimetres(max(record.play))}: a command jumps by it when its "
+            "actuator reverses. Send q; effective_... is the motion of the actuators."
+        )
+    if loaded.plane_in_words():
+        report.text(loaded.plane_in_words())
+    words = "The error of the robot is not known: the model has no held-out errors"
+    if record.expected:
+        mean = millimetres(record.expected["mean"], ".2g")
+        p95 = millimetres(record.expected["p95"], ".2g")
+        words = f"Expect {mean} (95 % below {p95}) of the robot inside the log"
+    if record.in_domain is not None and record.in_domain < 1.0:
+        outside = percent(1.0 - record.in_domain)
+        words += f"; {outside} of the path is outside, where nothing is known"
+    report.text(f"{words}{better}.")
 
 
 def track_path(
@@ -230,50 +184,47 @@ def track_path(
     track = best_track(domain, path, tol, progress)
     statuses = [IKStatus(int(code)).name for code in track.status]
     whole, n_lead = _with_lead_in(track, stands, domain)
-    speeds = np.abs(np.diff(whole.q, axis=0) / np.diff(whole.t)[:, None])
     inside = loaded.domain_distance(track.q) <= 1.0
     better = ""
     if loaded.hybrid is not None and inside.mean() < 1.0 - _MOST_OUTSIDE:
-        better = better_place(domain, path, tol)
+        better = f": {better_place(domain, path, tol)}"
     record = TrackRecord(
         model=str(loaded.path),
         n=len(path),
-        duration_s=path.duration,
         reached=score(track)[1],
-        tol=tol,
         errors=Errors.of(track.error),
         statuses=dict(Counter(statuses)),
         in_domain=None if loaded.hybrid is None else float(inside.mean()),
         expected=_expected(loaded, track.q[inside]),
         play=play_widths(loaded.hybrid),
-        lead_in=LeadIn(n_lead, whole.t[n_lead] - whole.t[0], stands),
+        lead_in=n_lead,
         limits=domain.limits,
-        largest_speed=speeds.max(initial=0.0),
-        columns=loaded.log_format(),
-        plane=loaded.plane_in_words(),
-        better=better,
     )
     report = Report(f"{loaded.name}: a path of {len(path)} points", record)
-    record._write(report)
+    _write(report, loaded, better)
     commands = {"command": loaded.commands(whole.q)}
     if loaded.play is not None:
         commands["actuator"] = whole.q
     _add_path(report, loaded, track)
     _add_commands(report, domain, whole.t, commands, n_lead)
     rows = partial(
-        _write_track, whole, commands, [LEAD_IN] * n_lead + statuses, record.columns
+        _write_track,
+        whole,
+        commands,
+        [LEAD_IN] * n_lead + statuses,
+        loaded.log_format(),
     )
     report.file("track.csv", rows)
     report.write(out)
     return report
 
 
-def _expected(loaded: LoadedModel, q: NDArray) -> ExpectedErrors | None:
-    """Return the mean errors to expect where the actuators do q (N, n); None if not known."""
+def _expected(loaded: LoadedModel, q: NDArray) -> dict[str, float]:
+    """Return the mean errors to expect where the actuators do q (N, n); empty if not known."""
     promised = loaded.promised_errors(q)
     if promised is None or len(q) == 0:
-        return None
-    return ExpectedErrors(promised.mean.mean(), promised.p95.mean())
+        return {}
+    return {"mean": promised.mean.mean(), "p95": promised.p95.mean()}
 
 
 def _start(domain: Domain, start: ArrayLike | str) -> NDArray | None:

@@ -82,48 +82,22 @@ def test_a_slip_of_a_newcomer_has_an_answer(
     assert not (tmp_path / "out").exists()
 
 
-def by_terminate(written):
-    def asked(log, robot, out, **_):
-        if written:
-            out.mkdir()
-            (out / "model").touch()
-        os.kill(os.getpid(), signal.SIGTERM)
-
-    return asked
+def by_terminate(*_, **__):
+    os.kill(os.getpid(), signal.SIGTERM)
 
 
 def by_keyboard(*_, **__):
     raise KeyboardInterrupt
 
 
-def in_an_import(*_, **__):
-    """C code turns an interrupt during an import into an ImportError."""
-    try:
-        os.kill(os.getpid(), signal.SIGINT)
-    except KeyboardInterrupt:
-        raise ImportError("could not import datetime") from None
-
-
 @pytest.mark.skipif(sys.platform == "win32", reason="needs signals of POSIX")
-@pytest.mark.parametrize(
-    ("fit_log", "code", "fate"),
-    [
-        (by_keyboard, 130, "nothing was written"),
-        (by_terminate(False), 143, "nothing was written"),
-        (by_terminate(True), 143, "files were written"),
-        (in_an_import, 130, "nothing was written"),
-    ],
-)
-def test_an_interrupt_leaves_cleanly_and_says_what_was_written(
-    log, robot, tmp_path, capsys, monkeypatch, fit_log, code, fate
-):
-    monkeypatch.setattr(workflow, "fit_log", fit_log, raising=False)
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # background jobs ignore it
+@pytest.mark.parametrize(("fit_log", "code"), [(by_keyboard, 130), (by_terminate, 143)])
+def test_an_interrupt_leaves_cleanly(log, robot, tmp_path, capsys, monkeypatch, fit_log, code):
+    monkeypatch.setattr(workflow, "fit_log", fit_log)
     left = run(capsys, "fit", log, "--robot", robot, "--out", tmp_path / "m")
-    assert signal.signal(signal.SIGINT, before) is signal.default_int_handler
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
     assert left[:2] == (code, "")
-    assert left[2].split("\n\n")[-1] == f"hybridkin: interrupted; {fate}\n"
+    assert left[2].endswith("hybridkin: interrupted\n")
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ import pytest
 from rich.console import Console
 
 from hybridkin.cli import _terminal
-from hybridkin.cli._terminal import Stages, shown
+from hybridkin.cli._terminal import Stages
 from hybridkin.cli.main import main
 from hybridkin.workflow import Report
 
@@ -81,24 +81,18 @@ def test_a_terminal_shows_a_bar_and_the_time_left(clock):
     assert "drawing" in plain
 
 
-@pytest.fixture
-def report():
+def test_a_report_is_markdown_and_its_text_has_the_same_tables():
     report = Report("A table", {})
-    report.table(["tip error [mm]", "mean"], [["hybrid, auto", "1.50"], ["[/nominal]", "22.75"]])
-    return report
-
-
-def test_tables_are_ruled_on_a_terminal_and_colours_can_be_off(report, monkeypatch):
-    settings = {"FORCE_COLOR": "1", "NO_COLOR": "1", "TERM": "xterm", "COLUMNS": "80"}
-    for name, value in settings.items():
-        monkeypatch.setenv(name, value)
-    text = shown(report)
-    assert "───" in text
-    for cell in ("tip error [mm]", "hybrid, auto", "[/nominal]", "22.75"):
-        assert cell in text
-    assert "\x1b[" in text  # a bold header
-    assert not re.search(r"\x1b\[[0-9;]*3[0-7]m", text)
-    assert "| --- | --- |" in report.markdown()
+    report.text("**Bold** words.")
+    report.table(["tip error [mm]", "mean"], [["hybrid, auto", "1.50"], ["nominal", "22.75"]])
+    table = (
+        "| tip error [mm] |  mean |\n"
+        "| -------------- | ----- |\n"
+        "| hybrid, auto   |  1.50 |\n"
+        "| nominal        | 22.75 |"
+    )
+    assert report.markdown() == f"# A table\n\n**Bold** words.\n\n{table}\n"
+    assert report.plain() == f"A table\n\nBold words.\n\n{table}"
 
 
 def test_a_quiet_command_prints_its_result_only(tmp_path, capsys):

@@ -5,7 +5,12 @@ import pytest
 
 from hybridkin import datasets, robots
 from hybridkin.workflow.calibrated import Calibration, calibrated_parameters
-from hybridkin.workflow.compare import Mechanical, Rows
+from hybridkin.workflow.compare import Mechanical
+from hybridkin.workflow.log import checked
+
+
+def measured(q, x, motions):
+    return checked(datasets.Log(q, x, motions), None, base_is_free=True)
 
 
 def entries(robot, rows):
@@ -23,7 +28,7 @@ def test_a_tilt_that_other_sets_contradict_is_not_identified():
     """A tilted base, a rest bend and shifted zeros explain the tips of the trunk alike."""
     data = datasets.load_trunk()
     robot = robots.RobotDescription("r", robots.bionic_handling_assistant(), "auto", None)
-    rows = Rows(data.q, data.x, np.arange(len(data.q)) // 50)
+    rows = measured(data.q, data.x, np.arange(len(data.q)) // 50)
     geometry, shown, alone = entries(robot, rows)
     assert geometry.name == "radii + base"
     assert "radii + rest_bends + base" in [rival.name for rival in geometry.rivals]
@@ -40,6 +45,6 @@ def test_the_tool_of_a_real_robot_is_not_identified(data_home):
     """Two sets with nearly the same errors give 6.7 and -8.7 mm, each to a fraction of one."""
     data = datasets.load_ftdcr(data_home)
     robot = robots.read_description("examples/robots/ftdcr_v4.toml")
-    _, shown, alone = entries(robot, Rows(data.q, data.x, data.groups))
+    _, shown, alone = entries(robot, measured(data.q, data.x, data.groups))
     assert alone["tool"].identified
     assert not shown["tool"].identified

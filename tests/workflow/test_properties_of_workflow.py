@@ -69,10 +69,6 @@ ENTRIES = {
             **{"tol": 1e-3, "force": True},
         },
     ),
-    "compare_by_group": (
-        with_settings(workflow.compare_by_group),
-        {"log": LOG, "robot": DESCRIPTION, **SETTINGS},
-    ),
     "fit_log": (
         with_settings(workflow.fit_log),
         {"log": LOG, "robot": DESCRIPTION, "out": OUT, "force": True, **SETTINGS},
