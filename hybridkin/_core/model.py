@@ -47,6 +47,10 @@ class Portable:
         state.pop("_lock", None)
         return _portable(state)
 
+    def __copy__(self) -> Self:
+        """Return a deep copy: the state holds arrays in place of tensors."""
+        return copy.deepcopy(self)
+
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
 

@@ -279,12 +279,12 @@ def test_a_target_that_is_not_finite_returns_the_start_within_the_limits(bad, ki
 
 
 def test_a_model_may_be_out_of_its_domain():
-    class Guarded(torch.nn.Module):
+    class Guarded(ForwardModel):
         def forward(self, q):
             return CHAIN(q)
 
-        def in_domain(self, q):
-            return CHAIN(q)[:, 0] > 0.0
+        def domain_distance(self, q):
+            return torch.where(CHAIN(q)[..., 0] > 0.0, 0.0, 2.0).to(q)
 
     class Fitted:
         module_ = Guarded()
