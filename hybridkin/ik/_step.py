@@ -6,7 +6,6 @@ Equations (17) to (20) are those of the page "Theory" of the documentation.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -246,34 +245,23 @@ def _step_inside(
 
     The desired motion v is projected onto the half-spaces. If the bounds then move J dq out of
     them, a safe step is looked for, and the margins of the half-spaces that it does not reach are
-    widened up to it. Alternating projections look for a motion that meets margins and bounds, with
-    some excess, so that they end. A remaining violation is removed by taking a fraction of the way
-    from the safe step to this one.
+    widened up to it. Alternating projections look for a motion that meets margins and bounds. A
+    remaining violation is removed by taking a fraction of the way from the safe step to this one.
     """
     limits = settings.tip_limits
     close = 32.0 * torch.finfo(v.dtype).eps
     assert limits is not None
-
-    def along(dq: Tensor) -> Tensor:
-        return limits.along(apply_rows(J, dq))
-
     wanted = v + limits.way_in(margin - limits.along(v))
     step = limited_step(settings, J, wanted, z, *bounds)
-    out = (along(step.dq) - margin > close).any(-1, keepdim=True)
+    out = limits.along(apply_rows(J, step.dq)) - margin > close
     if out.any():
-        safe = _safe_step(settings, margin, J, along, *bounds)
-        margin = torch.where(out, torch.maximum(margin, along(safe)), margin)
-        for _ in range(IK_PROJECTIONS):
-            over = along(step.dq) - margin
-            out = (over > close).any(-1, keepdim=True)
-            if not out.any():
-                break
-            # A bit farther in, because a step in a box is right to rounding only.
-            way = limits.way_in(-over - 8.0 * close)
-            back = apply_rows(J, step.dq) + IK_EXCESS * way
-            wanted = torch.where(out, back, wanted)
-            step = limited_step(settings, J, wanted, z, *bounds)
-        share = _share(along(safe) - margin, along(step.dq) - margin)
+        safe = _safe_step(settings, margin, J, *bounds)
+        least = limits.along(apply_rows(J, safe))
+        reachable = torch.maximum(margin, least)
+        margin = torch.where(out.any(-1, keepdim=True), reachable, margin)
+        step, wanted = _projected(settings, margin, J, step, wanted, z, *bounds)
+        over = limits.along(apply_rows(J, step.dq)) - margin
+        share = _share(least - margin, over)
         dq = torch.clamp(safe + share * (step.dq - safe), *bounds)
         dq = torch.where(share < 1.0, dq, step.dq)
         held = (dq <= bounds[0]) | (dq >= bounds[1])
@@ -284,24 +272,60 @@ def _step_inside(
 
 
 def _safe_step(
-    settings: StepSettings,
-    margin: Tensor,
-    J: Tensor,
-    along: Callable[[Tensor], Tensor],
-    *bounds: Tensor,
+    settings: StepSettings, margin: Tensor, J: Tensor, *bounds: Tensor
 ) -> Tensor:
-    """Return steps (N, n) back into the half-spaces that lead farther out of none of them.
+    """Return steps (N, n) into the half-spaces, or as near to them as found.
 
-    They go the shortest way, as far as the bounds allow. Where the bounds turn it out of another
-    half-space, only a share of it is taken; else a start outside several could get worse.
+    They start at rest, or at the hardest braking, and lead farther out of no half-space than this
+    start. Where the way in turns out of another half-space, only a share of it is taken; else a
+    start outside several could get worse.
     """
     limits = settings.tip_limits
     assert limits is not None
-    rest = torch.clamp(torch.zeros_like(bounds[0]), *bounds)
-    back = limited_step(settings, J, limits.way_in(margin), None, *bounds).dq
-    allowed = torch.maximum(margin, along(rest))
-    share = _share(along(rest) - allowed, along(back) - allowed)
+    rest = torch.clamp(torch.zeros_like(J[:, 0]), *bounds)
+    motion = apply_rows(J, rest)
+    start = limits.along(motion)
+    unknown = torch.full_like(rest[:, 0], math.nan)
+    step = StepRows(rest, unknown, unknown, rest != 0.0)
+    back = _projected(settings, margin, J, step, motion, None, *bounds)[0].dq
+    end = limits.along(apply_rows(J, back))
+    allowed = torch.maximum(margin, start)
+    share = _share(start - allowed, end - allowed)
     return torch.clamp(rest + share * (back - rest), *bounds)
+
+
+def _projected(
+    settings: StepSettings,
+    margin: Tensor,
+    J: Tensor,
+    step: StepRows,
+    wanted: Tensor,
+    z: Tensor | None,
+    *bounds: Tensor,
+) -> tuple[StepRows, Tensor]:
+    """Return steps moved towards the margins, and the tip motions (N, m) they were solved for.
+
+    Alternating projections, with some excess so that they end. Rows within their margins keep
+    their step.
+    """
+    limits = settings.tip_limits
+    assert limits is not None
+    close = 32.0 * torch.finfo(margin.dtype).eps
+    for _ in range(IK_PROJECTIONS):
+        motion = apply_rows(J, step.dq)
+        over = limits.along(motion) - margin
+        out = (over > close).any(-1, keepdim=True)
+        if not out.any():
+            break
+        # A bit farther in, because a step in a box is right to rounding only.
+        way = limits.way_in(-over - 8.0 * close)
+        wanted = torch.where(out, motion + IK_EXCESS * way, wanted)
+        moved = limited_step(settings, J, wanted, z, *bounds)
+        step = moved._replace(
+            dq=torch.where(out, moved.dq, step.dq),
+            saturated=torch.where(out, moved.saturated, step.saturated),
+        )
+    return step, wanted
 
 
 def _share(least: Tensor, over: Tensor) -> Tensor:

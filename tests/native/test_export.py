@@ -21,7 +21,7 @@ from hybridkin import (
 )
 from hybridkin._core.plan import NoKernel
 from hybridkin.cli.main import main
-from hybridkin.ik.tasks import PointsTask, as_task
+from hybridkin.ik.tasks import PointsTask, PoseTask, as_task
 from hybridkin.native import export_c
 
 LOOP = Path(__file__).parents[2] / "examples" / "c" / "loop.c"
@@ -69,6 +69,23 @@ def agrees(folder, model, *more, **options):
     done = subprocess.run([built(folder, *more)], capture_output=True, text=True)
     assert done.returncode == 0, done.stdout
     return "0 failures" in done.stdout
+
+
+TASKS = {
+    "pose": (lambda: PoseTask(trunk(), radian=0.1), {}),
+    "points": (lambda: PointsTask(trunk(), [0.5, 1.0]), {}),
+    "half-spaces": (trunk, {"tip_limits": (np.eye(3), [0.03, 0.03, 0.29])}),
+}
+
+
+@needs_cc
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "dtype"), [*((name, "float64") for name in TASKS), ("pose", "float32")]
+)
+def test_the_code_of_other_tasks(tmp_path, name, dtype):
+    make, settings = TASKS[name]
+    assert agrees(tmp_path, limited(make(), **settings), dtype=dtype)
 
 
 @needs_cc

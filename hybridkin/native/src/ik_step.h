@@ -177,7 +177,6 @@ HK_INLINE void ik_limited_step_of(int m, int n, const ik_settings *ik, const rea
     real ends[2 * HK_MAX_N], z[HK_MAX_N], mu[IK_ROWS], g[IK_PAIRS];
     real low = R(0.0), high, damping_sq, *dq = s->dq;
     const int exact = m != 3 && !trust && !ik->quick;
-    ik_eigen e;
     const real *lower = s->lower, *upper = s->upper;
     for (int j = 0; j < n; j++) z[j] = slides ? s->posture[j] : R(0.0);
     if (ik->flags & IK_WEIGHTS) {
@@ -191,22 +190,23 @@ HK_INLINE void ik_limited_step_of(int m, int n, const ik_settings *ik, const rea
         J = own, lower = ends, upper = ends + n;
     }
     ik_products(m, n, J, NULL, g);
-    if (trust)
-        damping_sq = *trust * ik_trace(m, g);
-    else {
-        if (m == 3)
-            ik_singular_values(g, &low, &high);
-        else if (exact) {
-            ik_eigen_of(m, g, &e);
-            ik_eigen_ends(m, &e, &low, &high);
-        } else
-            ik_pivots(m, g, &low, &high);
-        damping_sq = ik_damping_sq(ik, low, high);
-    }
     if (exact) {
+        ik_eigen e = {0};
+        ik_eigen_of(m, g, &e);
+        ik_eigen_ends(m, &e, &low, &high);
+        damping_sq = ik_damping_sq(ik, low, high);
         ik_eigen_solve(m, &e, v, damping_sq, mu);
         if (slides) ik_eigen_projection(m, n, J, &e, z);
     } else {
+        if (trust)
+            damping_sq = *trust * ik_trace(m, g);
+        else {
+            if (m == 3)
+                ik_singular_values(g, &low, &high);
+            else
+                ik_pivots(m, g, &low, &high);
+            damping_sq = ik_damping_sq(ik, low, high);
+        }
         const ik_factors f = ik_factor(m, g, damping_sq);
         ik_solve(m, &f, v, mu);
         if (slides) ik_null_projection(m, n, J, g, z);
@@ -377,20 +377,37 @@ static inline real ik_share(const ik_settings *ik, const real *least, const real
     return share;
 }
 
-/* A step `safe` (n) on the shortest way back into the half-spaces, as far as the bounds allow and
-   it leads out of none; the margins of those that it does not reach are widened up to it. */
+/* Move a step towards the margins by alternating projections, with some excess so that they end;
+   `wanted` (m) is the motion that it was solved for. Returns whether it leaves them yet, `over`. */
+static HK_NOINLINE int ik_project(const ik_settings *ik, const real *J, const real *margin,
+                                  int slides, real *wanted, real *over, ik_step_t *s) {
+    int out = ik_leaves(ik, J, s->dq, margin, over);
+    for (int round = 0; out && round < IK_PROJECTIONS; round++) {
+        real moved[IK_ROWS];
+        /* A bit farther in, because a step in a box is right to rounding only. */
+        for (int i = 0; i < ik->n_spaces; i++) over[i] = -over[i] - R(256.0) * HK_EPS;
+        ik_way_in(ik, over, wanted);
+        IK_OF(ik->m, ik_rows_of, ik->n, J, s->dq, moved);
+        for (int r = 0; r < ik->m; r++) wanted[r] = moved[r] + IK_EXCESS * wanted[r];
+        ik_limited_step(ik, J, wanted, slides, NULL, s);
+        out = ik_leaves(ik, J, s->dq, margin, over);
+    }
+    return out;
+}
+
+/* A step `safe` (n) into the half-spaces, or as near to them as found; the margins of those that it
+   does not reach are widened up to it. It starts at rest, or at the hardest braking, and leads
+   farther out of none than this start. */
 static inline void ik_safe_step(const ik_settings *ik, const real *J, const ik_step_t *s,
                                 real *margin, real *safe) {
-    real rest[HK_MAX_N], least[HK_MAX_N], over[HK_MAX_N], way[IK_ROWS];
+    real rest[HK_MAX_N] = {R(0.0)}, least[HK_MAX_N], over[HK_MAX_N], wanted[IK_ROWS];
     ik_step_t back;
     for (int j = 0; j < ik->n; j++) {
         back.lower[j] = s->lower[j], back.upper[j] = s->upper[j];
-        rest[j] = ik_clip(R(0.0), s->lower[j], s->upper[j]);
+        back.dq[j] = rest[j] = ik_clip(R(0.0), s->lower[j], s->upper[j]);
     }
-    ik_way_in(ik, margin, way);
-    ik_limited_step(ik, J, way, 0, NULL, &back);
     ik_leaves(ik, J, rest, margin, least);
-    ik_leaves(ik, J, back.dq, margin, over);
+    ik_project(ik, J, margin, 0, wanted, over, &back);
     for (int i = 0; i < ik->n_spaces; i++) /* no farther out than at rest */
         if (least[i] > R(0.0)) over[i] -= least[i], least[i] = R(0.0);
     const real share = ik_share(ik, least, over);
@@ -411,19 +428,9 @@ static HK_NOINLINE void ik_step_inside(const ik_settings *ik, const real *J, con
     ik_allowed(ik, margin, v, wanted);
     ik_limited_step(ik, J, wanted, slides, NULL, s);
     if (ik_leaves(ik, J, s->dq, margin, over)) {
-        real moved[IK_ROWS], least[HK_MAX_N], safe[HK_MAX_N] = {R(0.0)};
+        real least[HK_MAX_N], safe[HK_MAX_N] = {R(0.0)};
         ik_safe_step(ik, J, s, margin, safe);
-        int out = ik_leaves(ik, J, s->dq, margin, over);
-        for (int round = 0; out && round < IK_PROJECTIONS; round++) {
-            /* A bit farther in, because a step in a box is right to rounding only. */
-            for (int i = 0; i < ik->n_spaces; i++) over[i] = -over[i] - R(256.0) * HK_EPS;
-            ik_way_in(ik, over, wanted);
-            IK_OF(m, ik_rows_of, n, J, s->dq, moved);
-            for (int r = 0; r < m; r++) wanted[r] = moved[r] + IK_EXCESS * wanted[r];
-            ik_limited_step(ik, J, wanted, slides, NULL, s);
-            out = ik_leaves(ik, J, s->dq, margin, over);
-        }
-        if (out) {
+        if (ik_project(ik, J, margin, slides, wanted, over, s)) {
             ik_leaves(ik, J, safe, margin, least);
             const real share = ik_share(ik, least, over);
             for (int j = 0; j < n; j++) {
@@ -534,7 +541,7 @@ static void ik_arrive(const ik_settings *ik, const real *q, const real *x, const
     const int n = ik->n, m = ik->m;
     const real slip =
         ik_norm(m * n, J) * (IK_SLIP * ik_norm(n, s->dq) + R(32.0) * HK_EPS * ik_norm(n, q));
-    real promised[IK_ROWS], left[IK_ROWS];
+    real promised[IK_ROWS] = {R(0.0)}, left[IK_ROWS];
     ik_end end = {.J = ik_slot(ik, IK_END)}, pulled = {.J = ik_slot(ik, IK_END + 1)};
     IK_OF(m, ik_rows_of, n, J, s->dq, promised);
     for (int j = 0; j < n; j++) end.dq[j] = s->dq[j];
