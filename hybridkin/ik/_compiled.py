@@ -212,8 +212,10 @@ class Core:
         else:
             tolerances = np.array([tol])
             parts = 0
-        numbers = [ctypes.c_int32(number) for number in (mode, max_iter, parts)]
-        numbers.append(ctypes.c_void_p(tolerances.ctypes.data))
+        numbers = [
+            *(ctypes.c_int32(number) for number in (mode, max_iter, parts)),
+            ctypes.c_void_p(tolerances.ctypes.data),
+        ]
         self._run(
             "hk_ik_find", n_rows, numbers, [_plain(target), best, J, e, outcome, n_iter]
         )
@@ -283,7 +285,7 @@ class Follower:
         places = places_of(core.n, core.m, core.width)
         if state is None:
             state = np.zeros(places["J"].stop)
-        self.state = state
+        self.state: NDArray = state
         self.task = core.settings.task
         self._dt = state[IK_PERIOD] = core.settings.dt
         state[IK_MEMORY] = memory or 0.0
