@@ -70,7 +70,8 @@ ELSEWHERE = {
     *("check", "difference", "distances", "evaluate", "frozen", "present", "reached"),
     *("longest", "misses"),  # of a robot: bounds of its reach
     *("promised_errors", "plane_in_words"),  # of a file of a fit, in tests of the workflow
-    *("predict_and_jacobian", "score", "set_params", "follow", "export_c", "export_fmu", "export_mex"),
+    *("predict_and_jacobian", "score", "set_params", "follow"),
+    *("export_c", "export_fmu", "export_mex"),
 }
 
 
