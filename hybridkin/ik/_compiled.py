@@ -284,8 +284,8 @@ class Follower:
         self._least = mode
         places = places_of(core.n, core.m, core.width)
         if state is None:
-            state = np.zeros(places["J"].stop)
-        self.state: NDArray = state
+            state = np.zeros(int(places["J"].stop))
+        self.state = state
         self.task = core.settings.task
         self._dt = state[IK_PERIOD] = core.settings.dt
         state[IK_MEMORY] = memory or 0.0
