@@ -183,7 +183,7 @@ class ForwardModel(PortableModule):
 
     @property
     def has_pose(self) -> bool:
-        """Whether the model has poses of the tip, as a `PoseModel`."""
+        """Whether the model has poses of the tip, as a chain has."""
         return False
 
     @property
