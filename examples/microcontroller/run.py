@@ -192,7 +192,9 @@ def missing():
 
 if __name__ == "__main__":
     if missing():
-        raise SystemExit(f"not installed: {', '.join(missing())}; see microcontroller.md")
+        raise SystemExit(
+            f"not installed: {', '.join(missing())}; see microcontroller.md"
+        )
     print("| model | core | difference | flash [kB] | RAM [B] | stack [kB] |")
     print("| --- | --- | --- | --- | --- | --- |")
     for name, model in models().items():
