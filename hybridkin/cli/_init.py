@@ -149,27 +149,22 @@ def _proposed(answers: _Answers, delimiter: str | None) -> _Answers:
     if answers["log"] is None:
         return {"q": [f"q{i + 1}" for i in range(n)], "x": ["x", "y", "z"]}
     header = hybridkin.datasets.log_columns(answers["log"], delimiter)
-    tips = [
-        three
-        for three in zip(header, header[1:], header[2:], strict=False)
-        if _is_tip(three)
-    ]
-    found: _Answers = (
-        {"x": max(tips, key=lambda three: "tip" in three[0].lower())} if tips else {}
-    )
+    proposed: _Answers = {}
+    tips = [*filter(_is_tip, zip(header, header[1:], header[2:], strict=False))]
+    if tips:
+        proposed["x"] = max(tips, key=lambda three: "tip" in three[0].lower())
     families: dict[str, list[str]] = {}  # names that differ in numbers only
     for name in header:
-        if name not in found.get("x", ()) and re.search(r"\d", name):
+        if name not in proposed.get("x", ()) and re.search(r"\d", name):
             families.setdefault(re.sub(r"\d+", "", name), []).append(name)
-    every = [*itertools.chain(*families.values())]
-    fitting = [family for family in (*families.values(), every) if len(family) == n]
-    found |= {"q": fitting[0]} if fitting else {}
+    for family in (*families.values(), [*itertools.chain(*families.values())]):
+        if len(family) == n:
+            proposed.setdefault("q", family)
     for key, words in _WORDS.items():
-        named = [
-            name for name in header if re.match(rf"({words})(?![a-z\d])", name.lower())
-        ]
-        found |= {key: named[0]} if named else {}
-    return found
+        for name in header:
+            if re.match(rf"({words})(?![a-z\d])", name.lower()):
+                proposed.setdefault(key, name)
+    return proposed
 
 
 def _is_tip(three: Sequence[str]) -> bool:
