@@ -290,7 +290,7 @@ def test_a_robot_without_segments_from_the_log_to_the_commands(log, tmp_path):
     assert loaded.hybrid.in_domain(measured.q).mean() > 0.9
     assert not loaded.hybrid.in_domain(measured.q + 300).any()
     text = workflow.describe(loaded).plain()
-    assert re.search("mechanical model: +LinearModel", text)
+    assert re.search("mechanical model: +AffineModule", text)
     fitted_for = text[text.index("Training range") : text.index("Logs:")]
     assert re.search(r"q_min = 2\d\d(\.\d)?(, 2\d\d(\.\d)?){5}\.\n", fitted_for)
     x = loaded.predict(measured.q[:1])[0]
