@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from hybridkin.chains import robots
     from hybridkin.chains.constant_curvature import ConstantCurvatureChain
     from hybridkin.chains.elastic_tendons import ElasticTendonChain
+    from hybridkin.chains.force_tendons import ForceTendonChain
     from hybridkin.chains.play import PlayOperator, PlayState
     from hybridkin.chains.rigid import RigidChain
     from hybridkin.hybrid.choose_rows import choose_rows
@@ -32,6 +33,7 @@ __all__ = [
     "ELMRegressor",
     "ELMRegressorCV",
     "ElasticTendonChain",
+    "ForceTendonChain",
     "ForwardModel",
     "HybridForwardModel",
     "IKSolution",
@@ -68,6 +70,7 @@ _NAMES_OF = {
     "calibration.play_fit": ("PlayFit", "fit_play"),
     "chains.constant_curvature": ("ConstantCurvatureChain",),
     "chains.elastic_tendons": ("ElasticTendonChain",),
+    "chains.force_tendons": ("ForceTendonChain",),
     "chains.play": ("PlayOperator", "PlayState"),
     "chains.rigid": ("RigidChain",),
     "hybrid.choose_rows": ("choose_rows",),

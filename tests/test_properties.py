@@ -30,6 +30,7 @@ from saved_models import tendon_chain, trunk
 from hybridkin import (
     ConstantCurvatureChain,
     ElasticTendonChain,
+    ForceTendonChain,
     PlayOperator,
     PlayState,
     RigidChain,
@@ -119,6 +120,13 @@ ENTRIES = {
         GEOMETRY
         | {"bending_stiffness": np.array([2e-7, 3e-7]), "axial_stiffness": np.array([3.0, 4.0])}
         | {"tendon_zeros": 1e-4 * np.arange(7)},
+    ),
+    "ForceTendonChain": (
+        lambda **k: made(ForceTendonChain, **k),
+        GEOMETRY
+        | {"bending_stiffness": np.array([0.02, 0.01]), "axial_stiffness": np.array([9.0, 8.0])}
+        | {"weight": np.array([1.0, 2.0]), "taper": np.array([0.1, 0.5]), "arcs": 2}
+        | {"gravity": np.array([0.0, 0.0, 1.0])},
     ),
     "RigidChain": (
         lambda **k: made(RigidChain, **k),

@@ -25,9 +25,11 @@ _FACTORS = {
     "gains": 5.0,
     "bending_stiffness": 1e4,
     "axial_stiffness": 1e4,
+    "weight": 1e4,
 }
 PRIOR = 0.5
 _WIDEST = 1e6  # a prior of a million natural units has no effect, and is finite
+_LARGEST_TAPER = 0.95
 _SHORTEST = -0.1  # of the robot's length: a marker may sit a little before the end
 
 
@@ -239,6 +241,8 @@ def _scale(chain: Chain, geometry: Mapping[str, Tensor], entry: str) -> _Scale:
         return _Scale(1.0, "rad", -math.pi, math.pi)
     if entry == "angles":
         return _Scale(1.0, "rad")
+    if entry == "taper":
+        return _Scale(1.0, "-", 0.0, _LARGEST_TAPER)
     if entry == "offsets":
         return _Scale(reach, "m", low=_SHORTEST * reach)
     if entry == "joint_zeros" and isinstance(chain, RigidChain):

@@ -17,7 +17,7 @@ from functools import partial
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from hybridkin._core.stumpff import stumpff
 
@@ -82,6 +82,120 @@ def tip(segments: Segments, beside: Vector) -> Tensor:
     `beside` is its position (3, ...) in the frame after the last offset [m].
     """
     return torch.stack([*_tips(segments.each(), beside)[0]])
+
+
+class WorkOfGravity:
+    """Work of gravity on the weights of arcs, from the base frame to their centres, by the arcs.
+
+    The weights (A,) act half way along the arcs; `down` (3,) is a direction in the base frame. In
+    the end frame of an arc, the later weights have the moment M, the sum of weight times position.
+    In the start frame it is R M + W t, with the weight W after the arc and its end point t: the
+    formulas of a tail v, with W l instead of l.
+    """
+
+    def __init__(self, segments: Segments, weights: Tensor, down: Tensor) -> None:
+        self.segments = segments
+        self._weights = weights[:, None]
+        after = weights.flip(0).cumsum(0).flip(0) - weights
+        self._after = after[:, None]
+        self._each = segments.each()
+        self._down = down
+        zero = torch.zeros_like(segments.length[0])
+        moment: Vector = [zero, zero, zero]
+        moments = []
+        half = self._half(segments)
+        centres = torch.stack([half.g * half.x, half.g * half.y, half.f]) * half.length
+        for k in range(len(self._each) - 1, -1, -1):
+            x, y, z = moment
+            at_end = (x, y, z + after[k] * self._each[k].offset)
+            moments.append(torch.stack([*at_end]))
+            length = after[k] * self._each[k].length
+            moved = _in_start_frame(at_end, self._each[k], length)
+            moment = [a + b for a, b in zip(moved, centres[:, k], strict=True)]
+        self._moments = torch.stack(moments[::-1], dim=1)  # (3, A, N)
+        self.value = torch.tensordot(down, torch.stack([*moment]), 1)
+
+    def _half(self, segments: Segments) -> Segments:
+        """Return the first halves of the arcs, with lengths times the weights of the arcs."""
+        x = 0.5 * segments.x
+        y = 0.5 * segments.y
+        length = 0.5 * segments.length * self._weights
+        return Segments(length, x, y, *stumpff(fma(x * x, y, y)), segments.offset)
+
+    def _local_columns(self, segments: Segments) -> Tensor:
+        """Return derivatives (3, 3, A, N) of moments in start frames, by l, b_x, b_y, as vectors.
+
+        The moments in the end frames stay the same.
+        """
+        heavy = segments._replace(length=self._after * segments.length)
+        later = torch.stack(_columns(self._moments.unbind(), heavy)).unflatten(
+            0, (3, 3)
+        )
+        half = self._half(segments)
+        zero = torch.zeros_like(half.x)
+        centre = torch.stack(_columns((zero, zero, zero), half)).unflatten(0, (3, 3))
+        by_length = self._after * later[0] + 0.5 * self._weights * centre[0]
+        by_bending = later[1:] + 0.5 * centre[1:]
+        return torch.cat([by_length[None], by_bending])
+
+    def _downs(self) -> Tensor:
+        """Return the direction of gravity in the start frames of the arcs, (3, A, N)."""
+        zero = torch.zeros_like(self._each[0].length)
+        down: Vector = [zero + part for part in self._down]
+        downs = []
+        for segment in self._each:
+            downs.append(torch.stack([*down]))
+            inverse = segment._replace(x=-segment.x, y=-segment.y)
+            down = _in_start_frame(down, inverse, 0.0)
+        return torch.stack(downs, dim=1)
+
+    def gradient(self) -> Tensor:
+        """Return the derivative (3 A, N) by the arcs: lengths, then x-, then y-bendings."""
+        columns = self._local_columns(self.segments)
+        return (columns * self._downs()).sum(1).flatten(0, 1)
+
+    def hessian(self) -> Tensor:
+        """Return the second derivative (3 A, 3 A, N) by the arcs."""
+        downs = self._downs()
+        columns = self._local_columns(self.segments).transpose(
+            0, 1
+        )  # (3 vector, 3, A, N)
+        n_arcs = len(self._each)
+        turned = columns[:, :, :0]  # of later arcs, in the end frame of the present one
+        rows = []
+        for k in range(n_arcs - 1, -1, -1):
+            segment = self._each[k]
+            turning = _columns(
+                turned.unbind(), segment._replace(length=0.0 * segment.length)
+            )
+            by_bending = torch.stack(turning[3:]).unflatten(0, (2, 3))
+            by_later = torch.einsum("jciln,cn->jiln", by_bending, downs[:, k])
+            rows.append(nn.functional.pad(by_later, (0, 0, k + 1, 0, 0, 0, 1, 0)))
+            moved = torch.stack([*_in_start_frame(turned.unbind(), segment, 0.0)])
+            turned = torch.cat([columns[:, :, k : k + 1], moved], dim=2)
+        upper = torch.stack(rows[::-1], dim=1).transpose(1, 2)  # (3, 3, A, A, N)
+        upper = upper.transpose(1, 2).flatten(2, 3).flatten(0, 1)
+        within = self._within(downs).permute(0, 1, 3, 2).diag_embed()  # (3, 3, N, A, A)
+        within = within.permute(0, 3, 1, 4, 2).flatten(2, 3).flatten(0, 1)
+        return upper + upper.transpose(0, 1) + within
+
+    def _within(self, downs: Tensor) -> Tensor:
+        """Return the second derivatives (3, 3, A, N) by the arcs, each with itself."""
+        offset = self.segments.offset
+
+        def slope(arcs: Tensor) -> Tensor:
+            segments = segments_of(arcs.flatten(0, 1), offset)
+            return (self._local_columns(segments) * downs).sum(1)
+
+        arcs = torch.stack([self.segments.length, self.segments.x, self.segments.y])
+        # Backward: in forward mode torch decomposes addcmul in Python, which is slow.
+        _, backward = torch.func.vjp(slope, arcs)
+        seconds = []
+        for kind in range(3):
+            chosen = torch.zeros_like(arcs)
+            chosen[kind] = 1.0
+            seconds.append(backward(chosen)[0])
+        return torch.stack(seconds)
 
 
 def tip_and_columns(

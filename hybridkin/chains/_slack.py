@@ -136,8 +136,8 @@ def _pivoted(maps_of: Callable[[Tensor], Tensor], full: Tensor, x: Tensor) -> Te
     return codes
 
 
-class FindTaut(torch.autograd.Function):
-    """The set of taut tendons, for every torch transform; it is constant between kinks."""
+class WithoutDerivative(torch.autograd.Function):
+    """The result of a search by rows, for every torch transform; its derivative is zero."""
 
     @staticmethod
     def forward(find: Callable[..., Tensor], rows: Tensor, *parts: Tensor) -> Tensor:
@@ -158,10 +158,10 @@ class FindTaut(torch.autograd.Function):
     @staticmethod
     def vmap(info: Any, in_dims: tuple[Any, ...], *args: Any) -> tuple[Tensor, int]:
         find, *tensors = args
-        codes = []
+        results = []
         for k in range(info.batch_size):
             parts = []
             for tensor, dim in zip(tensors, in_dims[1:], strict=True):
                 parts.append(tensor if dim is None else tensor.select(dim, k))
-            codes.append(FindTaut.apply(find, *parts))
-        return torch.stack(codes), 0
+            results.append(WithoutDerivative.apply(find, *parts))
+        return torch.stack(results), 0

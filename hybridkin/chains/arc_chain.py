@@ -127,6 +127,12 @@ class ArcChain(MarkedChain):
         return self.offsets.abs().sum() + beside.abs().sum()
 
     @property
+    def arc_offsets(self) -> Tensor:
+        """Rigid length after each arc (A,) [m]; only the last arc of a segment has one."""
+        none = self.offsets.new_zeros(self.n_segments, self.arcs_per_segment - 1)
+        return torch.cat([none, self.offsets[:, None]], dim=1).flatten()
+
+    @property
     def absolute(self) -> Tensor:
         """Which actuators (n,) have absolute lengths: those of extensible segments, bool."""
         absolute = np.repeat(self.extensible, self.actuators_per_segment)
@@ -302,14 +308,14 @@ class ArcChain(MarkedChain):
         Tensor of shape (..., S + 1, 4, 4)
             Homogeneous transforms into the measuring frame; the last one is the robot's end.
         """
-        return self._poses(*self.arcs(q), self.offsets, q)
+        return self._poses(*self.arcs(q), self.arc_offsets, q)
 
     def pose(self, q: Tensor) -> Tensor:
         """Return the tip's pose in the measuring frame, shape (..., 4, 4)."""
         arcs = self._leading(self.up_to_tip(self._arcs(q)), q)
-        offsets = self.offsets_to_markers(self.offsets)[:, -1]
+        offsets = self.offsets_to_markers(self.arc_offsets)[:, -1]
         beside = identity(4, q)
-        beside[:3, 3] = q.new_tensor(self.markers[-1][1:])
+        beside[:3, 3] = self._beside(q)[:, -1, 0]
         return self._poses(*arcs, offsets, q)[..., -1, :, :] @ beside
 
     def pose_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
@@ -319,8 +325,8 @@ class ArcChain(MarkedChain):
     def frames_and_moves(self, rows: Tensor) -> Frames:
         """Return the frames after all segments at rows q (N, n), with derivatives of the end."""
         arcs, slope = self._arcs_and_slope(rows)
-        S = self.n_segments
-        segments = segments_of(arcs, self.offsets.to(arcs)[:, None])
+        S = self.n_segments * self.arcs_per_segment
+        segments = segments_of(arcs, self.arc_offsets.to(arcs)[:, None])
         at_end = arcs.new_zeros(3, 1)
         _, columns = tip_and_columns(segments, at_end, angular=True, rigid=True)
         moves, spins, tangents = columns.split([3 * S, 3 * S, S], dim=1)
@@ -484,7 +490,7 @@ class ArcChain(MarkedChain):
 
     def _segments(self, arcs: Tensor) -> Segments:
         """Return the segments (m, K, N) of arcs (3 m, K, N) up to the markers."""
-        offsets = self.offsets_to_markers(self.offsets).to(arcs)
+        offsets = self.offsets_to_markers(self.arc_offsets).to(arcs)
         return segments_of(arcs, offsets[..., None])
 
     def _beside(self, like: Tensor) -> Tensor:

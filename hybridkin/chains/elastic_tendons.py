@@ -363,11 +363,15 @@ class ElasticTendonChain(ArcChain):
         if self.n_actuators <= _TABLE:
             table = self._all_responses(rows)
             stretch = table.stretch.detach()
-            codes = _slack.FindTaut.apply(_slack.find_in_table, rows.detach(), stretch)
+            codes = _slack.WithoutDerivative.apply(
+                _slack.find_in_table, rows.detach(), stretch
+            )
             return codes, codes, table
         elasticity = self._elasticity().to(rows)
         fixed = (part.detach() for part in elasticity)
-        codes = _slack.FindTaut.apply(_slack.find_by_solving, rows.detach(), *fixed)
+        codes = _slack.WithoutDerivative.apply(
+            _slack.find_by_solving, rows.detach(), *fixed
+        )
         taut = _slack.as_mask(codes, self.n_actuators)
         places = torch.arange(len(rows), device=rows.device)
         return codes, places, _slack.responses_of(taut, elasticity)

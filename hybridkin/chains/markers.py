@@ -31,6 +31,7 @@ class MarkedChain(Chain):
     """
 
     n_segments: int
+    arcs_per_segment: int = 1
     markers: tuple[Marker, ...]
     stage: str | None = None  # "rotation" if the first segment is a rotation stage
 
@@ -142,7 +143,7 @@ class MarkedChain(Chain):
         if self.markers_at_end:
             return arcs[:, None]
         reached = self._reached(arcs)
-        by_kind = arcs.unflatten(0, (3, self.n_segments)).unbind()
+        by_kind = arcs.unflatten(0, (3, -1)).unbind()
         return torch.cat([_times(reached, part) for part in by_kind])
 
     def offsets_to_markers(self, offsets: Tensor) -> Tensor:
@@ -171,7 +172,7 @@ class MarkedChain(Chain):
 
     def _padded(self, parts: Tensor) -> Tensor:
         """Return derivatives (..., S, K, N): zero by segments after all markers."""
-        n_after = self.n_segments - parts.shape[-3]
+        n_after = self.n_segments * self.arcs_per_segment - parts.shape[-3]
         return nn.functional.pad(parts, (0, 0, 0, 0, 0, n_after))
 
     @property
@@ -181,7 +182,7 @@ class MarkedChain(Chain):
 
     def _reached(self, like: Tensor) -> Tensor:
         """Return the part (m, K) of the arc of every segment that lies before each marker."""
-        places = [at for at, *_ in self.markers]
+        places = [at * self.arcs_per_segment for at, *_ in self.markers]
         segments = [*range(math.ceil(max(places)))]
         # Not new_tensor: before torch 2.5 it fails in functional transforms.
         options = {"dtype": like.dtype, "device": like.device}

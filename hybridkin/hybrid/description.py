@@ -23,7 +23,12 @@ from hybridkin._core.stored import (
 )
 
 # Their chains are among the kinds that a description may hold.
-from hybridkin.chains import constant_curvature, elastic_tendons, rigid  # noqa: F401
+from hybridkin.chains import (  # noqa: F401
+    constant_curvature,
+    elastic_tendons,
+    force_tendons,
+    rigid,
+)
 from hybridkin.chains.play import PlayOperator
 from hybridkin.hybrid._adapt import Change
 from hybridkin.hybrid._drift import Drift

@@ -1,0 +1,444 @@
+"""A heavy, tapered elastic body pulled by tendons of given forces, as a torch module q -> x."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from hybridkin._core.arrays import LARGEST, Numbers, Transform, identity, whole
+from hybridkin._core.blocks import check_vectors
+from hybridkin._core.stored import Layout, Restore, Stored
+from hybridkin.chains._arcs import WorkOfGravity, segments_of
+from hybridkin.chains._checks import filled, float_dtype, numeric
+from hybridkin.chains._slack import WithoutDerivative, applied
+from hybridkin.chains.arc_chain import STRUCTURE, ArcChain
+from hybridkin.chains.chain import Chain
+from hybridkin.chains.markers import Marker
+
+__all__ = ["ForceTendonChain"]
+
+_MOST_STEPS = 100
+_MOST_ARCS = 50  # of a segment
+_CONVERGED = 1e-9  # last Newton step, in units of 1 J^(1/2); two more follow
+_ROUNDING = 1e-12
+
+
+class _Statics(NamedTuple):
+    """The energy of a shape: arcs (3 A, N), all lengths, then x- and y-bendings.
+
+    ``1/2 (a - rest)' K (a - rest) + a' B' f`` minus the work of gravity.
+    """
+
+    stiffness: Tensor  # (3 A,), diagonal of K
+    rest: Tensor  # (3 A,), without forces and weight
+    readings: Tensor  # B (n, 3 A), change of the tendon paths per change of shape
+    weights: Tensor  # (A,) [N]
+    offsets: Tensor  # (A,), rigid length after each arc [m]
+    down: Tensor  # (3,), direction of gravity in the frame of the base
+
+    def elastic_energy(self, arcs: Tensor, forces: Tensor) -> Tensor:
+        """Return the energy (N,) [J] of the body and the tendons with forces (N, n)."""
+        change = arcs - self.rest[:, None]
+        elastic = 0.5 * (self.stiffness[:, None] * change.square()).sum(0)
+        return elastic + (forces.mT * (self.readings @ change)).sum(0)
+
+    def gravity(self, arcs: Tensor) -> WorkOfGravity:
+        """Return the work of gravity and its derivatives."""
+        segments = segments_of(arcs, self.offsets[:, None])
+        return WorkOfGravity(segments, self.weights, self.down)
+
+    def energy(self, arcs: Tensor, forces: Tensor) -> Tensor:
+        """Return the energy (N,) [J] with tendon forces (N, n)."""
+        change = arcs - self.rest[:, None]
+        elastic = 0.5 * (self.stiffness[:, None] * change.square()).sum(0)
+        tendons = (forces.mT * (self.readings @ change)).sum(0)
+        return elastic + tendons - self.gravity(arcs).value
+
+    def imbalance(self, arcs: Tensor, forces: Tensor) -> Tensor:
+        """Return the derivative (3 A, N) of the energy by the arcs: zero at rest."""
+        elastic = self.stiffness[:, None] * (arcs - self.rest[:, None])
+        return elastic + self.readings.mT @ forces.mT - self.gravity(arcs).gradient()
+
+    def hessian(self, arcs: Tensor) -> Tensor:
+        """Return the second derivative (N, 3 A, 3 A) of the energy by the arcs."""
+        by_gravity = self.gravity(arcs).hessian().permute(2, 0, 1)
+        return torch.diag(self.stiffness) - by_gravity
+
+    def shape_of_least_energy(self, forces: Tensor) -> tuple[Tensor, Tensor]:
+        """Return arcs (3 A, N) at a minimum of the energy, and the inverse Hessian (N, 3 A, 3 A).
+
+        Newton steps from the shape without forces and weight. A step that does not lower the energy
+        is repeated with more damping. Each coordinate is scaled by the root of its stiffness.
+        """
+        unit = self.stiffness.rsqrt()
+        eye = identity(len(unit), forces)
+        arcs = self.rest[:, None].expand(-1, len(forces)).clone()
+        energy = self.energy(arcs, forces)
+        damping = torch.zeros_like(energy)
+        for _ in range(_MOST_STEPS):
+            imbalance = (unit[:, None] * self.imbalance(arcs, forces)).mT
+            hessian = unit[:, None] * self.hessian(arcs) * unit
+            damped = hessian + damping[:, None, None] * eye
+            factor, failed = torch.linalg.cholesky_ex(damped)
+            factor = torch.where(failed[:, None, None] > 0, eye, factor)
+            step = -torch.cholesky_solve(imbalance[..., None], factor)[..., 0]
+            moved = arcs + unit[:, None] * step.mT
+            moved_energy = self.energy(moved, forces)
+            size = step.abs().amax(1)
+            lower = moved_energy <= energy + _ROUNDING * energy.abs()
+            accepted = (failed == 0) & (lower | (size < 1e3 * _CONVERGED))
+            arcs = torch.where(accepted, moved, arcs)
+            energy = torch.where(accepted, moved_energy, energy)
+            more = (10.0 * damping).clamp(min=0.1)
+            less = torch.where(damping > 1e-3, 0.1 * damping, 0.0)
+            damping = torch.where(accepted, less, more)
+            if (accepted & (size < _CONVERGED)).all():
+                break
+        hessian = unit[:, None] * self.hessian(arcs) * unit
+        inverse = torch.linalg.solve_ex(hessian, eye.expand_as(hessian)).result
+        return arcs, unit[:, None] * inverse * unit
+
+
+class ForceTendonChain(ArcChain):
+    """Tip position of a heavy, tapered elastic body whose tendons are pulled with given forces.
+
+    q holds the tendon forces [N]. Each segment is divided into arcs of constant curvature and equal
+    rest length. The shape a, the lengths and bending vectors of all arcs, has least energy
+
+        1/2 (a - a0)' K (a - a0) + (gains * q)' B a - sum_j W_j g . p_j(a)
+
+    with the straight or bent rest shape a0, the path lengths B of the tendons, and the weight W_j
+    of every arc at its centre p_j. Tendons pull only: a negative force counts as zero. Without
+    weight the shape is linear in q.
+
+    The outer radius of a segment falls linearly to (1 - taper) times that at its start. Along with
+    it the bending stiffness falls by the fourth power, axial stiffness and weight by the second.
+    The radius of the tendon circle is constant along a segment.
+
+    Parameters
+    ----------
+    radii : array-like of shape (S,)
+        Radius of the tendon circle of each segment, base to tip [m].
+    lengths : array-like of shape (S,)
+        Length of each segment without forces and weight [m].
+    bending_stiffness : float or array-like of shape (S,)
+        Bending stiffness at the start of each segment, Young's modulus times the second moment of
+        area [N m^2].
+    axial_stiffness : float or array-like of shape (S,)
+        Axial stiffness at the start of each segment, Young's modulus times the area [N].
+    n_actuators : int or sequence of S ints, default=3
+        Tendons that end at each segment.
+    angles : array-like, optional
+        Tendon angles about the backbone, counter-clockwise from the base x-axis [rad], as in
+        `ElasticTendonChain`. Default: evenly spaced from 0.
+    routing : {"base", "segment"}, default="base"
+        "base": tendons of a segment also run through all segments nearer the base.
+    weight : float or array-like of shape (S,), default=0.0
+        Weight per length at the start of each segment [N/m].
+    taper : float or array-like of shape (S,), default=0.0
+        Relative loss of outer radius from the start to the end of each segment, below 1.
+    gravity : array-like of shape (3,), default=(0, 0, -1)
+        Direction of gravity in the measuring frame; only its direction counts.
+    arcs : int, default=6
+        Arcs of each segment.
+    gains : float or array-like of shape (S,) or (n,), default=1.0
+        Newtons per unit of q.
+    rest_bends : float or array-like of shape (S, 2), default=0.0
+        Bending vector of each segment without forces and weight [rad].
+    offsets : float or array-like of shape (S,), default=0.0
+        Rigid, weightless length after each segment along its tangent [m]; the last one is the tool.
+    base : array-like of shape (4, 4) or pytorch_kinematics Transform3d, optional
+        Pose of the robot's base in the measuring frame. Default: identity.
+    dtype : torch.dtype, default=torch.float64
+        Precision of the stored geometry. Shapes are solved in float64; results have the dtype of q.
+
+    Notes
+    -----
+    Newton's method on the energy of every row; derivatives follow from the implicit function
+    theorem. Heavy bodies can have several stable shapes; the one returned is reached from the rest
+    shape. The force of a tendon is the same along its path: no friction.
+
+    `calibrate` can also fit "marker_offsets", the offsets of the markers in the frames of their
+    places [m]. Forces identify the tendon radii only together with weight and stiffness: give the
+    radii as measured. There is no compiled kernel.
+
+    References
+    ----------
+    Rucker & Webster, IEEE Trans. Robotics 27 (2011), statics of tendon-driven robots; Renda et al.,
+    IEEE Trans. Robotics 34 (2018), piecewise constant strain.
+
+    Examples
+    --------
+    >>> import torch
+    >>> from hybridkin import ForceTendonChain
+    >>> chain = ForceTendonChain([0.01], [0.3], 0.02, 200.0, weight=1.0, taper=0.5)
+    >>> chain(torch.zeros(3, dtype=torch.float64)).shape
+    torch.Size([3])
+    """
+
+    _entries = (
+        "radii",
+        "angles",
+        "bending_stiffness",
+        "axial_stiffness",
+        "weight",
+        "taper",
+        "rest_bends",
+        "gains",
+        "lengths",
+        "offsets",
+        "marker_offsets",
+        "base",
+    )
+    layout = Layout(
+        "force_tendons",
+        dict.fromkeys(_entries, ""),
+        {**STRUCTURE, "arcs_per_segment": int, "gravity": list},
+    )
+    _structure = (*ArcChain._structure, "arcs_per_segment", "gravity")
+
+    gravity: tuple[float, ...]
+    marker_offsets: Tensor  # (K, 3)
+    bending_stiffness: Tensor  # (S,)
+    axial_stiffness: Tensor
+    weight: Tensor
+    taper: Tensor
+    lengths: Tensor
+
+    def __init__(
+        self,
+        radii: Numbers,
+        lengths: Numbers,
+        bending_stiffness: Numbers,
+        axial_stiffness: Numbers,
+        *,
+        n_actuators: int | Sequence[int] = 3,
+        angles: Numbers | None = None,
+        routing: str = "base",
+        weight: Numbers = 0.0,
+        taper: Numbers = 0.0,
+        gravity: Numbers = (0.0, 0.0, -1.0),
+        arcs: int = 6,
+        gains: Numbers = 1.0,
+        rest_bends: Numbers = 0.0,
+        offsets: Numbers = 0.0,
+        base: Numbers | Transform | None = None,
+        dtype: torch.dtype = torch.float64,
+    ) -> None:
+        super().__init__()
+        dtype = float_dtype(dtype)
+        geometry = self._checked(
+            routing,
+            radii=radii,
+            lengths=lengths,
+            n_actuators=n_actuators,
+            angles=angles,
+            offsets=offsets,
+            rest_bends=rest_bends,
+            gains=gains,
+            base=base,
+            dtype=dtype,
+        )
+        if any(self.extensible):
+            raise ValueError(
+                "`lengths` must hold the length of every segment, got None."
+            )
+        properties = {
+            "bending_stiffness": bending_stiffness,
+            "axial_stiffness": axial_stiffness,
+            "weight": weight,
+            "taper": taper,
+        }
+        for name, value in properties.items():
+            geometry[name] = filled(value, name, dtype, (self.n_segments,))
+        for name in ("bending_stiffness", "axial_stiffness"):
+            if not (geometry[name] > 1.0 / LARGEST).all():
+                need = f"must be positive, over {1.0 / LARGEST:g}"
+                raise ValueError(f"`{name}` {need}, got {geometry[name].tolist()}.")
+        if not (geometry["weight"] >= 0.0).all():
+            raise ValueError(
+                f"`weight` must not be negative [N/m], got {geometry['weight'].tolist()}."
+            )
+        taper_left = geometry["taper"]
+        if not ((taper_left >= 0.0) & (taper_left < 1.0)).all():
+            raise ValueError(f"`taper` must lie in [0, 1), got {taper_left.tolist()}.")
+        down = numeric(gravity, "gravity", need="n", length=3)
+        if not down.norm() > 0.0:
+            raise ValueError(f"`gravity` must be a direction, got {down.tolist()}.")
+        self.gravity = tuple((down / down.norm()).tolist())
+        self.arcs_per_segment = whole(arcs, "arcs", most=_MOST_ARCS)
+        geometry["marker_offsets"] = geometry["base"].new_zeros(1, 3)
+        self._set_geometry(geometry)
+
+    @property
+    def default_parameters(self) -> tuple[str, ...]:
+        """Names of the parameters that a calibration fits by default."""
+        statics = ("bending_stiffness", "axial_stiffness", "weight", "taper")
+        return (*statics, "rest_bends", "turns", "base")
+
+    @property
+    def in_metres(self) -> bool:
+        """Whether q is in metres: False, it holds forces."""
+        return False
+
+    @property
+    def reach(self) -> Tensor:
+        """Length of the body without forces and weight, shape () [m]."""
+        return self.lengths.sum()
+
+    @property
+    def rigid_length(self) -> Tensor:
+        """Upper bound of the length of rigid offsets and of the way to a marker, shape () [m]."""
+        return self.offsets.abs().sum() + self.marker_offsets.abs().sum()
+
+    def tips(self) -> list[ForceTendonChain]:
+        """Return one chain per marker, each mapping q (..., n) to x (..., 3)."""
+        tips = []
+        for (at, *_), offset in zip(
+            self.markers, self.marker_offsets.tolist(), strict=True
+        ):
+            x, y, z = offset
+            tips.append(self._marked([(at, x, y, z)]))
+        return tips
+
+    def geometry_jacobian(self, q: Tensor, tangents: Mapping[str, Tensor]) -> Tensor:
+        """Return the derivative of the tip along P changes of the geometry, shape (..., 3, P)."""
+        return Chain.geometry_jacobian(self, q, tangents)
+
+    def forces(self, q: Tensor) -> Tensor:
+        """Return the tendon forces (..., n) [N] at q (..., n); they are not negative."""
+        check_vectors(q, self.n_actuators, "q", self._why_shape())
+        return (self.gains.to(q) * q).clamp(min=0.0)
+
+    def metres(self, q: Tensor) -> Tensor:
+        """Return the forces (..., n) [N] of q (..., n): they take the place of length changes."""
+        return self.forces(q)
+
+    def unit_messages(self, q: Tensor, name: str, factor: float = 1.0) -> list[str]:
+        """Return no warning: forces have no plausible size that the geometry gives."""
+        return []
+
+    def plausible_rows(self) -> None:
+        """Return None: every force is plausible."""
+
+    def longest(self, largest: Tensor) -> float:
+        """Return infinity: a soft body can become longer under its weight."""
+        return torch.inf
+
+    def backbone(self, q: Tensor, n_points: int = 20) -> Tensor:
+        """Return points (..., S * n_points + 1, 3) along the robot, base to end [m]."""
+        n_points = whole(n_points, "n_points", most=10**6)
+        places = []
+        for segment in range(self.n_segments):
+            for point in range(1, n_points + 1):
+                places.append((segment + point / n_points, 0.0, 0.0, 0.0))
+        points = self._marked(places)(q).unflatten(-1, (-1, 3))
+        start = self.base[:3, 3].to(points).expand(*q.shape[:-1], 1, 3)
+        return torch.cat([start, points], dim=-2)
+
+    def poses(self, q: Tensor) -> Tensor:
+        """Return the poses (..., S + 1, 4, 4) of the base and of the ends of all segments."""
+        after_arcs = self._poses(*self.arcs(q), self.arc_offsets, q)
+        return after_arcs[..., :: self.arcs_per_segment, :, :]
+
+    def _set_markers(self, markers: Sequence[Marker]) -> None:
+        super()._set_markers(markers)
+        offsets = [offset for _, *offset in self.markers]
+        like = self._buffers.get("base")
+        if like is not None:  # None while the chain is built
+            self.register_buffer("marker_offsets", like.new_tensor(offsets))
+
+    def _beside(self, like: Tensor) -> Tensor:
+        return self.marker_offsets.to(like).mT[..., None]
+
+    def _check_rows(self, rows: Tensor, name: str) -> None:
+        negative = (rows * self.gains.detach().to(rows) < 0.0).any(dim=1)
+        if negative.any():
+            raise ValueError(
+                f"`{name}` must hold tendon forces that pull, gains * q >= 0, got "
+                f"{int(negative.sum())} of {len(rows)} rows with a negative one."
+            )
+
+    def _statics(self) -> _Statics:
+        """Return the energy of shapes, in float64."""
+        geometry = {name: value.double() for name, value in self.geometry().items()}
+        base = geometry["base"]
+        k = self.arcs_per_segment
+        at = (torch.arange(k, dtype=base.dtype, device=base.device) + 0.5) / k
+        outer = (
+            1.0 - geometry["taper"][:, None] * at
+        )  # outer radius over that at the start
+        length = geometry["lengths"][:, None] / k
+        bending = (geometry["bending_stiffness"][:, None] * outer**4 / length).flatten()
+        axial = (geometry["axial_stiffness"][:, None] * outer**2 / length).flatten()
+        weights = geometry["weight"][:, None] * outer**2 * length
+        rest_bends = geometry["rest_bends"].mT.flatten().repeat_interleave(k) / k
+        down = torch.tensor(self.gravity, dtype=base.dtype, device=base.device)
+        readings = self._readings().to(base).unflatten(-1, (3, -1))
+        return _Statics(
+            stiffness=torch.cat([axial, bending, bending]),
+            rest=torch.cat([length.expand(-1, k).flatten(), rest_bends]),
+            readings=readings.repeat_interleave(k, dim=-1).flatten(1),
+            weights=weights.flatten(),
+            offsets=self.arc_offsets.to(base),
+            down=base[:3, :3].mT @ down,
+        )
+
+    def _arcs(self, q: Tensor) -> Tensor:
+        rows = self._rows(q)
+        return self._at_rest(rows.double()).to(rows)
+
+    def _arcs_and_slope(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        q = rows.double()
+        arcs = self._at_rest(q)
+        statics = self._statics()
+        gains = self.gains.to(q)
+        by_force = torch.linalg.solve_ex(statics.hessian(arcs), -statics.readings.mT)
+        pulls = (gains * q >= 0.0) * gains
+        slope = by_force.result * pulls[:, None]
+        return arcs.to(rows), slope.permute(1, 2, 0).to(rows)
+
+    def _at_rest(self, q: Tensor) -> Tensor:
+        """Return the arcs (3 A, N) at rest, float64.
+
+        The shape is found without derivative. Two steps with its constant compliance follow: by
+        the implicit function theorem the first one gives the first derivative, the second one the
+        second.
+        """
+        entries = [self.geometry()[name].detach() for name in self._entries]
+        packed = WithoutDerivative.apply(self._search, q.detach(), *entries)
+        n = 3 * self.n_segments * self.arcs_per_segment
+        arcs, compliance = packed.split([n, n * n], dim=1)
+        arcs = arcs.mT
+        compliance = compliance.unflatten(1, (n, n))
+        statics = self._statics()
+        forces = self.forces(q)
+        for _ in range(2):
+            imbalance = statics.imbalance(arcs, forces).mT
+            arcs = arcs - applied(compliance, imbalance).mT
+        return arcs
+
+    def _search(self, q: Tensor, *entries: Tensor) -> Tensor:
+        """Return arcs (N, 3 A) at rest and the flat compliance, for entries of the geometry."""
+        geometry = dict(zip(self._entries, entries, strict=True))
+        chain = self.with_geometry(**geometry)
+        arcs, compliance = chain._statics().shape_of_least_energy(chain.forces(q))
+        return torch.cat([arcs.mT, compliance.flatten(1)], dim=1)
+
+    @classmethod
+    def _arguments(cls, stored: Stored) -> dict[str, Any]:
+        arguments = super()._arguments(stored)
+        del arguments["marker_offsets"]
+        arguments["arcs"] = stored.value("arcs_per_segment", int)
+        arguments["gravity"] = stored.list_of(float, "gravity")
+        return arguments
+
+    @classmethod
+    def from_stored(cls, stored: Stored, restore: Restore) -> ForceTendonChain:
+        """Return the chain built from a description."""
+        chain = super().from_stored(stored, restore)
+        offsets = torch.from_numpy(stored.array("marker_offsets")).to(chain.base)
+        return chain.with_geometry(marker_offsets=offsets)

@@ -1,0 +1,183 @@
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+from hybridkin import ForceTendonChain, calibrate, load_model, save_model
+
+DOWN = torch.tensor([0.3, -0.2, 1.0])
+
+
+def chain(**changes):
+    options = {
+        "radii": [0.012, 0.01],
+        "lengths": [0.2, 0.15],
+        "bending_stiffness": [0.02, 0.01],
+        "axial_stiffness": 100.0,
+        "n_actuators": 2,
+        "angles": [1.0, -1.2],
+        "weight": 2.0,
+        "taper": [0.3, 0.5],
+        "gravity": DOWN,
+        "arcs": 3,
+        "rest_bends": [[0.2, -0.1], [0.0, 0.3]],
+        "offsets": [0.01, 0.02],
+    }
+    return ForceTendonChain(**(options | changes))
+
+
+def forces(n=5, seed=0):
+    random = torch.Generator().manual_seed(seed)
+    return 0.5 + 4.0 * torch.rand(n, 4, generator=random, dtype=torch.float64)
+
+
+def test_without_weight_one_force_bends_a_uniform_body_into_an_arc():
+    # Moment r F over E I times the length; compression F over E A.
+    body = ForceTendonChain([0.01], [0.3], 0.02, 50.0, arcs=4)
+    length, bending = body.arcs(torch.tensor([1.5, 0.0, 0.0], dtype=torch.float64))
+    assert_close(length.sum(), length.new_tensor(0.3 * (1 - 1.5 / 50.0)))
+    assert_close(bending.sum(0), length.new_tensor([0.01 * 1.5 * 0.3 / 0.02, 0.0]))
+
+
+def test_a_light_beam_sags_like_a_cantilever():
+    # Euler-Bernoulli: the tip of a horizontal beam sinks by w L^4 / (8 E I).
+    beam = ForceTendonChain([0.01], [0.3], 2.0, 1e6, weight=0.1, gravity=[1, 0, 0], arcs=40)
+    x = beam(torch.zeros(3, dtype=torch.float64))
+    assert_close(x[0], x.new_tensor(0.1 * 0.3**4 / 16.0), rtol=1e-3, atol=0.0)
+    # A hanging one becomes longer by w L^2 / (2 E A).
+    hanging = ForceTendonChain([0.01], [0.3], 2.0, 50.0, weight=1.0, gravity=[0, 0, 1], arcs=3)
+    x = hanging(torch.zeros(3, dtype=torch.float64))
+    assert_close(x, x.new_tensor([0.0, 0.0, 0.3 + 0.3**2 / 100.0]))
+
+
+def test_the_shape_has_least_energy():
+    body = chain()
+    statics = body._statics()
+    arcs = body._arcs(forces())
+    assert_close(statics.imbalance(arcs, forces()), torch.zeros_like(arcs), rtol=0, atol=1e-12)
+    energy = statics.energy(arcs, forces())
+    random = torch.Generator().manual_seed(1)
+    for size in (1e-4, 1e-2):
+        step = size * torch.randn(arcs.shape, generator=random, dtype=torch.float64)
+        assert (statics.energy(arcs + step, forces()) > energy).all()
+
+
+def test_derivatives_of_the_energy():
+    statics = chain()._statics()
+    random = torch.Generator().manual_seed(2)
+    step = torch.randn(18, 5, generator=random, dtype=torch.float64)
+    arcs = statics.rest[:, None] + 0.3 * step
+    by_torch = torch.func.grad(lambda shape: statics.energy(shape, forces()).sum())(arcs)
+    assert_close(statics.imbalance(arcs, forces()), by_torch)
+    second = torch.func.jacrev(lambda shape: statics.imbalance(shape, forces()))(arcs)
+    assert_close(statics.hessian(arcs), torch.einsum("injn->nij", second))
+
+
+def test_more_arcs_converge():
+    tips = [chain(arcs=arcs)(forces()) for arcs in (4, 8, 16)]
+    first = (tips[0] - tips[2]).norm()
+    second = (tips[1] - tips[2]).norm()
+    assert second < 0.3 * first
+    assert first < 0.01
+
+
+def test_turning_base_and_gravity_turns_the_tip():
+    turn = torch.linalg.matrix_exp(torch.tensor([[0, 1.0, 2], [-1, 0, 0.5], [-2, -0.5, 0]]))
+    base = torch.eye(4, dtype=torch.float64)
+    base[:3, :3] = turn
+    turned = chain(base=base, gravity=turn @ DOWN)
+    assert_close(turned(forces()), chain()(forces()) @ turn.double().T, rtol=0, atol=1e-7)
+
+
+def test_jacobian_is_that_of_torch_and_of_differences():
+    body = chain().with_markers([(0, 0.4, (0.01, 0.0, 0.02)), (1, 1.0)])
+    q = forces(3)
+    x, J = body.forward_and_jacobian(q)
+    assert_close(x, body(q))
+    step = 1e-5
+    for k in range(4):
+        change = torch.zeros(4, dtype=torch.float64)
+        change[k] = step
+        difference = (body(q + change) - body(q - change)) / (2 * step)
+        assert_close(J[..., k], difference, rtol=1e-6, atol=1e-9)
+    rows = forces(2).requires_grad_()
+    assert torch.autograd.gradcheck(chain(), rows)
+    assert torch.autograd.gradgradcheck(chain(arcs=1), rows)
+    assert torch.autograd.gradcheck(lambda q: chain(arcs=2).forward_and_jacobian(q)[1], rows)
+
+
+def test_geometry_jacobian_against_differences():
+    body = chain().with_markers([(0, 0.4, (0.01, 0.0, 0.02)), (1, 1.0)])
+    q = forces(2)
+    step = 1e-6
+    geometry = body.geometry()
+    for name, value in geometry.items():
+        change = torch.linspace(0.2, 1.0, value.numel(), dtype=torch.float64)
+        change = change.reshape(value.shape) * value.abs().max().clamp(min=0.01)
+        J = body.geometry_jacobian(q, {name: change[None]})[..., 0]
+        above = body.with_geometry(**{name: value + step * change})(q)
+        below = body.with_geometry(**{name: value - step * change})(q)
+        assert_close(J, (above - below) / (2 * step), rtol=1e-5, atol=1e-8)
+
+
+def test_poses_backbone_and_pose_agree():
+    body = chain()
+    q = forces(2)
+    assert body.poses(q).shape == (2, 3, 4, 4)
+    assert_close(body.poses(q)[:, -1], body.pose(q))
+    assert_close(body.pose(q)[:, :3, 3], body(q))
+    points = body.backbone(q, 5)
+    assert points.shape == (2, 11, 3)
+    assert_close(points[:, [0, 5, 10]], body.poses(q)[:, :, :3, 3])
+    J = body.pose_jacobian(q)
+    assert_close(J[:, :3], body.forward_and_jacobian(q)[1])
+
+
+def test_batches_dtypes_and_negative_forces():
+    body = chain()
+    q = forces(4)
+    assert_close(body(q.reshape(2, 2, 4)).reshape(4, 3), torch.stack([body(row) for row in q]))
+    assert body(q.float()).dtype == torch.float32
+    assert_close(torch.func.vmap(body)(q), body(q))
+    q[:, 0] = -1.0
+    slack = torch.cat([torch.zeros(4, 1).double(), q[:, 1:]], dim=1)
+    assert_close(body(q), body(slack))
+    with pytest.raises(ValueError, match="pull"):
+        body.check_actuators(q)
+
+
+def test_calibration_finds_stiffness_and_weight():
+    q = forces(30, seed=3)
+    x = chain().with_markers([(0, 1.0), (1, 1.0)])(q)
+    start = chain(bending_stiffness=[0.03, 0.008], weight=1.0, taper=0.2)
+    names = ("bending_stiffness", "weight", "taper")
+    result = calibrate(start.with_markers([(0, 1.0), (1, 1.0)]), q, x, names)
+    assert result.rmse < 1e-8
+    np.testing.assert_allclose(result.values["weight"], 2.0, rtol=1e-4)
+    np.testing.assert_allclose(result.values["taper"], [0.3, 0.5], rtol=1e-4)
+
+
+def test_saved_and_read(tmp_path):
+    body = chain().with_markers([(0, 0.4, (0.01, 0.0, 0.02)), (1, 1.0)])
+    shifted = body.with_geometry(marker_offsets=body.marker_offsets + 0.01)
+    save_model(shifted, tmp_path / "model")
+    read = load_model(tmp_path / "model")
+    assert isinstance(read, ForceTendonChain)
+    assert_close(read(forces()), shifted(forces()), rtol=0, atol=1e-14)
+    assert_close(read.tip_model(forces()), shifted(forces())[:, 3:])
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("lengths", None),
+        ("weight", -1.0),
+        ("taper", 1.0),
+        ("gravity", [0, 0, 0]),
+        ("arcs", 0),
+        ("axial_stiffness", 0.0),
+    ],
+)
+def test_wrong_arguments_are_named(name, value):
+    with pytest.raises(ValueError, match=name):
+        chain(**{name: value})
