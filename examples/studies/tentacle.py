@@ -22,8 +22,18 @@ from numpy.typing import NDArray
 from hybridkin import ForceTendonChain, HybridForwardModel, calibrate, datasets
 
 LENGTH = 0.36  # [m]
-PLACES = (0.125, 0.208, 0.275, 0.355)  # of the markers along the body [m], read off the recording
-BASE = [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]]  # the body hangs along y
+PLACES = (
+    0.125,
+    0.208,
+    0.275,
+    0.355,
+)  # of the markers along the body [m], read off the recording
+BASE = [
+    [1, 0, 0, 0],
+    [0, 0, 1, 0],
+    [0, -1, 0, 0],
+    [0, 0, 0, 1],
+]  # the body hangs along y
 PARAMETERS = (
     "bending_stiffness",
     "axial_stiffness",
@@ -61,10 +71,16 @@ def held_out_errors(q: NDArray, x: NDArray, row: int) -> NDArray:
     train = np.arange(len(q)) != row
     chain = nominal()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # fewer rows than parameters: priors determine some
+        warnings.simplefilter(
+            "ignore"
+        )  # fewer rows than parameters: priors determine some
         calibrated = calibrate(chain, q[train], x[train], PARAMETERS).chain
         errors = []
-        for model, name in ((chain, "drop"), (calibrated, "drop"), (calibrated, "quadratic")):
+        for model, name in (
+            (chain, "drop"),
+            (calibrated, "drop"),
+            (calibrated, "quadratic"),
+        ):
             hybrid = HybridForwardModel(model, name, random_state=0)
             hybrid.fit(q[train], x[train])
             residual = hybrid.predict(q[[row]]) - x[[row]]
@@ -81,7 +97,9 @@ def main() -> None:
     data = datasets.load_soromox_tentacle(options.data)
     rows = range(len(data.q))
     run = Parallel(options.jobs)
-    errors = np.stack(run(delayed(held_out_errors)(data.q, data.x, row) for row in rows))
+    errors = np.stack(
+        run(delayed(held_out_errors)(data.q, data.x, row) for row in rows)
+    )
     print("| model | mean of four markers | largest load | tip | largest tip |")
     print("| --- | --- | --- | --- | --- |")
     for k, name in enumerate(("nominal", "calibrated", "calibrated + quadratic")):

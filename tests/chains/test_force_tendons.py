@@ -100,6 +100,10 @@ def test_jacobian_is_that_of_torch_and_of_differences():
         change[k] = step
         difference = (body(q + change) - body(q - change)) / (2 * step)
         assert_close(J[..., k], difference, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_first_and_second_derivatives_in_torch():
     rows = forces(2).requires_grad_()
     assert torch.autograd.gradcheck(chain(), rows)
     assert torch.autograd.gradgradcheck(chain(arcs=1), rows)
@@ -146,6 +150,7 @@ def test_batches_dtypes_and_negative_forces():
         body.check_actuators(q)
 
 
+@pytest.mark.slow
 def test_calibration_finds_stiffness_and_weight():
     q = forces(30, seed=3)
     x = chain().with_markers([(0, 1.0), (1, 1.0)])(q)
