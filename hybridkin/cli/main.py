@@ -57,7 +57,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         with (
             contextlib.closing(stages),
             warnings.catch_warnings(),
-            _terminable(),
+            _interruptible(),
             one_thread(),
         ):
             warnings.filterwarnings("default", category=UserWarning)
@@ -85,20 +85,34 @@ class _Terminated(KeyboardInterrupt):
 
 
 @contextlib.contextmanager
-def _terminable() -> Iterator[None]:
-    """Let SIGTERM raise `_Terminated`, so that files are closed and removed on the way out."""
+def _interruptible() -> Iterator[None]:
+    """Let SIGTERM interrupt as SIGINT does, unless the caller handles these signals.
+
+    An error after a signal is the interrupt: C code turns it into an ImportError during an import.
+    """
+    usual = {signal.SIGTERM: signal.SIG_DFL, signal.SIGINT: signal.default_int_handler}
     if threading.current_thread() is not threading.main_thread():
-        yield
-        return
+        usual = {}
+    ours = [n for n, handler in usual.items() if signal.getsignal(n) is handler]
+    caught: list[KeyboardInterrupt] = []
 
-    def stop(number: int, frame: object) -> None:
-        raise _Terminated
+    def stop(number: int, _: object) -> None:
+        caught.append(
+            _Terminated() if number == signal.SIGTERM else KeyboardInterrupt()
+        )
+        raise caught[-1]
 
-    usual = signal.signal(signal.SIGTERM, stop)
+    for number in ours:
+        signal.signal(number, stop)
     try:
         yield
+    except _OF_INPUT as error:
+        if caught:
+            raise caught[-1] from error
+        raise
     finally:
-        signal.signal(signal.SIGTERM, usual)
+        for number in ours:
+            signal.signal(number, usual[number])
 
 
 def _next(arguments: argparse.Namespace, stages: Stages) -> _Result:

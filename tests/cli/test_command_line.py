@@ -90,11 +90,23 @@ def by_keyboard(*_, **__):
     raise KeyboardInterrupt
 
 
+def by_an_import(*_, **__):
+    """C code that turns an interrupt into an error of an import."""
+    try:
+        os.kill(os.getpid(), signal.SIGINT)
+    except KeyboardInterrupt:
+        raise ImportError("could not import datetime") from None
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="needs signals of POSIX")
-@pytest.mark.parametrize(("fit_log", "code"), [(by_keyboard, 130), (by_terminate, 143)])
+@pytest.mark.parametrize(
+    ("fit_log", "code"), [(by_keyboard, 130), (by_terminate, 143), (by_an_import, 130)]
+)
 def test_an_interrupt_leaves_cleanly(log, robot, tmp_path, capsys, monkeypatch, fit_log, code):
     monkeypatch.setattr(workflow, "fit_log", fit_log)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # background jobs ignore it
     left = run(capsys, "fit", log, "--robot", robot, "--out", tmp_path / "m")
+    assert signal.signal(signal.SIGINT, before) is signal.default_int_handler
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
     assert left[:2] == (code, "")
     assert left[2].endswith("hybridkin: interrupted\n")
