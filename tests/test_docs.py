@@ -1,8 +1,6 @@
 """The pages can be reached, their code runs, and every public name says what it takes and gives."""
 
-import csv
 import inspect
-import itertools
 import re
 import textwrap
 from enum import Enum
@@ -123,66 +121,6 @@ def test_models_of_the_page_on_the_inside_run_as_printed(capsys):
         compile(writer + "from hybridkin._core.stored import Layout\n" + layout, "", "exec"), space
     )
     assert space["layout"].write_plan is space["write_plan"]
-
-
-def cells_of(page):
-    """Yield the header and one row of every table of a page, cell by cell."""
-    head = None
-    for line in (DOCS / page).read_text(encoding="utf-8").splitlines():
-        cells = [cell.strip() for cell in line.strip("|").split("|")]
-        if not line.startswith("| "):
-            head = None
-        elif head is None:
-            head = cells
-        elif set(line) - {*"| -"}:
-            yield head, cells
-
-
-def test_tables_have_eight_rows_at_most():
-    for page in ("hybrid.md", "next_rows.md", "domain.md", "changes.md", "beyond_the_paper.md"):
-        rows = [len(list(of)) for _, of in itertools.groupby(cells_of(page), lambda pair: pair[0])]
-        assert rows, page
-        assert max(rows) <= 8, page
-
-
-STUDIES = {
-    "25": "few rows",
-    "armlab": "outside the training range",
-    "5 folds": "held-out motions",
-}  # by a word of the header
-CASES = {
-    "trunk 1": "trunk 1, inner 60 %",
-    "trunk 2": "trunk 2, inner 60 %",
-    "armlab": "armlab_3cable, pulls up to 6 mm",
-    "ftdcr_v4, plain": "ftdcr_v4, plain chain",
-    "ftdcr_v4, elastic": "ftdcr_v4, elastic tendons",
-    "asl_trunk_static": "asl_trunk_static",
-}
-
-
-def test_figures_of_the_hybrids_are_those_of_the_stored_table():
-    with open(DOCS / "data" / "hybrids.csv", newline="", encoding="utf-8") as file:
-        stored = [*csv.DictReader(file)]
-    compared = 0
-    for head, (name, *cells) in cells_of("hybrid.md"):
-        study = next((STUDIES[kind] for kind in STUDIES if kind in head), None)
-        if study is None:
-            continue
-        case, _, model = name.rpartition(": ")
-        for column, cell in zip(head[1:], cells, strict=True):
-            own = [e for e in stored if e["study"] == study and e["model"] == model]
-            if study == "few rows":
-                own = [e for e in own if (e["case"], e["rows"]) == (case, column)]
-            elif study == "held-out motions":
-                own = [e for e in own if (e["case"], e["test"]) == (case, column)]
-            else:
-                own = [e for e in own if e["case"] == CASES[column]]
-            (entry,) = own
-            spread, largest = entry["std_mm"], entry["max_mm"]
-            found = entry["mean_mm"] + (f" ± {spread}" if study == "few rows" else f" ({largest})")
-            assert cell == found, (name, column)
-            compared += 1
-    assert compared == 7 * 4 + 4 * 6 + 8 * 3
 
 
 @pytest.mark.slow

@@ -97,13 +97,6 @@ def test_versions_agree():
     assert "version" in PROJECT["dynamic"]
 
 
-def test_extras():
-    extras = PROJECT["optional-dependencies"]
-    assert {"sim", "dask", "parquet", "view", "docs", "dev", "bench"} <= {*extras}
-    (whole,) = (name for name in extras["dev"] if name.startswith("hybridkin["))
-    assert {"sim", "dask", "parquet", "view"} <= {*re.findall(r"\w+", whole)[1:]}
-
-
 @pytest.mark.slow
 def test_what_is_imported_is_declared():
     needed = modules_of(PROJECT["dependencies"])

@@ -131,8 +131,9 @@ def free_arcs(
             direction = torch.stack([psi.cos(), psi.sin()])
             bending = torch.outer(direction, direction)
         else:
-            bending = 0.5 * n_bends * torch.eye(2).to(of_segment)
-        length = float(stretches) * torch.ones(1, 1).to(of_segment)
+            plane = torch.eye(2, dtype=of_segment.dtype, device=of_segment.device)
+            bending = 0.5 * n_bends * plane
+        length = float(stretches) * of_segment.new_ones(1, 1)
         blocks.append(torch.block_diag(length, bending))
     # From segment by segment to all lengths, all x- and all y-bendings.
     by_kind = torch.diag_embed(torch.stack(blocks, dim=-1))  # (3, 3, S, S)

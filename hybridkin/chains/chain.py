@@ -148,9 +148,11 @@ class Chain(PoseModel):
         if not tangents or not {*tangents} <= {*geometry}:
             need = f"must map entries of the geometry, {[*geometry]}, to changes"
             raise ValueError(f"`tangents` {need}, got {tangents!r:.80}.")
-        n_changes = len(next(iter(tangents.values())))
         for name, value in tangents.items():
             check_tensor(value, f"tangents[{name!r}]")
+        first = next(iter(tangents.values()))
+        n_changes = len(first) if first.ndim else 1
+        for name, value in tangents.items():
             shape = (n_changes, *geometry[name].shape)
             check_shape(value, f"tangents[{name!r}]", shape)
 

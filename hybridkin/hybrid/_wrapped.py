@@ -212,7 +212,8 @@ def shifted(model: ForwardModel, shift: Tensor) -> ForwardModel:
 
 def moved(model: ForwardModel, motion: Tensor) -> ForwardModel:
     """Return a model after a motion (4, 4) of its base; a chain stays one."""
-    if torch.equal(motion, torch.eye(4).to(motion)):
+    at_rest = torch.eye(4, dtype=motion.dtype, device=motion.device)
+    if torch.equal(motion, at_rest):
         return model
     if isinstance(model, Chain):
         return model.with_geometry(base=motion.to(model.base) @ model.base)

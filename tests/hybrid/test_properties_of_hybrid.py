@@ -6,15 +6,14 @@ Where scikit-learn checks an argument its message names it without backticks.
 import copy
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
-from saved_models import arm, trunk, trunk_log
+from saved_models import trunk, trunk_log
 from sklearn.linear_model import LinearRegression
 from strategies import answer, arrays, named
 
-from hybridkin import ELMRegressor, HybridForwardModel, choose_rows
+from hybridkin import ELMRegressor, HybridForwardModel
 
 Q, X, GROUPS = trunk_log()
 SMALL = ELMRegressor(3, random_state=0)
@@ -128,28 +127,3 @@ def test_a_stream_follows_or_is_refused(data, log):
     assert np.isfinite(after).all()
     if error is not None:
         assert_array_equal(after, before)
-
-
-@given(st.data())
-def test_rows_are_chosen_or_refused_by_name(data):
-    model = data.draw(st.sampled_from([trunk(), arm(), FITTED["linear"]]))
-    shapes = st.sampled_from([(6, 3), (6, 3), (1, 3), (0, 3), (3,), (2, 2)])
-    special = (np.nan, np.inf, 0.0, 1e300, 5e-324)
-    q, measured, target = (data.draw(arrays(shapes, 0.1, 0.4, special)) for _ in range(3))
-    n = data.draw(st.integers(-1, 8) | st.sampled_from([2.0, 2.5, np.nan, "a", None, [1]]))
-    groups = data.draw(st.sampled_from([None, np.arange(6) // 2, ["a"] * 6, [1]]))
-    given = {"measured": measured, "target": target, "groups": groups}
-    kept = {name: value for name, value in given.items() if data.draw(st.booleans())}
-    found, error = answer(choose_rows, model, q, n, **kept)
-    if error is None:
-        assert len(found[0]) == len(found[1]) == n
-        assert len(np.unique(found[0])) == n
-        assert np.isfinite(found[1]).all()
-
-
-@pytest.mark.parametrize("name", ["guard", "coupling", "calibrate", "play", "coverage", "output"])
-@given(value=st.floats(width=64) | st.sampled_from(["", "a", [], ["a"], [[1.0]], {}, True, b"a"]))
-def test_settings_are_refused_by_name(name, value):
-    model = hybrid(**{name: value})
-    fitted, error = answer(named(model.fit), Q, X)
-    assert error is not None or np.isfinite(fitted.predict(Q)).all()

@@ -1,7 +1,3 @@
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -10,8 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from hybridkin import ConstantCurvatureChain
 from paper import NotSettledError, TrunkPlant, trunk
-from paper.mjcf import RADII, TIME_STEP
-from paper.trunk import SERVO_GAINS
+from paper.mjcf import RADII
 
 mujoco = pytest.importorskip("mujoco", reason="the simulated trunk needs hybridkin[sim]")
 
@@ -101,42 +96,6 @@ def test_lengths_reach_the_command_and_the_pose_is_rigid(plant, working):
         assert_allclose(pose[3], [0, 0, 0, 1])
 
 
-@pytest.mark.slow
-def test_start_shape_does_not_matter(plant, working):
-    state = plant._rest
-    for q_target in working:
-        cold = plant._equilibrium(plant._rest, q_target, iter(range(200)))[0]
-        state = plant._equilibrium(state, q_target, iter(range(200)))[0]  # from the last shape
-        tips = [plant._hold(s, q_target, np.ones(9, dtype=bool))[1][:3, 3] for s in (cold, state)]
-        assert_allclose(*tips, atol=1e-7)
-
-
-@pytest.mark.slow
-def test_tip_is_a_smooth_function_of_the_command(plant, working):
-    direction = np.random.default_rng(1).standard_normal(9)
-    direction /= np.linalg.norm(direction)
-    for q_target in working[:8]:
-        centre = np.clip(q_target, 0.192, 0.308)
-        behind, here, ahead = (plant(centre + s * 1e-3 * direction) for s in (-1, 0, 1))
-        assert np.linalg.norm(ahead - behind) / 2e-3 < 8  # gain
-        assert np.linalg.norm(ahead - 2 * here + behind) / 1e-6 < 100  # curvature [1/m]
-
-
-@pytest.mark.slow
-def test_running_the_servos_from_straight_ends_in_the_same_shape(plant, working):
-    target, model = working[0], plant._model
-    data, integral = mujoco.MjData(model), np.zeros(9)
-    mujoco.mj_forward(model, data)
-    for _ in range(int(12 / TIME_STEP)):
-        gap = target - data.ten_length
-        integral += TIME_STEP * gap
-        data.ctrl[:] = SERVO_GAINS[0] * gap + SERVO_GAINS[1] * integral
-        mujoco.mj_step(model, data)
-    mujoco.mj_forward(model, data)
-    R, p = plant._T_mocap_base[:3, :3], plant._T_mocap_base[:3, 3]
-    assert_allclose(R @ data.site("tip").xpos + p, plant(target), atol=1e-5)
-
-
 def test_weak_chambers_saturate_and_the_measured_lengths_say_so(working):
     weak = TrunkPlant(max_force=20.0)
     q, _ = weak.settle(working[4])
@@ -148,22 +107,6 @@ def test_weak_chambers_saturate_and_the_measured_lengths_say_so(working):
 
 
 # noise and determinism
-
-
-def test_noise_has_the_stated_standard_deviation(monkeypatch, working):
-    noisy = TrunkPlant(cable_noise=2e-3, mocap_noise=1e-3, random_state=0)
-    clean_q, clean_pose = TrunkPlant().settle(working[0])
-    # The shape is the same each time: settle once, measure often.
-    state = noisy._equilibrium(noisy._rest, working[0], iter(range(200)))
-    held_result = noisy._hold(state[0], working[0], state[1])
-    monkeypatch.setattr(noisy, "_equilibrium", lambda *_: state)
-    monkeypatch.setattr(noisy, "_check_stable", lambda *_: None)
-    monkeypatch.setattr(noisy, "_hold", lambda *_: held_result)
-    q, pose = map(np.array, zip(*(noisy.settle(working[0]) for _ in range(2000)), strict=True))
-    assert_allclose((q - clean_q).std(axis=0), 2e-3, rtol=0.1)
-    assert_allclose((pose - clean_pose)[:, :3, 3].std(axis=0), 1e-3, rtol=0.1)
-    assert_allclose((q - clean_q).mean(axis=0), 0, atol=2e-4)
-    assert_allclose(pose[:, :3, :3], np.broadcast_to(clean_pose[:3, :3], (2000, 3, 3)), atol=1e-9)
 
 
 # not settled
@@ -191,38 +134,4 @@ def test_a_trunk_that_moves_is_not_settled(plant, working, monkeypatch, limit, m
         plant._hold(state, working[0], held)
 
 
-def test_a_failure_leaves_the_plant_usable(working):
-    plant = TrunkPlant()
-    expected = plant(working[0])
-    plant._max_iter = 1
-    with pytest.raises(NotSettledError):
-        plant(working[5])
-    plant._max_iter = 200
-    assert_allclose(plant(working[0]), expected, atol=1e-7)
-
-
 # bad input
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("mass", 0.0),
-        ("bending_stiffness", -1.0),
-        ("max_force", np.nan),
-        ("cable_noise", -1e-3),
-        ("tilt", np.inf),
-        ("gravity", "9.81"),
-        ("base_error", [0.0, 0.0, 0.0]),
-    ],
-)
-def test_bad_parameters_raise(name, value):
-    with pytest.raises(ValueError, match=f"`{name}` must be"):
-        TrunkPlant(**{name: value})
-
-
-@pytest.mark.slow
-def test_importing_the_folder_does_not_import_mujoco():
-    code = "import sys, paper; sys.exit('mujoco' in sys.modules)"
-    examples = Path(trunk.__file__).parents[1]
-    assert subprocess.run([sys.executable, "-c", code], cwd=examples, check=False).returncode == 0

@@ -29,23 +29,6 @@ def test_shipped_rows_are_reproduced_by_the_plant():
 
 
 @pytest.mark.slow
-def test_make_trunk_follows_the_plant():
-    data = make_trunk(**SMALL, cable_noise=0.0, mocap_noise=0.0, tilt=0.1)
-    plant = TrunkPlant(tilt=0.1)
-    assert data.parameters["plant"]["tilt"] == 0.1
-    for q_target, q, x in zip(data.q_target, data.q, data.x, strict=True):
-        assert_allclose(q, q_target, atol=1e-8)
-        assert_allclose(x, plant(q_target), atol=1e-8)
-
-
-@pytest.mark.slow
-def test_result_does_not_depend_on_processes(small_chunks):
-    alone, shared = make_trunk(**SMALL), make_trunk(**SMALL, n_jobs=2)
-    assert_allclose(shared.q, alone.q, rtol=0, atol=1e-9)
-    assert_allclose(shared.x, alone.x, rtol=0, atol=1e-9)
-
-
-@pytest.mark.slow
 def test_resumed_equals_uninterrupted(small_chunks, monkeypatch, tmp_path):
     settled = []
 
@@ -114,21 +97,6 @@ def test_rows_that_do_not_settle_are_drawn_again(stubborn):
     assert failed == set(np.flatnonzero(first_draw[:, 0] > 0.25).tolist())
     kept = np.setdiff1d(np.arange(18), list(failed))
     assert_array_equal(data.q_target[kept], first_draw[kept])
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"q_target": np.full((2, 8), 0.25)}, r"shape \(n_samples, 9\), got \(2, 8\)"),
-        ({"q_target": np.full((2, 9), 250.0)}, r"2 rows are not, first row 0"),
-        ({"q_target": np.full((2, 9), np.nan)}, r"2 rows are not"),
-        ({"random_state": -1}, "`random_state` must be an integer >= 0"),
-        ({"cable_noise": -1.0}, "`cable_noise` must be"),
-    ],
-)
-def test_make_trunk_bad_input(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        make_trunk(**arguments)
 
 
 @pytest.mark.slow
