@@ -79,7 +79,7 @@ class _Pickled:
 
 
 def _restored(array: NDArray, device: str) -> Tensor:
-    tensor = torch.tensor(array)
+    tensor = torch.tensor(array, device="cpu")
     try:
         return tensor.to(device)
     except (AssertionError, RuntimeError):  # this machine lacks the device

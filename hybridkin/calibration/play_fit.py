@@ -32,7 +32,8 @@ class PlayFit(WidthSearch):
     width : float
         Chosen play [unit of q]; zero if none was kept.
     widths : ndarray of shape (W,)
-        Widths tried, ascending from zero, including doubled ones if the largest was the best.
+        Widths tried [unit of q], ascending from zero, including doubled ones if the largest was
+        the best.
     cv_rmse : ndarray of shape (W,)
         Root mean square tip distance on held-out motions for each width [m].
     gain : float

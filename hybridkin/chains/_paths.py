@@ -66,7 +66,7 @@ def bend_matrix(
 
 def _spans(counts: Sequence[int], starts: Sequence[int]) -> Tensor:
     """Return which segments (n, S) every actuator runs through, as 0 and 1."""
-    spans = torch.zeros(sum(counts), len(counts))
+    spans = torch.zeros(sum(counts), len(counts), dtype=torch.float64, device="cpu")
     row = 0
     for k, count in enumerate(counts):
         spans[row : row + count, starts[k] : k + 1] = 1.0

@@ -364,7 +364,7 @@ class ArcChain(MarkedChain):
         length, bending = self.arcs(q)
         poses = self._poses(length, bending, self.offsets)
         # A part of an arc is an arc of that part of its length and of its bending.
-        part = torch.arange(1, n_points + 1).to(q) / n_points
+        part = torch.arange(1, n_points + 1, dtype=q.dtype, device=q.device) / n_points
         steps = transforms(
             part * length[..., None], part[:, None] * bending[..., None, :], 0.0 * part
         )

@@ -185,9 +185,9 @@ class MarkedChain(Chain):
         places = [at * self.arcs_per_segment for at, *_ in self.markers]
         segments = [*range(math.ceil(max(places)))]
         # Not new_tensor: before torch 2.5 it fails in functional transforms.
-        options = {"dtype": like.dtype, "device": like.device}
-        before = torch.tensor(segments, **options)[:, None]
-        return (torch.tensor(places, **options) - before).clamp(0.0, 1.0)
+        before = torch.tensor(segments, dtype=like.dtype, device=like.device)[:, None]
+        at = torch.tensor(places, dtype=like.dtype, device=like.device)
+        return (at - before).clamp(0.0, 1.0)
 
     def _marked(self, markers: Sequence[Marker]) -> Self:
         chain = self.with_geometry()  # shares the buffers

@@ -180,7 +180,9 @@ def _moved(
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Return effective changes (or with `lead` commands), last command and effective change."""
     command, effective = start
-    half = half.astype(rows.dtype)
+    half = np.minimum(half, np.finfo(rows.dtype).max / 4).astype(
+        rows.dtype
+    )  # 1e300 in float32
     result = np.empty_like(rows)
     for t, row in enumerate(rows):
         if lead:

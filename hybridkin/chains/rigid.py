@@ -557,8 +557,10 @@ class RigidChain(Chain):
         corners = torch.cat([frames[..., :3, 3], self(q)[..., None, :]], dim=-2)
         start = corners[..., :-1, None, :]
         end = corners[..., 1:, None, :]
-        fractions = torch.linspace(0.0, 1.0, n_points + 1, dtype=q.dtype)[1:, None]
-        points = torch.lerp(start, end, fractions.to(q.device)).flatten(-3, -2)
+        fractions = torch.linspace(
+            0.0, 1.0, n_points + 1, dtype=q.dtype, device=q.device
+        )
+        points = torch.lerp(start, end, fractions[1:, None]).flatten(-3, -2)
         return torch.cat([corners[..., :1, :], points], dim=-2)
 
     def unit_messages(self, q: Tensor, name: str, factor: float = 1.0) -> list[str]:

@@ -575,7 +575,9 @@ class InverseKinematics:
         best = max(tracks, key=score)  # of equal tracks the first
         if alone:
             return best
-        return followed(settings, torch.as_tensor(best.q[0]), timed, loop)
+        return followed(
+            settings, torch.as_tensor(best.q[0], device=target.device), timed, loop
+        )
 
     def _starts(self, target: Tensor, q0: Tensor | None) -> Iterator[Tensor]:
         """Yield two configurations (n,) at a target (1, ...): of the first start, a regular one."""
