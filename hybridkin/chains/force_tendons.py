@@ -139,9 +139,9 @@ class ForceTendonChain(ArcChain):
     weight : float or array-like of shape (S,), default=0.0
         Weight per length at the start of each segment [N/m].
     taper : float or array-like of shape (S,), default=0.0
-        Relative loss of outer radius from the start to the end of each segment, below 1.
+        Relative loss of outer radius from the start to the end of each segment, below 1 [-].
     gravity : array-like of shape (3,), default=(0, 0, -1)
-        Direction of gravity in the measuring frame; only its direction counts.
+        Direction of gravity in the measuring frame [-].
     arcs : int, default=6
         Arcs of each segment.
     gains : float or array-like of shape (S,) or (n,), default=1.0
