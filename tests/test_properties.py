@@ -36,6 +36,7 @@ from hybridkin import (
     RigidChain,
     as_forward_model,
     calibrate,
+    choose_rows,
     datasets,
     jacobian,
     load_model,
@@ -305,6 +306,17 @@ ENTRIES = {
         {
             **{"model": FITTED, "q": Q, "target": X, "t": np.arange(24.0), "x": X, "n_frames": 3},
             **{"names": ["a", "b", "c"], "expected": X[:, 0]},
+        },
+    ),
+    "choose_rows": (
+        choose_rows,
+        {
+            "model": trunk(),
+            "candidates": Q,
+            "n": 3,
+            "measured": Q[:2],
+            "target": Q[2:4],
+            "groups": GROUPS,
         },
     ),
     "workflow.open_model": (workflow.open_model, {"path": SAVED, "robot": ROBOT}),
