@@ -132,8 +132,9 @@ class ForceTendonChain(ArcChain):
     n_actuators : int or sequence of S ints, default=3
         Tendons that end at each segment.
     angles : array-like, optional
-        Tendon angles about the backbone, counter-clockwise from the base x-axis [rad], as in
-        `ElasticTendonChain`. Default: evenly spaced from 0.
+        Tendon angles about the backbone, counter-clockwise from the base x-axis [rad]: shape
+        ``(n,)`` for all segments alike, ``(S, n)``, or one sequence per segment. Default: evenly
+        spaced from 0.
     routing : {"base", "segment"}, default="base"
         "base": tendons of a segment also run through all segments nearer the base.
     weight : float or array-like of shape (S,), default=0.0
