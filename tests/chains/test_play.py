@@ -165,3 +165,9 @@ def test_one_motion_is_too_few():
     truth, q, x, _ = log_of(0.0, 0.0)
     with pytest.raises(ValueError, match="at least two motions"):
         fit_play(truth, q, x, np.zeros(len(q)))
+
+
+def test_a_width_beyond_the_dtype_of_the_rows_never_moves_a_tendon():
+    rows = np.array([[0.1, 0.2], [0.3, -0.1]], dtype=np.float32)
+    effective, _ = PlayOperator(1e300).apply(rows)
+    np.testing.assert_array_equal(effective, rows[[0, 0]])
