@@ -173,6 +173,8 @@ class MarkedChain(Chain):
     def _padded(self, parts: Tensor) -> Tensor:
         """Return derivatives (..., S, K, N): zero by segments after all markers."""
         n_after = self.n_segments * self.arcs_per_segment - parts.shape[-3]
+        if n_after == 0:
+            return parts  # `pad` would copy them
         return nn.functional.pad(parts, (0, 0, 0, 0, 0, n_after))
 
     @property
