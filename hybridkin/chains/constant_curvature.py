@@ -189,7 +189,8 @@ class ConstantCurvatureChain(ArcChain):
         by_segment = geometry["angles"].split(self.actuators_per_segment)
         self.bends = bend_counts(by_segment, self.extensible)
         self.stage = stage
-        turns = stage == "rotation" and self.bends[0] == 0
+        named = isinstance(stage, str) and stage == "rotation"
+        turns = named and self.bends[0] == 0
         if stage is not None and not turns:
             raise ValueError(
                 '`stage` must be None or "rotation"; "rotation" needs a first segment with one '

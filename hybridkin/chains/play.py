@@ -153,7 +153,7 @@ class PlayOperator:
         self, motion: Any, state: PlayState | None, name: str, *, lead: bool
     ) -> tuple[Any, PlayState]:
         """Return the effective changes of commands, or the reverse (`lead`), and the last state."""
-        rows = real_array(motion, name)
+        rows = np.array(real_array(motion, name), order="C")  # as the core reads them
         check_shape(rows, name, ("T", self.width.size if self.width.ndim else "n"))
         if not rows.shape[1]:
             raise ValueError(f"`{name}` must hold at least one actuator, got none.")
@@ -180,9 +180,8 @@ def _moved(
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Return effective changes (or with `lead` commands), last command and effective change."""
     command, effective = start
-    half = np.minimum(half, np.finfo(rows.dtype).max / 4).astype(
-        rows.dtype
-    )  # 1e300 in float32
+    most = np.finfo(rows.dtype).max / 4  # wider ones never move a tendon
+    half = np.minimum(half, most).astype(rows.dtype)
     result = np.empty_like(rows)
     for t, row in enumerate(rows):
         if lead:
@@ -206,6 +205,8 @@ def _like(values: NDArray, caller: NDArray | Tensor) -> Any:
 
 def _checked(state: PlayState, n: int) -> PlayState:
     """Return a caller's state for n tendons, checked."""
+    if not isinstance(state, tuple) or len(state) != 2:
+        raise TypeError(f"`state` must be a PlayState, got {state!r:.80}.")
     vectors = []
     for part in state:
         vector = real_array(part, "state")

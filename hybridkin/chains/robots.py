@@ -154,8 +154,8 @@ class Limits:
         return Limits(
             None if np.isinf(q_min).all() else q_min,
             None if np.isinf(q_max).all() else q_max,
-            None if self.dq_max is None else size * self.dq_max,
-            None if self.ddq_max is None else size * self.ddq_max,
+            None if self.dq_max is None else np.multiply(size, self.dq_max),
+            None if self.ddq_max is None else np.multiply(size, self.ddq_max),
         )
 
     def narrowed(self, by: float | np.ndarray) -> Limits:
