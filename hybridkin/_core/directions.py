@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import qr
+from scipy.optimize import linprog
 
 _EXCITED = 0.01  # of the largest spread
 # of the largest value: a range below it is none.
@@ -15,6 +15,7 @@ _ROUNDING = 4.0 * np.finfo(np.float64).eps
 _POINT = 1e-6  # of the largest value: the range of rows of a single configuration
 _COUNTS = 1e-4  # of a step: numbers this close to multiples of a step are whole counts
 _AS_ROUNDED = 2.0  # variances of rounding: what moves less is not distinguished from it
+_INSIDE = 0.05  # part of a unit vector outside a span that counts as zero
 _MENTIONED = 0.05  # of the largest part of a direction
 
 
@@ -71,10 +72,36 @@ def _steps(X: NDArray) -> NDArray:
 def few_terms(directions: NDArray) -> NDArray:
     """Return a sparse basis (K, P) of the span of orthonormal rows (K, P).
 
-    Each row is the only one with a part along its own entry, the reduced row echelon form.
+    For each entry, fixed to 1, minimise the sum of absolute entries; take the shortest independent.
     """
-    pivots = qr(directions, mode="r", pivoting=True)[1][: len(directions)]
-    return np.linalg.solve(directions[:, pivots], directions)
+    (K, P) = directions.shape
+    if K < 2:
+        return directions
+    cost = np.concatenate([np.zeros(K), np.ones(P)])
+    eye = np.eye(P)
+    above = np.block([[directions.T, -eye], [-directions.T, -eye]])
+
+    def shortest(entry: NDArray) -> NDArray:
+        equal = np.concatenate([entry, np.zeros(P)])[None]
+        solution = linprog(
+            cost, above, np.zeros(2 * P), equal, [1.0], bounds=(None, None)
+        ).x
+        # if it fails, the nearest vector.
+        a = entry if solution is None else solution[:K]
+        return a / np.linalg.norm(a)
+
+    columns = directions.T[np.linalg.norm(directions, axis=0) > _INSIDE]
+    candidates = [shortest(entry) for entry in columns]
+    candidates.sort(
+        key=lambda a: np.abs(a @ directions).sum() / np.abs(a @ directions).max()
+    )
+    chosen: list[NDArray] = []
+    while len(chosen) < K:
+        taken = np.array(chosen).reshape(-1, K)
+        remaining = np.linalg.svd(taken)[2][len(chosen) :]
+        free = [a for a in candidates if np.linalg.norm(remaining @ a) > _INSIDE]
+        chosen.append(free[0] if free else shortest(remaining[0]))
+    return np.array(chosen) @ directions
 
 
 def in_terms(directions: NDArray, names: Sequence[str]) -> str:
