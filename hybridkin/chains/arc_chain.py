@@ -567,6 +567,8 @@ class ArcChain(MarkedChain):
         chain = chain.with_geometry(angles=angles)
         markers = []
         for at, *beside in stored.list_of(list, "markers"):
+            if any(isinstance(number, bool) for number in (at, *beside)):
+                raise ValueError("`markers` must hold numbers")
             segment = math.ceil(at) - 1
             markers.append((segment, at - segment, beside))
         return chain.with_markers(markers)
