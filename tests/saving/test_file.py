@@ -167,6 +167,8 @@ def test_arrays_that_do_not_fit_are_refused_with_a_right_checksum_too(tmp_path, 
     q, said = said_of(source)
     unknown = {"noise_variance", "error_model.noise_variance", "error_model.residual"}
     for name, array in arrays.items():
+        if name.startswith("error_model."):
+            continue  # repeats numbers of the module, and is not read
         for damage, changed in _damages(array).items():
             if name in LENGTHS and damage in LENGTHS[name]:
                 continue
