@@ -145,7 +145,7 @@ def test_commands_for_the_recording_run(tmp_path, data_home):
     shutil.copytree(ROOT / "examples" / "robots", tmp_path / "examples" / "robots")
     command = [word for word in RECORDING[-1] if word not in ("--play", "auto")]
     out = hybridkin([*command, *QUICK, "--no-auto"], tmp_path)
-    found = re.findall(r"^ +(mechanical, calibrated|hybrid, ELM) +([\d.]+)", out, re.MULTILINE)
+    found = re.findall(r"^\W+(mechanical, calibrated|hybrid, ELM)[ |]+([\d.]+)", out, re.MULTILINE)
     assert {name: float(mean) < 12.0 for name, mean in found} == {
         "mechanical, calibrated": True,
         "hybrid, ELM": True,

@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from hybridkin import HybridForwardModel, RigidChain, datasets, robots
+from hybridkin import ForwardModel, HybridForwardModel, RigidChain, datasets, robots
 from hybridkin.ik._gram import apply_rows, damped_solve, null_projection, row_gram
 from hybridkin.ik.solver import IKStatus, InverseKinematics
 from hybridkin.ik.tasks import (
@@ -218,13 +218,17 @@ def test_the_solver_stays_in_the_domain_of_a_hybrid_where_it_can(rng):
     assert bare.solve(target, anywhere).converged.all()
 
 
-class Unguided(torch.nn.Module):
+class Unguided(ForwardModel):
     """A model that knows whether q is in its domain, but not how far it is from there."""
 
     def __init__(self, module):
         super().__init__()
         self.module = module
-        self.in_domain, self.n_actuators = module.in_domain, 9
+        self.n_actuators = 9
+        self.n_outputs = 3
+
+    def domain_distance(self, q):
+        return 2.0 * (~self.module.in_domain(q)).to(q)
 
     def forward_and_jacobian(self, q):
         return self.module.forward_and_jacobian(q)
