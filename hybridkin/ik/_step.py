@@ -378,7 +378,7 @@ class _Arrival(NamedTuple):
     upper: Tensor
 
     def end(self, dq: Tensor, motion: Tensor) -> _End:
-        """Return the end of steps dq, whose tips shall make a motion (N, m)."""
+        """Return the end of steps dq, whose tips are to make a motion (N, m)."""
         tip, J = self.settings.evaluate(self.q + dq)
         moved = self.settings.task.difference(self.x, tip)
         return _End(dq, _only_taut(self.settings, J), motion - moved)
