@@ -60,7 +60,7 @@ def test_the_command_writes_everything_or_nothing(tmp_path, capsys):
     for entry in found["asked"]["entries"]:
         answer = "yes" if entry["identified"] else "no"
         assert re.search(rf"{re.escape(entry['name'])} .* {answer}[ |]*\n", printed)
-        assert f"| {entry['name']} [{entry['unit']}] | " in report
+        assert f"| {entry['name']} [{entry['unit']}] | " in re.sub(" +", " ", report)
     for sentence in found["asked"]["unidentified"]:
         assert f"- {sentence}" in report
         assert sentence in plain
