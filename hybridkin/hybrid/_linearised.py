@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from itertools import product
 from math import inf, log10
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -57,6 +57,14 @@ class Products:
             yield rows, block
 
 
+class Solution(NamedTuple):
+    """The fit to all rows."""
+
+    used: Tensor  # (K,), whether the feature has a finite penalty
+    factor: Tensor  # (D, D), the Cholesky factor of the system
+    residual: Tensor  # (N, m)
+
+
 class Linearised:
     """The problem sum_n |y_n - J_n W phi_n|^2 + sum_ck penalty_k W_ck^2.
 
@@ -102,7 +110,7 @@ class Linearised:
 
     def residual(self, readout: Tensor) -> Tensor:
         """Return y - J W phi, shape (N, m)."""
-        return self.y - (self.J @ (self.phi @ readout.mT)[..., None])[..., 0]
+        return self.y - moved_by(self.J, self.phi, readout)
 
     def left_out(self, penalty: Tensor, members: list[Tensor] | None = None) -> Tensor:
         """Return the residual (N, m) of every row from a fit without that row, or its group.
@@ -117,85 +125,109 @@ class Linearised:
         members : list of Tensor, optional
             Rows of every group, the same at every call. None: single rows.
         """
-        n_weights = len(self.gram) * int(torch.isfinite(penalty).sum())
         if members is None:
-            finite, L, residual = self._solved(penalty)
-            leverage = (
-                self.J @ self._spread(finite, torch.cholesky_inverse(L)) @ self.J.mT
-            )
-            return torch.linalg.solve(
-                identity(leverage.shape[1], leverage) - leverage, residual
-            )
-        result = torch.empty_like(self.y)
+            return self._single_rows_left_out(penalty)
+        n_weights = len(self.gram) * int(torch.isfinite(penalty).sum())
         few = n_weights if len(members) > _FOLDS else n_weights // 4
-        whole = None  # the solution for all rows
-        for k, rows in enumerate(members):
-            J = self.J[rows]
-            phi = self.phi[rows]
-            y = self.y[rows]
-            if y.numel() <= few:
-                whole = whole or self._solved(penalty)
-                finite, L, residual = whole
-                A = design(J, phi[:, finite]).flatten(0, 1)
-                white = torch.linalg.solve_triangular(L, A.mT, upper=False)
-                leverage = identity(len(A), A) - white.mT @ white
-                result[rows] = torch.linalg.solve(
-                    leverage, residual[rows].flatten()
-                ).view_as(y)
-                continue
-            if k not in self._apart:
-                self._apart[k] = _gram(J, Products(phi))
-            rest = self.factor(penalty, self._apart[k])
-            readout = solve_kept(self.moment - moment(J, y, phi), *rest)
-            result[rows] = y - (J @ (phi @ readout.mT)[..., None])[..., 0]
-        return result
+        all_rows = None
+        left_out = torch.empty_like(self.y)
+        for group, rows in enumerate(members):
+            if self.y[rows].numel() > few:
+                left_out[rows] = self._refitted_without(group, rows, penalty)
+            else:
+                all_rows = all_rows or self._solved(penalty)
+                left_out[rows] = self._few_left_out(rows, all_rows)
+        return left_out
 
-    def _solved(self, penalty: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the factor, as `factor`, and the residual (N, m) of the fit to all rows."""
-        finite, L = self.factor(penalty)
-        return finite, L, self.residual(solve_kept(self.moment, finite, L))
+    def _solved(self, penalty: Tensor) -> Solution:
+        used, L = self.factor(penalty)
+        residual = self.residual(solve_kept(self.moment, used, L))
+        return Solution(used, L, residual)
 
-    def _spread(self, kept: Tensor, inverse: Tensor) -> Tensor:
+    def _single_rows_left_out(self, penalty: Tensor) -> Tensor:
+        used, L, residual = self._solved(penalty)
+        covariance = self._spread(used, torch.cholesky_inverse(L))
+        leverage = self.J @ covariance @ self.J.mT
+        unexplained = identity(leverage.shape[1], leverage) - leverage
+        return torch.linalg.solve(unexplained, residual)
+
+    def _few_left_out(self, rows: Tensor, all_rows: Solution) -> Tensor:
+        """Return the residuals of one group, from the fit to all rows."""
+        used, L, residual = all_rows
+        A = design(self.J[rows], self.phi[rows][:, used]).flatten(0, 1)
+        white = torch.linalg.solve_triangular(L, A.mT, upper=False)
+        unexplained = identity(len(A), A) - white.mT @ white
+        of_group = residual[rows]
+        return torch.linalg.solve(unexplained, of_group.flatten()).view_as(of_group)
+
+    def _refitted_without(self, group: int, rows: Tensor, penalty: Tensor) -> Tensor:
+        """Return the residuals of one group, from the system without its rows."""
+        J = self.J[rows]
+        phi = self.phi[rows]
+        y = self.y[rows]
+        if group not in self._apart:
+            self._apart[group] = _gram(J, Products(phi))
+        used, L = self.factor(penalty, self._apart[group])
+        readout = solve_kept(self.moment - moment(J, y, phi), used, L)
+        return y - moved_by(J, phi, readout)
+
+    def _spread(self, used: Tensor, inverse: Tensor) -> Tensor:
         """Return the covariance (N, C, C) of W phi, from that of W (D, D)."""
         C = self.J.shape[2]
-        at = kept.nonzero()[:, 0].numpy()
-        K = int(at.max(initial=-1)) + 1
-        whole = np.zeros((C * K, C * K))
-        whole[np.ix_(*[np.add.outer(K * np.arange(C), at).ravel()] * 2)] = (
-            inverse.numpy()
-        )
-        (a, b) = np.tril_indices(C)
-        (k, j) = np.tril_indices(K)
-        blocks = whole.reshape(C, K, C, K)[a, :, b]
+        features = used.nonzero()[:, 0].numpy()
+        K = int(features.max(initial=-1)) + 1
+        # The covariance of all weights: zero for unused features.
+        weights = np.add.outer(K * np.arange(C), features).ravel()
+        covariance = np.zeros((C * K, C * K))
+        covariance[np.ix_(weights, weights)] = inverse.numpy()
+        # phi' S_ab phi is a sum over the products phi_k phi_j, j <= k.
+        a, b = np.tril_indices(C)
+        k, j = np.tril_indices(K)
+        blocks = covariance.reshape(C, K, C, K)[a, :, b]
         folded = blocks[:, k, j] + blocks[:, j, k]
         folded[:, k == j] *= 0.5
         spread = np.empty((C, C, len(self.phi)))
         for rows, block in self._products:
-            spread[a, b, rows] = spread[b, a, rows] = folded @ block[: len(k)]
+            entries = folded @ block[: len(k)]
+            spread[a, b, rows] = entries
+            spread[b, a, rows] = entries
         return torch.from_numpy(spread).permute(2, 0, 1)
 
 
 def _gram(J: Tensor, products: Products) -> Tensor:
     """Return sum_n (J' J)_ab phi phi', shape (C, K, C, K)."""
-    inner = (J.mT @ J).numpy()[(slice(None), *np.tril_indices(J.shape[2]))]
-    sums = sum(inner[rows].T @ block.T for rows, block in products)
-    gram = np.take(sums, _places(products.phi.shape[1]), axis=1)[_places(J.shape[2])]
+    C = J.shape[2]
+    K = products.phi.shape[1]
+    a, b = np.tril_indices(C)
+    of_coordinates = (J.mT @ J).numpy()[:, a, b]
+    sums = np.zeros((_pairs(C), _pairs(K)))
+    for rows, of_features in products:
+        sums += of_coordinates[rows].T @ of_features.T
+    gram = np.take(sums, _places(K), axis=1)[_places(C)]
     return torch.from_numpy(gram.transpose(0, 2, 1, 3).copy())
 
 
-def _pairs(n: Any) -> Any:
+def _pairs(n: int) -> int:
     return n * (n + 1) // 2
 
 
 def _places(n: int) -> NDArray:
     """Return the places (n, n) of the pairs of n items in the list ordered by the larger item."""
     i, j = np.indices((n, n))
-    return _pairs(np.maximum(i, j)) + np.minimum(i, j)
+    larger = np.maximum(i, j)
+    return larger * (larger + 1) // 2 + np.minimum(i, j)
+
+
+def moved_by(J: Tensor, phi: Tensor, readout: Tensor) -> Tensor:
+    """Return J W phi, shape (N, m)."""
+    change = phi @ readout.mT
+    return (J @ change[..., None])[..., 0]
 
 
 def moment(J: Tensor, y: Tensor, phi: Tensor) -> Tensor:
     """Return sum_n J_n' y_n phi_n', shape (C, K)."""
-    return (J.mT @ y[..., None])[..., 0].mT @ phi
+    pulled = (J.mT @ y[..., None])[..., 0]
+    return pulled.mT @ phi
 
 
 def solve_kept(right: Tensor, kept: Tensor, L: Tensor) -> Tensor:
@@ -229,9 +261,11 @@ def basis(phi: Tensor, n_linear: int, most: int) -> Tensor:
     explained = torch.linalg.pinv(linear, rtol=1e-6) @ bent
     rest = bent - linear @ explained
     sizes, axes = torch.linalg.eigh(rest.mT @ rest)
-    axes = axes[:, sizes > _RANK * bent.square().sum()].flip(1)[:, :most]
-    top = torch.cat([identity(n_linear, phi), -explained @ axes], dim=1)
-    return torch.cat([top, torch.nn.functional.pad(axes, (n_linear, 0))])
+    with_data = sizes > _RANK * bent.square().sum()
+    axes = axes[:, with_data].flip(1)[:, :most]
+    of_linear = torch.cat([identity(n_linear, phi), -explained @ axes], dim=1)
+    of_bent = torch.nn.functional.pad(axes, (n_linear, 0))
+    return torch.cat([of_linear, of_bent])
 
 
 def choose(
@@ -255,24 +289,30 @@ def choose(
             if pair not in scores:
                 scores[pair] = score(_penalties(pair))
         limit = (1.0 + _EQUAL) * min(scores.values())
-        return max((pair for pair in scores if scores[pair] <= limit), key=preference)
+        equal = [pair for pair, value in scores.items() if value <= limit]
+        return max(equal, key=preference)
 
     def preference(pair: Pair) -> tuple[int, float, float]:
-        return pair.count(inf), sum(k for k in pair if k < inf), -scores[pair]
+        n_infinite = pair.count(inf)
+        finite = sum(k for k in pair if k < inf)
+        return n_infinite, finite, -scores[pair]
 
     if start is None:
         at = best_of(product(_GRID, _GRID))
         steps = (2.0, 1.0)
     else:
-        at = best_of([(inf, inf), (_half_decades(start[0]), _half_decades(start[1]))])
+        nearest = _half_decades(start[0]), _half_decades(start[1])
+        at = best_of([(inf, inf), nearest])
         steps = (1.0,)
     for step in steps:
         previous = None
         while at != previous:
             previous = at
             linear = _near(at[0], step, _LOW[0])
-            at = best_of(product(linear, _near(at[1], step, _LOW[1])))
-    return _penalties(at), {_penalties(pair): value for pair, value in scores.items()}
+            bent = _near(at[1], step, _LOW[1])
+            at = best_of(product(linear, bent))
+    by_penalties = {_penalties(pair): value for pair, value in scores.items()}
+    return _penalties(at), by_penalties
 
 
 def _near(half_decades: float, step: float, low: float) -> list[float]:
@@ -293,11 +333,12 @@ def quasi_newton(
     slope: Tensor, pairs: list[tuple[Tensor, Tensor]], factor: tuple[Tensor, Tensor]
 ) -> Tensor:
     """Return the L-BFGS inverse Hessian times a slope, from changes of readout and slope."""
-    step_sizes = []
+    forward = []
     for moved, turned in reversed(pairs):
-        step_sizes.append((moved * slope).sum() / (moved * turned).sum())
-        slope = slope - step_sizes[-1] * turned
+        forward.append((moved * slope).sum() / (moved * turned).sum())
+        slope = slope - forward[-1] * turned
     step = solve_kept(slope, *factor)
-    for (moved, turned), share in zip(pairs, reversed(step_sizes), strict=True):
-        step = step + (share - (turned * step).sum() / (moved * turned).sum()) * moved
+    for moved, turned in pairs:
+        backward = (turned * step).sum() / (moved * turned).sum()
+        step = step + (forward.pop() - backward) * moved
     return step
