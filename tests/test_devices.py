@@ -182,23 +182,6 @@ def test_nothing_follows_the_default_device_or_precision(work, tmp_path):
             assert_allclose(found, wanted, rtol=1e-12, atol=1e-12)
 
 
-def test_a_sound_file_loads_and_a_robot_moves(tmp_path):
-    with defaults("meta", torch.float32):
-        save_model(trunk(), tmp_path / "trunk")
-        chain = load_model(tmp_path / "trunk")
-        result = calibrate(chain, Q[:10], X[:10], ("radii",))
-        ik = InverseKinematics(result.chain, q_min=0.1, q_max=0.4)
-        assert ik.solve(X[:1], max_iter=5).q.shape == (1, 3)
-        assert ik.tracker(Q[0]).step(X[0]).shape == (3,)
-    assert chain.base.device.type == "cpu"
-
-
-def test_a_chain_with_a_graph_is_calibrated():
-    radii = torch.tensor([0.05], dtype=torch.float64, requires_grad=True)
-    given = calibrate(trunk().with_geometry(radii=radii), Q, X, ("radii",))
-    assert_allclose(given.values["radii"], calibrate(trunk(), Q, X, ("radii",)).values["radii"])
-
-
 def test_tensors_of_the_package_name_their_device():
     for path in Path(hybridkin.__file__).parent.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

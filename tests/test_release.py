@@ -123,19 +123,6 @@ def test_the_wheel_holds_the_package_and_nothing_else(built):
 
 
 @pytest.mark.slow
-def test_the_wheel_says_what_it_needs(built):
-    about = f"hybridkin-{hybridkin.__version__}.dist-info/"
-    wheel = zipfile.ZipFile(built[1])
-    metadata = wheel.read(about + "METADATA").decode()
-    for extra in PROJECT["optional-dependencies"]:
-        assert f"Provides-Extra: {extra}\n" in metadata
-    for requirement in PROJECT["dependencies"]:
-        assert f"Requires-Dist: {name_of(requirement)}" in metadata
-    assert "hybridkin = hybridkin.cli.main:main" in wheel.read(about + "entry_points.txt").decode()
-    assert about + "licenses/LICENSE" in wheel.namelist()
-
-
-@pytest.mark.slow
 def test_the_sdist_builds_the_same_and_can_be_tested(built):
     sdist = tarfile.open(built[0])
     names = {name.split("/", 1)[1] for name in sdist.getnames()}
@@ -181,17 +168,6 @@ def test_without_a_compiler_the_wheel_is_pure(tmp_path):
     assert not libraries(wheel)
     (line,) = said.strip().splitlines()
     assert "without compiled kernels; no C compiler: /nonexistent/cc -O2 was not found" in line
-
-
-@needs_compiler
-def test_variants_that_a_compiler_does_not_know_are_left_out(hatch_build, tmp_path, monkeypatch):
-    monkeypatch.setattr(hatch_build, "X86", {"v2": "-O0", "v4": "-mno-such-option"})
-    (made,) = hatch_build.compile_into(tmp_path, "linux_x86_64", [])
-    assert made == tmp_path / "hk_v2.so"
-    assert [*tmp_path.iterdir()] == [made]
-    monkeypatch.setattr(hatch_build, "X86", {"v4": "-mno-such-option"})
-    with pytest.raises(OSError, match="no-such-option"):
-        hatch_build.compile_into(tmp_path, "linux_x86_64", [])
 
 
 @needs_compiler

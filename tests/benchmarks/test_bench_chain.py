@@ -1,13 +1,10 @@
 """Chains alone: tip and Jacobian in one pass against automatic derivation and another library."""
 
-from functools import partial
-
 import pytest
 import torch
 from torch.testing import assert_close
 
 from hybridkin import ConstantCurvatureChain, ElasticTendonChain, RigidChain, jacobian
-from hybridkin.native.library import evaluate
 
 
 @pytest.mark.slow
@@ -58,35 +55,6 @@ def test_tendons_that_can_only_pull(race, batch, what):
         lambda: peer(q),
         rows=batch,
         at_most=goal,
-    )
-
-
-def test_cost_per_row_of_a_large_batch(race, chain, draw, timed):
-    large, small = (1_000_000, 10_000) if timed else (64, 8)
-    q = draw(large)
-    few = q[:small].clone()
-    assert_close(chain.forward_and_jacobian(q)[1][:small], chain.forward_and_jacobian(few)[1])
-    race(
-        "chain: tip + J",
-        f"itself, {small:,} rows",
-        lambda: chain.forward_and_jacobian(q),
-        lambda: chain.forward_and_jacobian(few),
-        rows=large,
-        peer_rows=small,
-        at_most=1.3,
-    )
-
-
-def test_one_configuration(race, chain, draw, arm):
-    q = draw(1)[0]
-    x, J = chain.forward_and_jacobian(q)
-    assert_close(J, jacobian(lambda q: chain(q), q))
-    assert_close(x, chain(q))
-    race(
-        "chain: tip + J, NumPy",
-        "pytorch_kinematics (9 joints): J",
-        partial(evaluate, chain, q.numpy(), jacobian=True),
-        lambda: arm.jacobian(q),
     )
 
 

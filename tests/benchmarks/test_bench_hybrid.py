@@ -71,22 +71,6 @@ def test_price_of_the_guard(race, hybrids, draw, trunk, batch, rows):
     )
 
 
-def test_cost_per_row_of_a_large_batch(race, hybrids, draw, timed):
-    large, small = (1_000_000, 10_000) if timed else (64, 8)
-    module, q = hybrids[None], draw(large)
-    few = q[:small].clone()
-    assert_close(module.forward_and_jacobian(q)[1][:small], module.forward_and_jacobian(few)[1])
-    race(
-        WHAT,
-        f"itself, {small:,} rows",
-        of_numpy(module, q),
-        of_numpy(module, few),
-        rows=large,
-        peer_rows=small,
-        at_most=1.15,
-    )
-
-
 class ConstantStrainTrunk:
     """The mechanical part alone in soromox: two curvatures and one stretch per segment.
 

@@ -109,19 +109,6 @@ def test_a_tied_log_warns_in_actuator_terms():
         model.fit(q, measured(nominal, q))
 
 
-@pytest.mark.slow
-def test_without_learning_the_held_out_error_decides():
-    q = chambers(60)
-    x = measured(bent(), q)
-    nominal, one_motion = ConstantCurvatureChain([0.05]), np.zeros(60)
-    choice = choose_geometry(nominal, q, x, groups=one_motion, outside=False)
-    assert len(choice.errors) > 1
-    assert all(math.isnan(errors.io) for errors in choice.errors.values())
-    assert choice.name == "radii + rest_bends + base"
-    model = HybridForwardModel(nominal, "drop", calibrate="auto").fit(q, x)
-    assert set(model.calibration_.values) == set(choice.parameters)
-
-
 def test_rows_held_out_of_a_long_log_are_predicted_from_evenly_spaced_others():
     """Of many rows 500 calibrate: with exact tips they give the robot, with noise nearly."""
     truth = bent(base=moved_base())

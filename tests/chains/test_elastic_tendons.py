@@ -137,17 +137,6 @@ def test_one_tendon_pulled_by_hand():
     assert_close(bend[0], torch.tensor([radius * tension / bending, 0.0]).double())
 
 
-def test_a_common_pull_shortens_and_pretension_grows():
-    chain = ElasticTendonChain([0.005], [0.1], axial_stiffness=1.5, tendon_zeros=0.001)
-    q = torch.full((3,), -0.002, dtype=torch.float64)
-    length, bend = chain.arcs(q)
-    assert float(length) == pytest.approx(0.1 - 3 * 0.003 / (3 + 1.5), rel=1e-13)
-    assert_close(bend, torch.zeros_like(bend), rtol=0, atol=1e-15)
-    assert_close(chain.tensions(q), torch.full_like(q, 0.001), rtol=1e-12, atol=0)
-    more = chain.with_geometry(tendon_zeros=chain.tendon_zeros + 0.001)
-    assert (more.tensions(q) > chain.tensions(q)).all()
-
-
 def test_slack_tendons_hang(rng):
     chain, q = robot(), random_q(rng, 200)
     looser = q + 0.01 * chain.slack(q)  # however far
@@ -243,26 +232,6 @@ def test_geometry_jacobian_is_that_of_autograd(chain, rng):
     each = [chain.geometry_jacobian(q, {name: value}) for name, value in both.items()]
     J = chain.geometry_jacobian(q, both)
     assert_close(J, sum(each), rtol=0, atol=1e-12 * float(J.abs().max()))
-
-
-def test_robots_and_rows_may_be_mapped_over(rng):
-    """By torch.func.vmap: several robots at the same rows, one at several, each at its own."""
-    chain = robot()
-    q = random_q(rng, 6, chain.n_actuators).reshape(2, 3, -1)
-    radii = torch.stack([chain.radii, 1.1 * chain.radii])
-
-    def tips(own, rows):
-        return chain.with_geometry(radii=own)(rows)
-
-    expected = torch.stack([torch.stack([tips(own, rows) for rows in q]) for own in radii])
-    vmap = torch.func.vmap
-    assert_close(vmap(tips, (0, None))(radii, q[0]), expected[:, 0], rtol=0, atol=1e-13)
-    assert_close(vmap(tips, (None, 0))(radii[0], q), expected[0], rtol=0, atol=1e-13)
-    assert_close(
-        vmap(tips, (None, 1))(radii[1], q.transpose(0, 1)), expected[1], rtol=0, atol=1e-13
-    )
-    each = torch.stack([expected[0, 0], expected[1, 1]])
-    assert_close(vmap(tips)(radii, q), each, rtol=0, atol=1e-13)
 
 
 def test_what_is_kept_follows_the_geometry(rng):
@@ -371,8 +340,3 @@ def test_calibration_finds_stiffness_rest_bends_and_zeros(rng):
 def test_bad_input_says_what_is_needed(make, message):
     with pytest.raises(ValueError, match=message):
         make()
-
-
-def test_displacements_in_millimetres_are_noticed():
-    (message,) = robot().check_actuators(torch.full((9,), 5.0))
-    assert "`q` reaches 5, which looks like millimetres" in message

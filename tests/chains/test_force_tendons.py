@@ -3,7 +3,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from hybridkin import ForceTendonChain, calibrate, load_model, save_model
+from hybridkin import ForceTendonChain, calibrate
 
 DOWN = torch.tensor([0.3, -0.2, 1.0])
 
@@ -73,14 +73,6 @@ def test_derivatives_of_the_energy():
     assert_close(statics.hessian(arcs), torch.einsum("injn->nij", second))
 
 
-def test_more_arcs_converge():
-    tips = [chain(arcs=arcs)(forces()) for arcs in (4, 8, 16)]
-    first = (tips[0] - tips[2]).norm()
-    second = (tips[1] - tips[2]).norm()
-    assert second < 0.3 * first
-    assert first < 0.01
-
-
 def test_turning_base_and_gravity_turns_the_tip():
     turn = torch.linalg.matrix_exp(torch.tensor([[0, 1.0, 2], [-1, 0, 0.5], [-2, -0.5, 0]]))
     base = torch.eye(4, dtype=torch.float64)
@@ -124,19 +116,6 @@ def test_geometry_jacobian_against_differences():
         assert_close(J, (above - below) / (2 * step), rtol=1e-5, atol=1e-8)
 
 
-def test_poses_backbone_and_pose_agree():
-    body = chain()
-    q = forces(2)
-    assert body.poses(q).shape == (2, 3, 4, 4)
-    assert_close(body.poses(q)[:, -1], body.pose(q))
-    assert_close(body.pose(q)[:, :3, 3], body(q))
-    points = body.backbone(q, 5)
-    assert points.shape == (2, 11, 3)
-    assert_close(points[:, [0, 5, 10]], body.poses(q)[:, :, :3, 3])
-    J = body.pose_jacobian(q)
-    assert_close(J[:, :3], body.forward_and_jacobian(q)[1])
-
-
 def test_batches_dtypes_and_negative_forces():
     body = chain()
     q = forces(4)
@@ -160,16 +139,6 @@ def test_calibration_finds_stiffness_and_weight():
     assert result.rmse < 1e-8
     np.testing.assert_allclose(result.values["weight"], 2.0, rtol=1e-4)
     np.testing.assert_allclose(result.values["taper"], [0.3, 0.5], rtol=1e-4)
-
-
-def test_saved_and_read(tmp_path):
-    body = chain().with_markers([(0, 0.4, (0.01, 0.0, 0.02)), (1, 1.0)])
-    shifted = body.with_geometry(marker_offsets=body.marker_offsets + 0.01)
-    save_model(shifted, tmp_path / "model")
-    read = load_model(tmp_path / "model")
-    assert isinstance(read, ForceTendonChain)
-    assert_close(read(forces()), shifted(forces()), rtol=0, atol=1e-14)
-    assert_close(read.tip_model(forces()), shifted(forces())[:, 3:])
 
 
 @pytest.mark.parametrize(

@@ -97,19 +97,3 @@ def test_lengths_are_positive_in_metres():
         chain.check_actuators(torch.tensor([[110.0, 120.0, -50.0], [110.0, 50.0, -50.0]]))
     (message,) = chain.check_actuators(torch.tensor([[1e6, 120.0, -50.0]]))
     assert message.startswith("`q` times `gains` reaches 20, which looks like millimetres")
-
-
-def test_elastic_tendons_of_a_counted_chain():
-    _, counted, metres, q = pair("tendons", 2.0)
-    plain = ElasticTendonChain.from_chain(counted.with_geometry(gains=torch.ones_like(COUNTS)))
-    elastic = ElasticTendonChain.from_chain(counted)
-    assert_close(elastic.tendon_zeros, COUNTS * ZEROS)
-    assert_close(elastic(q), plain(metres + plain.tendon_zeros))
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_gains_are_described(kind):
-    _, chain, _, q = pair(kind)
-    stored = chain.stored()
-    assert_close(type(chain).from_stored(stored, None)(q), chain(q))
-    assert chain.default_parameters.count("gain") == 1

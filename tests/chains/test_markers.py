@@ -6,7 +6,6 @@ import torch
 from torch.testing import assert_close
 
 from hybridkin import ConstantCurvatureChain, ElasticTendonChain
-from hybridkin._core import plan
 from hybridkin.chains.chain import Chain
 from hybridkin.native.library import evaluate, program_of
 
@@ -84,19 +83,6 @@ def test_the_compiled_core_has_one_marker(chain, k):
     assert_close(torch.from_numpy(slope), J, rtol=1e-9, atol=1e-10)
     assert_close(one.pose_jacobian(q)[:, :3], J)
     assert (program_of(one) is not None) == (k > 1 and program_of(chain) is not None)
-
-
-def test_markers_beside_the_backbone_have_no_kernel(chain):
-    with pytest.raises(plan.NoKernel, match="beside the backbone"):
-        plan.Plan(chain.with_markers(MARKERS).stored())
-
-
-def test_other_chains_keep_the_markers():
-    plain = CHAINS["tendons"]().with_markers(MARKERS)
-    assert ElasticTendonChain.from_chain(plain).markers == plain.markers
-    assert plain.with_geometry(radii=2.0 * plain.radii).markers == plain.markers
-    assert plain.tip_model.markers == plain.markers[-1:]
-    assert plain.with_tip(3.0)(rows_of(plain)).shape == (12, 3)
 
 
 @pytest.mark.parametrize(

@@ -252,15 +252,3 @@ def test_only_tendons_contradict_each_other():
     assert chain.contradiction(q) is None
     q[:, 8:] = -0.01  # a common pull of a pair
     assert "segment 4, 10 mm rms" in chain.contradiction(q)
-
-
-def test_two_pairs_elsewhere_in_the_plane_are_one():
-    angles = [0.3, 0.3 + PI, 0.3 + 2 * PI]
-    one = ConstantCurvatureChain([0.01], n_actuators=3, angles=angles, lengths=[0.1])
-    two = ConstantCurvatureChain([0.01], n_actuators=2, angles=angles[:2], lengths=[0.1])
-    q = torch.tensor([[0.01, -0.01]], dtype=torch.float64)
-    assert_close(one(torch.cat([q, q[:, :1]], 1)), two(q), rtol=0, atol=1e-16)
-    assert one.float().with_geometry().bends == (1,)
-    assert ConstantCurvatureChain(
-        [0.01], n_actuators=2, angles=angles[:2], dtype=torch.float32
-    ).bends == (1,)

@@ -1,5 +1,3 @@
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -10,7 +8,6 @@ from torch.testing import assert_close
 
 from hybridkin import ConstantCurvatureChain, PlayOperator, fit_play
 
-EXAMPLE = Path(__file__).parents[2] / "examples" / "plot_slack_tendons.py"
 ROWS = st.integers(1, 12).flatmap(
     lambda T: arrays(np.float64, (T, 3), elements=st.floats(-0.01, 0.01))
 )
@@ -30,13 +27,6 @@ def test_play_by_hand():
     close(y.ravel(), np.array([0.0, 0.0, 0.75, 0.75, 0.75, 0.5, 1.75]))
     close(state.command, np.array([2.0]))
     close(state.effective, np.array([1.75]))
-
-
-@CHECKS
-@given(q=ROWS)
-def test_no_width_is_the_identity(q):
-    close(PlayOperator(0.0).apply(q)[0], q)
-    close(PlayOperator(0.0).command(q)[0], q)
 
 
 @CHECKS
@@ -73,11 +63,6 @@ def test_commanding_is_the_inverse(past, y, width):
         reached, state = play.apply(q, before)
         close(reached, y)
         close(np.stack(state), np.stack(sent))
-
-
-def test_a_resting_tendon_keeps_its_command():
-    y = np.array([[0.0], [1.0], [1.0], [0.5], [0.5]])
-    close(PlayOperator(0.5).command(y)[0].ravel(), np.array([0.0, 1.25, 1.25, 0.25, 0.25]))
 
 
 def test_motions_start_afresh_wherever_their_rows_lie(rng):
@@ -150,15 +135,6 @@ def test_widths_are_doubled_while_the_largest_is_the_best():
     assert fit.width == 1.6e-3
     close(fit.widths[-4:], np.array([0.4e-3, 0.8e-3, 1.6e-3, 3.2e-3]))
     assert fit.cv_rmse.shape == fit.widths.shape
-
-
-@pytest.mark.slow
-def test_no_play_is_kept_where_there_is_none():
-    truth, q, x, groups = log_of(0.0, 1e-3)
-    fit = fit_play(truth, q, x, groups, (0.1e-3, 0.4e-3), ("radii",), loss="soft_l1")
-    assert not fit.kept
-    assert fit.width == 0.0
-    close(fit.widths, np.array([0.0, 0.1e-3, 0.4e-3]))
 
 
 def test_one_motion_is_too_few():

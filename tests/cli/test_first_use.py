@@ -1,7 +1,6 @@
 """`init` and `demo`: the first commands of a new user."""
 
 import io
-import itertools
 import json
 import re
 import sys
@@ -87,14 +86,6 @@ def test_init_of_motors(tmp_path, capsys, options, metres):
     assert robot.log.q_unit == options[1]
 
 
-def test_every_key_of_the_file_has_a_comment(tmp_path, capsys):
-    run(capsys, "init", tmp_path / "r.toml", *TENDONS, "--q-sign", "1")
-    lines = (tmp_path / "r.toml").read_text().splitlines()
-    for before, line in itertools.pairwise(lines):
-        if " = " in line and not line.startswith("#"):
-            assert before.startswith("# ") or line.startswith("x_unit"), line
-
-
 def test_init_reads_the_header_of_a_log_and_checks_it(log, tmp_path, capsys):
     path = tmp_path / "robot.toml"
     code, out, err = run(capsys, "init", path, *TENDONS, "--q-sign", "-1", "--log", log)
@@ -151,18 +142,6 @@ def test_init_without_what_it_needs_writes_nothing(tmp_path, capsys, options, me
     assert code == 2
     assert message in err
     assert not [*tmp_path.iterdir()]
-
-
-def test_init_replaces_a_file_only_by_force(tmp_path, capsys):
-    path = tmp_path / "robot.toml"
-    path.write_text("mine")
-    options = [*TENDONS, "--q-sign", "1"]
-    code, _, err = run(capsys, "init", path, *options)
-    assert code == 2
-    assert "--force" in err
-    assert path.read_text() == "mine"
-    assert run(capsys, "init", path, *options, "--force")[0] == 0
-    assert robots.from_toml(path).n_actuators == 6
 
 
 class Terminal(io.StringIO):

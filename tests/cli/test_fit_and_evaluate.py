@@ -8,7 +8,7 @@ import pytest
 import torch
 from simulated_log import COLUMNS, FIT, HEADER, ROBOT, document, rows, run, write
 
-from hybridkin import datasets, load_model, robots, workflow
+from hybridkin import load_model, robots, workflow
 from hybridkin.cli.main import main
 
 
@@ -220,21 +220,6 @@ def test_describe_tells_what_a_model_is(fitted, capsys):
     assert f"Model: hybrid, auto, {record['training']['chosen']}" in in_one_line(printed)
 
 
-def test_describe_of_a_description_and_of_what_is_none(fitted, tmp_path, capsys):
-    code, printed, _ = run(capsys, "describe", fitted / "robot.toml")
-    assert code == 0
-    assert printed.startswith("two segments: ConstantCurvatureChain, 6 actuators")
-    assert "0.0055, 0.0055" in printed
-    code, _, errors = run(capsys, "describe", fitted / "log.csv")
-    assert code == 2
-    assert "--robot" in errors
-    other = tmp_path / "other.safetensors"
-    other.write_bytes(b"no model")
-    code, _, errors = run(capsys, "describe", other)
-    assert code == 2
-    assert "not a model" in errors
-
-
 @pytest.mark.parametrize(
     ("option", "play"), [("auto", "auto"), ("0.4", 4e-4), ("0", 0.0), (None, "detect")]
 )
@@ -251,31 +236,3 @@ def test_play_reaches_the_fit_in_metres(log, robot, tmp_path, monkeypatch, optio
     assert main([str(argument) for argument in arguments]) == 2
     assert seen == [play]
     assert type(seen[0]) is type(play)
-
-
-def test_play_needs_motions_in_the_order_of_time(robot, tmp_path, capsys):
-    table = rows()
-    table[[3, 4], 0] = table[[4, 3], 0]
-    log = write(tmp_path / "log.csv", table)
-    arguments = ["fit", log, "--robot", robot, "--out", tmp_path / "m", "--play", "auto", *FIT]
-    assert "sort the log by motion and time" in run(capsys, *arguments)[2]
-    assert "--no-auto" in run(capsys, *arguments, "--no-auto")[2]
-    robot.write_text(ROBOT.replace('groups = "motion"', ""))
-    code, _, errors = run(capsys, *arguments)
-    assert code == 2
-    assert "--groups" in errors
-
-
-@pytest.mark.slow
-def test_fit_of_armlab_as_csv_with_nothing_but_a_robot_description(data_home, tmp_path, capsys):
-    data = datasets.load_armlab(data_home)
-    table = np.column_stack([-1e3 * data.q, 1e3 * data.x, data.groups])
-    header = "cable_1,cable_2,cable_3,tip_x,tip_y,tip_z,line"
-    log, out = tmp_path / "armlab.csv", tmp_path / "m"
-    np.savetxt(log, table, delimiter=",", header=header, comments="", fmt="%.6g")
-    arguments = [log, "--robot", "examples/robots/armlab_3cable.toml", "--out", out]
-    code, record = document(capsys, "fit", *arguments, *FIT, "--max-rows", "440", "--no-auto")
-    assert (code, record["n_whole"]) == (0, 24019)
-    assert {f["kind"] for f in record["log_check"]["findings"]} == {"jumps"}
-    held_out = {name: entry["mean"] for name, entry in record["held_out"].items()}
-    assert held_out["hybrid, ELM"] < 0.5 * held_out["mechanical, calibrated"] < 0.003

@@ -1,7 +1,5 @@
 """Files that another command or program wrote are replaced only by --force."""
 
-import json
-
 import numpy as np
 import pytest
 import torch
@@ -50,24 +48,6 @@ def home(tmp_path, monkeypatch):
 
 def content(folder):
     return {path.name: path.read_bytes() for path in folder.iterdir()}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("command", COMMANDS)
-def test_no_file_of_another_command_is_replaced(home, capsys, command):
-    out = home / "out"
-    run = [command, *COMMANDS[command], "--out", "out"]
-    assert main(run) == 0
-    record = json.loads((out / "report.json").read_text())
-    assert record["command"] == command
-    (out / "report.json").write_text(json.dumps({**record, "command": "other"}))
-    before = content(out)
-    capsys.readouterr()
-    assert main(run) == 2
-    _, err = capsys.readouterr()
-    assert all(name in err for name in before)  # those of every file that the command writes
-    assert "--force" in err
-    assert content(out) == before
 
 
 @pytest.mark.slow

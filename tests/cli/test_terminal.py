@@ -1,14 +1,9 @@
 """Progress, notes and warnings on standard error; tables on a terminal and elsewhere."""
 
-import io
-import re
-
 import pytest
-from rich.console import Console
 
 from hybridkin.cli import _terminal
 from hybridkin.cli._terminal import Stages
-from hybridkin.cli.main import main
 from hybridkin.workflow import Report
 
 
@@ -64,23 +59,6 @@ def test_quiet_leaves_warnings_and_what_is_important(clock, capsys):
     ]
 
 
-def test_a_terminal_shows_a_bar_and_the_time_left(clock):
-    text = io.StringIO()
-    stages = Stages()
-    stages._console = Console(file=text, force_terminal=True, width=100)
-    stages("tracking", 0, 4)
-    clock[0] += 40.0
-    stages("tracking", 1, 4)
-    stages._bar.refresh()
-    stages.warn("far [mm]")
-    stages("drawing", 0, 1)
-    stages.close()
-    plain = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", text.getvalue())
-    assert "tracking: 1 of 4, about 2.0 min left" in plain
-    assert "hybridkin: warning: far [mm]" in plain
-    assert "drawing" in plain
-
-
 def test_a_report_is_markdown_and_its_text_has_the_same_tables():
     report = Report("A table", {})
     report.text("**Bold** words.")
@@ -93,20 +71,3 @@ def test_a_report_is_markdown_and_its_text_has_the_same_tables():
     )
     assert report.markdown() == f"# A table\n\n**Bold** words.\n\n{table}\n"
     assert report.plain() == f"A table\n\nBold words.\n\n{table}"
-
-
-def test_a_quiet_command_prints_its_result_only(tmp_path, capsys):
-    robot, log = tmp_path / "robot.toml", tmp_path / "log.csv"
-    robot.write_text('[log]\nq = ["a", "b"]\nx = ["x", "y", "z"]\n')
-    rows = [
-        f"{0.01 * i},{0.02 * (i % 7)},{0.01 * i},{0.02 * (i % 7)},{0.1 + 1e-4 * i**2}"
-        for i in range(40)
-    ]
-    log.write_text("a,b,x,y,z\n" + "\n".join(rows) + "\n")
-    arguments = ["describe", str(log), "--robot", str(robot)]
-    assert main(arguments) == 0
-    loud = capsys.readouterr()
-    assert main([*arguments, "--quiet"]) == 0
-    quiet = capsys.readouterr()
-    assert "reading and checking the log ..." in loud.err
-    assert (quiet.err, quiet.out) == ("", loud.out)

@@ -1,13 +1,11 @@
 """`next`, `track`, `animate` and `export`: from a model to commands."""
 
 import re
-import shutil
 
 import numpy as np
 import pytest
 import torch
 from simulated_log import COLUMNS, ROBOT, document, rows, run, write
-from sklearn.kernel_ridge import KernelRidge
 
 import hybridkin
 from hybridkin import PlayOperator, datasets, load_model, save_model
@@ -161,21 +159,6 @@ def test_track_leads_in_from_where_the_robot_stands(robot, tmp_path, capsys):
         assert run(capsys, *arguments, f"--from={start}")[0] == 2
 
 
-@pytest.mark.slow
-def test_track_without_known_limits_asks_for_them(fitted, tmp_path, capsys):
-    bare = tmp_path / "robot.toml"
-    bare.write_text(ROBOT[: ROBOT.index("[limits]")])
-    shape = ["--shape", "line", "--size", "0,10,0", "--out", tmp_path / "t"]
-    code, _, errors = run(capsys, "track", bare, *shape)
-    assert code == 2
-    assert "--q-min" in errors
-    # A fitted model knows the range that it was fitted on.
-    shutil.copy(fitted / "model" / "model.safetensors", tmp_path / "alone.safetensors")
-    alone = ["track", tmp_path / "alone.safetensors", *shape, "--unit", "mm", "--dt", "0.1"]
-    code, record = document(capsys, *alone)
-    assert (code, record["limits"]["source"]) == (0, "training range")
-
-
 @pytest.fixture(scope="module")
 def playful(tmp_path_factory):
     """A folder with a model whose actuators have play, its robot and a log of it."""
@@ -235,25 +218,3 @@ def test_track_with_play_tells_what_to_send_and_what_it_does(playful, tmp_path, 
     model = load_model(playful / "model.safetensors")
     assert np.linalg.norm(model.predict(sent) - target, axis=1).max() < 1e-4
     assert "actuators: 0.4 mm" in run(capsys, "describe", playful)[1]
-
-
-@pytest.mark.slow
-def test_first_track_of_a_kernel_model_stays_where_the_model_is_at_home(tmp_path, capsys):
-    """Most of the box around its training rows lies outside the domain of such a model."""
-    table = rows(10, 24)
-    table = table[table[:, 1] > 1.0]  # mm: a half of the workspace
-    q, x = -1e-3 * table[:, 1:7], 1e-3 * table[:, 7:10]
-    kernel = KernelRidge(kernel="rbf", gamma=1e5, alpha=1e-3)
-    path = tmp_path / "kernel.safetensors"
-    model = hybridkin.HybridForwardModel(CHAIN, kernel).fit(q, x)
-    save_model(model, path)
-    low, high = q.min(axis=0), q.max(axis=0)
-    box = np.random.default_rng(0).uniform(low, high, (500, 6))
-    assert model.in_domain(box).mean() < 0.5
-    track = ["track", path, *SHAPE, "--size", "10,5", "--out", tmp_path / "track"]
-    code, record = document(capsys, *track)
-    assert code == 0
-    assert record["statuses"] == {"CONVERGED": record["n"]}
-    assert record["in_domain"] == 1.0
-    np.testing.assert_allclose(record["limits"]["q_min"], low)
-    np.testing.assert_allclose(record["limits"]["q_max"], high)

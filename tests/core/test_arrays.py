@@ -3,7 +3,7 @@ import pytest
 import torch
 from numpy.testing import assert_array_equal
 
-from hybridkin._core.arrays import check_shape, labels, leading, shaped, table
+from hybridkin._core.arrays import check_shape, leading, shaped, table
 
 
 def test_shapes_of_lengths_letters_and_leading_axes():
@@ -26,15 +26,6 @@ def test_shapes_of_lengths_letters_and_leading_axes():
     assert_array_equal(shaped([[1, 2]], "x", "T2", 1), [[1.0, 2.0]])
     with pytest.raises(ValueError, match=r"`t` must have shape \(3,\), got \(2,\)"):
         shaped([0.0, 1.0], "t", "T", 3)
-
-
-def test_labels_of_any_kind():
-    assert_array_equal(labels(np.array(["a", 1, None], dtype=object), 3), ["a", "1", "None"])
-    assert_array_equal(labels(torch.tensor([2, 1]), 2), [2, 1])
-    assert_array_equal(labels(torch.tensor([2.0, 1.0], requires_grad=True), 2), [2, 1])
-    assert labels([True, False], 2).dtype == bool
-    with pytest.raises(ValueError, match=r"`groups` must have shape \(3,\).*one entry for each"):
-        labels([1, 2], 3)
 
 
 def test_batches_that_do_not_agree_are_named():

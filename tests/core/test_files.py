@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from hybridkin import robots
 from hybridkin._core.files import write_file, write_files
 
 FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # as of a call that knows no name
@@ -46,6 +45,3 @@ def test_a_name_that_is_too_long_is_the_one_in_the_message(tmp_path, length):
     with pytest.raises(OSError, match="too long") as caught:
         write_file(tmp_path / name, Path.touch)
     assert caught.value.filename == str(tmp_path / name)
-
-
-CHAIN = robots.bionic_handling_assistant()

@@ -12,7 +12,6 @@ from hybridkin.datasets import _npz, load_armlab, load_log
 from hybridkin.ik import trajectories
 
 Q, X = ["q1", "q2", "q3"], ["x", "y", "z"]
-HEADER = "q1,q2,q3,x,y,z,motion\n"
 
 
 def npy(shape, descr="<f8"):
@@ -52,32 +51,6 @@ def test_an_npz_that_expands_without_measure(tmp_path, monkeypatch):
     np.savez_compressed(path, q=np.zeros((10**5, 3)))
     with pytest.raises(ValueError, match="expands to 2 MB"):
         load_log(path, Q, X)
-
-
-def test_a_parquet_of_one_value_repeated(tmp_path, monkeypatch):
-    monkeypatch.setattr(_npz, "_MOST", 10**6)
-    pd = pytest.importorskip("pandas")
-    pytest.importorskip("pyarrow")
-    path = tmp_path / "log.parquet"
-    pd.DataFrame({"q1": np.zeros(400_000, dtype=bool)}).to_parquet(path)
-    with pytest.raises(ValueError, match="expands to 3 MB"):
-        load_log(path, Q, X)
-
-
-def test_a_wide_header_over_short_rows_costs_what_the_file_holds(tmp_path):
-    path = tmp_path / "log.csv"
-    wide = HEADER.strip() + "".join(f",c{k}" for k in range(9_000)) + "\n"
-    path.write_text(wide + "0,0,0,0,0,0,a\n" * 3_000)
-    assert load_log(path, Q, X).q.shape == (3_000, 3)
-
-
-def test_messages_have_an_end(tmp_path):
-    path = tmp_path / "log.csv"
-    for text in ("q" * 9_999 + ",a\n0,0\n", HEADER + "9" * 9_999 + "x,0,0,0,0,0,a\n"):
-        path.write_text(text)
-        with pytest.raises(ValueError, match=r"log\.csv") as caught:
-            load_log(path, Q, X)
-        assert len(str(caught.value)) < 3_000
 
 
 def test_paths_that_are_no_text_or_no_file(tmp_path):

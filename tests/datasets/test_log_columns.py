@@ -51,14 +51,6 @@ def test_dates_and_durations_are_seconds(tmp_path, unit):
         assert_allclose(log.time, FIRST + SECONDS, rtol=1e-15)
 
 
-def test_a_time_zone_does_not_change_the_time(tmp_path):
-    pd = pytest.importorskip("pandas")
-    dates = pd.date_range("2024-03-31 00:30", periods=N, freq="1h", tz="UTC")  # summer time begins
-    local = load_log(parquet(tmp_path, t=dates.tz_convert("Europe/Berlin")), **NAMES, time="t")
-    assert_array_equal(local.time - local.time[0], 3600.0 * np.arange(N))
-    assert local.time[0] == dates[0].timestamp()
-
-
 def test_a_missing_date_is_a_missing_value(tmp_path):
     dates = np.datetime64("2024-01-01") + np.arange(N).astype("m8[s]")
     dates[2] = "NaT"
@@ -66,15 +58,6 @@ def test_a_missing_date_is_a_missing_value(tmp_path):
         load_log(npz(tmp_path, t=dates), **NAMES, time="t")
     log = load_log(npz(tmp_path, t=dates), **NAMES, time="t", drop_invalid=True)
     assert_array_equal(log.time, FIRST + np.array([0, 1, 3, 4, 5]))
-
-
-@pytest.mark.parametrize("name", ["a", "X"])
-@pytest.mark.parametrize("kind", ["M8[s]", "m8[ms]"])
-def test_dates_are_no_actuators_and_no_tips(tmp_path, name, kind):
-    dates = np.arange(N).astype(kind)
-    for write in (npz, parquet):
-        with pytest.raises(ValueError, match=rf"Column '{name}' .* must hold numbers, got .*time"):
-            load_log(write(tmp_path, **{name: dates}), **NAMES)
 
 
 # a column has one use

@@ -10,13 +10,12 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.stats import multivariate_normal
 from sklearn.base import BaseEstimator, RegressorMixin
 
-from hybridkin import ConstantCurvatureChain, HybridForwardModel, load_model, save_model
+from hybridkin import ConstantCurvatureChain, HybridForwardModel
 from hybridkin.hybrid import _radius
 from hybridkin.hybrid._adapt import _Problem
 from hybridkin.hybrid._drift import MISFITS, SWITCH, Drift
-from hybridkin.hybrid._error_models import _LEAST, NoCorrection, RegressorModel
+from hybridkin.hybrid._error_models import NoCorrection
 from hybridkin.hybrid._features import Features
-from hybridkin.hybrid._kernel import tuned_kernel
 from hybridkin.hybrid._readout_fit import _Problem as ReadoutProblem
 from hybridkin.hybrid._readout_fit import fit_readout
 from hybridkin.hybrid._rows import Rows
@@ -38,14 +37,6 @@ def log(n, seed=0, noise=1e-4):
 
 
 # Kernel
-
-
-def test_the_kernel_does_not_depend_on_the_unit_of_its_inputs():
-    q, x = log(40)
-    ones = np.ones(40)
-    plain, scaled = (tuned_kernel(unit * q, x, ones, None) for unit in (1.0, 1024.0))
-    assert scaled.alpha == plain.alpha
-    assert scaled.gamma == pytest.approx(plain.gamma / 1024.0**2)
 
 
 # Blend
@@ -163,16 +154,6 @@ def test_a_regressor_that_takes_groups_gets_them(groups):
         assert_array_equal(model.error_model_.groups_, groups)
 
 
-def test_a_radius_that_cannot_be_is_refused(tmp_path):
-    model = HybridForwardModel(CHAIN, "drop", coverage=0.5).fit(*log(30))
-    known = model.radius_
-    for change in ({"coverage": 1.5}, {"coverage": 0.0}, {"n_rows": inf}):
-        model.radius_ = known._replace(**change)
-        save_model(model, tmp_path / "model.safetensors")
-        with pytest.raises(ValueError, match="`radius` must hold"):
-            load_model(tmp_path / "model.safetensors")
-
-
 # Noise, and changes of the robot
 
 
@@ -220,33 +201,6 @@ def test_the_likeliest_noise_is_that_of_the_normal_density():
             return -float(counts @ sizes)
 
         assert found == pytest.approx(max([inf, *ratios], key=density))
-
-
-class Memory(RegressorMixin, BaseEstimator):
-    """Predicts the targets of the rows it was fitted to, all of them off by a length."""
-
-    def __init__(self, off):
-        self.off = off
-
-    def fit(self, X, y):
-        self.X_, self.y_ = X, y
-        return self
-
-    def predict(self, X):
-        nearest = ((X[:, None] - self.X_) ** 2).sum(-1).argmin(1)
-        return self.y_[nearest] + self.off
-
-
-def test_a_regressor_that_knows_its_rows_by_heart_has_some_noise():
-    """Its errors are no less than a share of the spread before learning."""
-    rng = np.random.default_rng(0)
-    y = rng.standard_normal((50, 3)) * [1.0, 2.0, 3.0] + 5.0
-    rows = Rows(rng.standard_normal((50, 2)), y, residual=y)
-    for off in (0.0, 10.0):
-        model = RegressorModel(Memory(off))
-        fitted = model.fit(rows, Spec(None, model))
-        expected = max(off, _LEAST * y.var(axis=0).mean() ** 0.5)
-        assert fitted.noise == pytest.approx(expected)
 
 
 def test_the_derivative_of_a_pose_by_a_change_of_the_robot():

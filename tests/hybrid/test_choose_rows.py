@@ -108,16 +108,6 @@ def test_the_order_of_candidates_and_the_unit_do_not_matter():
     assert_allclose(doubled, 2.0 * error, rtol=1e-9)
 
 
-def test_fewer_rows_are_the_first_of_more():
-    q = lengths(50)
-    rows, error = choose_rows(trunk(), q, 50)
-    assert sorted(rows) == [*range(50)]
-    assert (np.diff(error) < 0.0).all()
-    few, larger = choose_rows(trunk(), q, 7)
-    assert_array_equal(few, rows[:7])
-    assert_allclose(larger, error[:7])
-
-
 def test_rows_for_a_path_leave_less_error_there():
     q = lengths(200)
     path = np.linspace(q[0], q[1], 20)
@@ -126,12 +116,6 @@ def test_rows_for_a_path_leave_less_error_there():
     known = explicit(trunk(), q, q[:0], path)
     assert_allclose(error[-1] ** 2, known(rows.tolist()), rtol=1e-9)
     assert error[-1] ** 2 < 0.5 * known(everywhere.tolist())
-
-
-def test_what_is_measured_is_not_measured_again():
-    q = lengths(30)
-    measured = np.concatenate([q[:10]] * 20)
-    assert set(choose_rows(trunk(), q, 10, measured=measured)[0]).isdisjoint(range(10))
 
 
 def test_a_hybrid_stands_for_its_mechanical_model():

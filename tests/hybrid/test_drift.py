@@ -5,11 +5,9 @@ import copy
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from scipy.optimize import brentq
 from sklearn.linear_model import Ridge
 
 from hybridkin import HybridForwardModel, datasets, load_model, robots, save_model
-from hybridkin.hybrid._drift import Drift
 
 PAYLOAD = np.array([[0.1, -0.2, 0.0], [0.0, 0.1, 0.3], [0.05, 0.0, -0.1]])
 
@@ -101,15 +99,3 @@ def test_a_robot_that_has_not_changed_is_left_alone():
         assert rms(same, q[1000:], x[1000:]) < 1.1 * before
     moved = copy.deepcopy(model).partial_fit(q[new], x[new] + 0.1)
     assert rms(moved, q[1000:], x[1000:] + 0.1) < 0.06
-
-
-@pytest.mark.parametrize(("gain", "changed"), [(3.0, False), (5.0, True)])
-def test_a_change_needs_a_gain_of_two_for_offset_and_slope_each(gain, changed):
-    """An offset e of n rows, in noise s, gains (r - 1 - log r) / 2, with r = n e^2 / s^2."""
-    n, noise = 100, 0.01
-    r = brentq(lambda r: 0.5 * (r - 1.0 - np.log(r)) - gain, 1.0, 100.0)
-    offset = noise * np.sqrt(r / n)
-    gram, moment = np.diag([n, 0.0]), np.array([[n * offset], [0.0]])
-    squares = np.array(n * noise**2 + n * offset**2)
-    drift = Drift(np.zeros(1), np.ones(1), gram[None], moment, squares)
-    assert (drift.likeliest_alpha(noise) < np.inf) == changed

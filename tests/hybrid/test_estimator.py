@@ -12,7 +12,6 @@ from sklearn.ensemble import RandomForestRegressor
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.kernel_ridge import KernelRidge
 from sklearn.linear_model import LinearRegression
-from sklearn.model_selection import GridSearchCV, GroupKFold, cross_val_score
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import MinMaxScaler, PolynomialFeatures
 from sklearn.utils.estimator_checks import parametrize_with_checks
@@ -24,13 +23,10 @@ from hybridkin import (
     ELMRegressor,
     ELMRegressorCV,
     HybridForwardModel,
-    IKStatus,
-    InverseKinematics,
     datasets,
     jacobian,
     robots,
 )
-from hybridkin.ik.trajectories import figure_eight
 
 
 class SmallSum(torch.nn.Module):
@@ -79,10 +75,6 @@ def bha():
     return robots.bionic_handling_assistant()
 
 
-def error_of(model, q, x):
-    return np.linalg.norm(model.predict(q) - x, axis=1).mean()
-
-
 def quadratic():
     return make_pipeline(MinMaxScaler((-1, 1)), PolynomialFeatures(2), LinearRegression())
 
@@ -98,16 +90,6 @@ def test_the_sum_of_the_paper(log):
     assert_allclose(
         model.predict_mechanical(q) + model.predict_error(q), model.predict(q), atol=1e-14
     )
-
-
-def test_learning_the_error_helps_on_other_motions(log):
-    q, x, groups = log
-    train = groups < 9
-    mechanical = HybridForwardModel(bha(), "drop").fit(q[train], x[train])
-    hybrid = HybridForwardModel(bha(), random_state=0).fit(q[train], x[train])
-    data_driven = HybridForwardModel(random_state=0).fit(q[train], x[train])
-    errors = [error_of(m, q[~train], x[~train]) for m in (hybrid, mechanical, data_driven)]
-    assert errors[0] < 0.5 * min(errors[1:])
 
 
 @pytest.mark.parametrize("guard", ["leverage", "box", None])
@@ -164,24 +146,6 @@ def test_calibration_happens_inside_fit(log):
     nominal = ConstantCurvatureChain([0.10, 0.10, 0.10])
     model = HybridForwardModel(nominal, "drop", calibrate=("radii",)).fit(q, x, groups=groups)
     assert model.calibration_.cv_rmse > model.calibration_.rmse
-
-
-@pytest.mark.slow
-def test_cross_validation_and_search_by_groups(log):
-    q, x, groups = log
-    model = HybridForwardModel(bha(), ELMRegressor(random_state=0))
-    scores = cross_val_score(model, q, x, cv=GroupKFold(5), groups=groups)
-    assert scores.shape == (5,)
-    assert scores.min() > 0.99
-    search = GridSearchCV(
-        model,
-        {"error_model__alpha": [1e-4, 1e-1, 1e3], "guard": ["leverage", None]},
-        cv=GroupKFold(3),
-        n_jobs=2,
-    ).fit(q, x, groups=groups)
-    assert search.best_params_["error_model__alpha"] < 1e3
-    default = GridSearchCV(HybridForwardModel(bha()), {"error_model__alpha": [1e-2, 1e3]})
-    assert default.fit(q, x).best_params_ == {"error_model__alpha": 1e-2}
 
 
 @pytest.mark.parametrize("coupling", ["parallel", "serial"])
@@ -367,36 +331,6 @@ def test_no_configuration_is_far_from_the_mechanical_model(guard, error_model):
     assert_close(module.forward_and_jacobian(at)[0], module(at), rtol=0, atol=1e-9)
     reverse = torch.func.vmap(torch.func.jacrev(module))(at)
     assert_close(module.jacobian(at), reverse, rtol=1e-6, atol=1e-6 * float(reverse.abs().max()))
-
-
-def test_rows_that_cannot_be_written_to_are_read_without_a_word():
-    q = np.random.default_rng(0).uniform(0.2, 0.3, (20, 9))
-    q.flags.writeable = False
-    chain = robots.bionic_handling_assistant()
-    x = chain(torch.from_numpy(q.copy())).numpy()
-    HybridForwardModel(chain, "linear", calibrate="default").fit(q, x)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "error_model", [KernelRidge(kernel="rbf", gamma=1e4, alpha=1e-3), None, "quadratic"]
-)
-def test_a_log_of_balanced_tendons_is_not_left_by_common_pulls(error_model):
-    """Nothing tells what a common pull does; that must be no way out for an inverse."""
-    chain = ConstantCurvatureChain([0.005, 0.005], lengths=[0.1, 0.1], routing="base")
-    rng = np.random.default_rng(0)
-    balanced = rng.uniform(-0.004, 0.004, (300, 2, 3))
-    q = (balanced - balanced.mean(axis=2, keepdims=True)).reshape(-1, 6)
-    x = chain(torch.from_numpy(q)).numpy() + 0.002 * np.sin(800.0 * q[:, :3])
-    model = HybridForwardModel(chain, error_model, random_state=0).fit(q, x)
-    assert model.in_domain(q).all()
-    # The domain ends a hundredth of the range beside the plane of the log.
-    pulled = np.repeat([[1e-5, 1e-4, 4e-3]], 6, axis=0).T
-    assert model.in_domain(pulled).tolist() == [True, False, False]
-    ik = InverseKinematics(model, q_min=-0.02, q_max=0.02, q_pref=0.0, dt=0.02)
-    track = ik.track(figure_eight((0.0, 0.0, 0.195), (0.03, 0.02), duration=5.0, dt=0.02))
-    assert (track.status == IKStatus.CONVERGED).all()
-    assert np.abs(track.q.reshape(-1, 2, 3).mean(axis=2)).max() < 1e-8
 
 
 def test_warnings_of_units_name_the_line_of_the_caller():

@@ -41,28 +41,6 @@ def without(x, share=0.3, seed=1):
     return np.where(missing.repeat(3, axis=1), np.nan, x)
 
 
-MODELS = {
-    "drop": {"error_model": "drop", "calibrate": ("radii", "base")},
-    "ELM": {"random_state": 0},
-    "regressor": {"error_model": LinearRegression(), "guard": None},
-    "serial pose": {"error_model": "pose", "coupling": "serial"},
-}
-
-
-@pytest.mark.parametrize("name", MODELS)
-def test_every_kind_of_hybrid_has_several_markers(name):
-    q, x = log(50)
-    model = HybridForwardModel(CHAIN, **MODELS[name]).fit(q, without(x))
-    learned = model.error_model_
-    assert learned is None if name == "drop" else len(learned) == 3
-    new = log(5, 3)[0]
-    found = model.predict(new)
-    assert model.in_domain(q).mean() > 0.7  # all but rows that one marker has not seen
-    tip = model.module_.tip_model
-    np.testing.assert_allclose(tip(torch.from_numpy(new)).numpy(), found[:, 6:], atol=1e-13)
-    assert (program_of(tip) is not None) == (program_of(CHAIN.tip_model) is not None)
-
-
 def test_outside_the_robot_every_marker_is_learned_alone():
     q, x = log(60)
     missing = without(x)
@@ -143,28 +121,6 @@ def test_inverse_kinematics_steers_the_tip_or_all_markers():
     found = every.solve(target, q0=q[:3] + 0.003)
     assert found.converged.all()
     np.testing.assert_allclose(model.predict(found.q), target, atol=1e-4)
-
-
-@pytest.mark.parametrize("names", [["base", "actuator_zeros"], ["actuator_zeros"]])
-@pytest.mark.parametrize("K", [2, 3])
-def test_adapt_and_partial_fit_take_all_markers(names, K):
-    columns = np.s_[:, 9 - 3 * K :]
-    q, x = log(60)
-    chain = CHAIN.with_markers(MARKERS[3 - K :])
-    model = HybridForwardModel(chain, "linear", coupling="serial").fit(q, x[columns])
-    new, seen = log(8, 3)
-    moved = seen[columns].copy()
-    if "base" in names:
-        moved = moved + np.tile([0.05, 0.0, -0.02], K)
-        model.adapt(new, moved, parameters=names)
-    else:
-        model.adapt(new - 0.004, moved, parameters=names)
-        new = new - 0.004
-    assert np.abs(model.predict(new) - moved).max() < 5e-3
-    tip = model.module_.tip_model(torch.from_numpy(new)).detach().numpy()
-    np.testing.assert_allclose(tip, model.predict(new)[:, -3:], atol=1e-12)
-    followed = model.partial_fit(new, moved + 0.01, alpha=1e-3)
-    assert np.abs(followed.predict(new) - moved - 0.01).max() < 5e-3
 
 
 @pytest.mark.parametrize(

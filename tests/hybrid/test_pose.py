@@ -16,9 +16,7 @@ from hybridkin import (
     ELMRegressor,
     HybridForwardModel,
     InverseKinematics,
-    load_model,
     robots,
-    save_model,
 )
 from hybridkin._core.model import PoseModel
 from hybridkin._core.rotations import rotation
@@ -338,15 +336,6 @@ def test_a_change_of_the_robot_is_followed(log):
     followed = model.predict(unseen)
     assert millimetres(followed, y).mean() < 0.2 * millimetres(stale, y).mean()
     assert degrees(followed, y).mean() < 0.2 * degrees(stale, y).mean()
-
-
-def test_files_of_another_output_are_damaged(log, tmp_path):
-    q, y = log
-    positions = HybridForwardModel(bha(), LinearRegression()).fit(q, y[:, :3])
-    positions.output = "pose"
-    save_model(positions, tmp_path / "model.safetensors")
-    with pytest.raises(ValueError, match="damaged"):
-        load_model(tmp_path / "model.safetensors")
 
 
 class TipOnly(torch.nn.Module):

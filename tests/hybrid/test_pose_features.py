@@ -76,17 +76,6 @@ def test_values_are_axes_and_moments_of_the_poses(robot, rng):
     assert phi.abs().max() < 2.0
 
 
-def test_a_moment_of_weight_is_a_readout(rng):
-    # The moment of a weight at the end about the end of segment 1, in the frame there.
-    chain, q = rows_of("trunk", rng, 20)
-    g = torch.tensor([0.3, -0.5, 0.8], dtype=torch.float64)
-    poses = torch.linalg.solve(chain.base, chain.poses(q))
-    R, lever = poses[:, 1, :3, :3], poses[:, -1, :3, 3] - poses[:, 1, :3, 3]
-    moment = (R.mT @ torch.linalg.cross(lever, g.expand(20, 3))[..., None])[..., 0]
-    phi = features_of(chain, q)(q)[:, 10 + 3 + 9 : 10 + 3 + 18]
-    assert_close(chain.reach * (phi.unflatten(1, (3, 3)) @ g), moment)
-
-
 @every_robot
 def test_slope(robot, rng):
     chain, q = rows_of(robot, rng, 12)

@@ -68,15 +68,6 @@ def test_as_many_groups_as_the_coverage_needs(n, finite):
     assert len(found) == (not finite)
 
 
-def test_rows_without_groups_count_one_by_one():
-    model, messages, _ = few(3, 0.99, groups=False)
-    assert model.radius_.inside == np.inf
-    assert "at least 99" in messages[-1]
-    model, messages, _ = few(3, 12 / 13, groups=False)
-    assert np.isfinite(model.radius_.inside)
-    assert not messages
-
-
 def test_the_scale_of_the_weights_has_no_influence():
     q, x, motion = motions(0, 20)
     weights = np.random.default_rng(0).integers(0, 4, len(q)).astype(float)

@@ -1,4 +1,4 @@
-from math import inf, log10
+from math import inf
 
 import pytest
 import torch
@@ -9,14 +9,11 @@ from hybridkin._core.model import ForwardModel
 from hybridkin.hybrid._features import Features, HiddenFeatures, QuadraticFeatures, Readout
 from hybridkin.hybrid._linearised import (
     Linearised,
-    basis,
-    choose,
     design,
     members_of,
-    solve_kept,
 )
 from hybridkin.hybrid._module import HybridModule, InnerCorrection, TipCorrection
-from hybridkin.hybrid._readout_fit import _Problem, _tips, fit_readout
+from hybridkin.hybrid._readout_fit import _Problem, fit_readout
 from hybridkin.hybrid._rows import Rows
 
 ARM = """
@@ -199,14 +196,6 @@ def solved(linear, penalty, rows):
     return weights.reshape(linear.J.shape[2], -1)
 
 
-def test_optimum_of_the_linearised_problem(rng):
-    linear, penalty = ridge(rng)
-    expected = solved(linear, penalty, torch.arange(30))
-    optimum = solve_kept(linear.moment, *linear.factor(penalty))
-    assert_close(optimum, expected, atol=1e-12, rtol=1e-10)
-    assert (expected[:, 2] == 0).all()
-
-
 @pytest.mark.parametrize("sizes", [None, [1] * 30, [3] * 10, [2, 28], [15, 14, 1]])
 def test_rows_left_out_equal_fits_without_them(sizes, rng):
     linear, penalty = ridge(rng)
@@ -221,20 +210,6 @@ def test_rows_left_out_equal_fits_without_them(sizes, rng):
         out = groups == label
         expected = linear.residual(solved(linear, penalty, ~out))[out]
         assert_close(found[out], expected, atol=1e-10, rtol=1e-10)
-
-
-@pytest.mark.parametrize("at", [3.0, 2.0, 1.4])
-@pytest.mark.parametrize("elastic", [False, True])
-def test_tips_of_arcs_are_those_of_the_chain(at, elastic, rng):
-    geometry = {"lengths": [0.1, 0.09, 0.08], "offsets": [0.01, 0.02, 0.03]}
-    base = torch.eye(4, dtype=torch.float64)
-    base[:3, :3] = torch.linalg.qr(uniform(rng, 3, 3))[0]
-    base[:3, 3] = uniform(rng, 3)
-    kind = ElasticTendonChain if elastic else ConstantCurvatureChain
-    chain = kind([0.01, 0.009, 0.008], base=base, **geometry).with_tip(at)
-    z = chain.coordinates(0.004 * uniform(rng, 20, 9))[0]
-    found = _tips(chain)(z)
-    assert_close(found, chain.from_coordinates_and_jacobian(z), rtol=1e-12, atol=1e-14)
 
 
 def test_rows_left_out_of_the_whole_fit(rng):
@@ -290,65 +265,3 @@ def test_pure_noise_chooses_no_correction(rng):
     fit = read_out(chain, QuadraticFeatures.of_range(q), q, x)
     assert (hybrid(chain, fit.readout)(q) - chain(q)).norm(dim=1).mean() < 5e-4
     assert fit.scores[inf, inf] <= 1.01 * min(fit.scores.values())
-
-
-@pytest.mark.slow
-def test_choice_is_never_worse_than_nothing_on_rows_left_out(rng):
-    chain, q = rows_of("tendons", rng, 24)
-    for size in (0.003, 0.01, 0.03):
-        x = disturbed(chain, q, rng, size=size, noise=0.01)[1]
-        groups = torch.arange(24) // 6
-        fit = read_out(chain, QuadraticFeatures.of_range(q), q, x, groups=groups)
-        left = torch.from_numpy(fit.residual)
-        assert left.norm() <= (1 + 1e-9) * (x - chain(q)).norm()
-
-
-def shaken(truth, q, rng):
-    """Return tips of actuators that were elsewhere by 1 mm, measured with 0.5 mm of noise."""
-    moved = truth(q + 1e-3 * torch.randn(q.shape, generator=rng, dtype=q.dtype))
-    return moved + 5e-4 * torch.randn(moved.shape, generator=rng, dtype=q.dtype)
-
-
-def test_noise_of_the_actuators_is_told_from_that_of_the_tip(rng):
-    chain, q = rows_of("trunk", rng, 1500)
-    args = Features.of_range(q), q, q[:, :3], torch.ones(len(q)).double()
-    problem = _Problem(chain, *args, serial=True)
-    assert 0.1 < problem.likeliest_ratio(shaken(chain, q, rng) - chain(q)) < 0.6  # 0.25
-    assert problem.likeliest_ratio(1e-3 * uniform(rng, 1500, 3)) > 100.0
-
-
-def test_choice_finds_the_least_of_a_bowl():
-    scores = lambda pair: 1.0 + (pair[0] - 0.1) ** 2 + (1.0 / pair[1] - 0.1) ** 2  # noqa: E731
-    found, tried = choose(scores)
-    assert_close(found, (0.1, 10.0))
-    assert len(tried) < 50
-    odd = lambda pair: (log10(pair[0]) + 0.5) ** 2 + (log10(pair[1]) - 1.5) ** 2  # noqa: E731
-    assert_close(choose(odd)[0], (10.0**-0.5, 10.0**1.5))  # to half a decade
-    assert choose(lambda pair: 1.0)[0] == (inf, inf)
-
-
-def test_basis_keeps_the_linear_features_and_separates_the_others(rng):
-    phi = torch.cat([uniform(rng, 50, 4), uniform(rng, 50, 6).abs()], 1)
-    turned = phi @ basis(phi, 4, 100)
-    assert_close(turned[:, :4], phi[:, :4])
-    inner = turned.mT @ turned
-    assert inner[:4, 4:].abs().max() < 1e-10
-    assert_close(inner[4:, 4:], inner[4:, 4:].diagonal().diag(), atol=1e-10, rtol=0)
-    assert (phi[:8] @ basis(phi[:8], 4, 100)).shape == (8, 8)
-    assert (phi @ basis(phi, 4, 2)).shape == (50, 6)
-
-
-def test_rows_with_missing_markers_do_not_count_for_the_ratio_of_noise(rng):
-    """Without the rows of missing markers the ratio is the same."""
-    chain, q = rows_of("trunk", rng, 60)
-    x, weight = chain(q), torch.ones(60).double()
-    x[::3] = torch.nan
-    residual = shaken(chain, q, rng) - chain(q)
-    residual[::3] = 0.0
-    seen = ~x.isnan().any(1)
-    of = lambda k: _Problem(chain, Features.of_range(q), q[k], x[k], weight[k], True)  # noqa: E731
-    ratio = of(seen).likeliest_ratio(residual[seen])
-    assert 0.0 < ratio < inf
-    every = of(torch.arange(60))
-    # the scale of the tried ratios is the mean over the rows with tips, too
-    assert every.likeliest_ratio(residual) == pytest.approx(ratio)

@@ -2,14 +2,12 @@
 
 import pickle
 import warnings
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
 from sklearn.base import clone
-from sklearn.kernel_ridge import KernelRidge
 
 from hybridkin import (
     ConstantCurvatureChain,
@@ -82,26 +80,6 @@ def test_it_says_what_it_chose(chosen):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("grouped", [False, True], ids=["rows", "motions"])
-def test_penalties_of_few_motions_make_held_out_errors_too_small(grouped):
-    chain = ConstantCurvatureChain([0.05])
-    scores, expected, new = [], [], []
-    for seed in range(3):
-        rng = np.random.default_rng(seed)
-        q = rng.uniform(0.2, 0.3, (420, 3))
-        off = 0.01 * np.sin(q @ rng.uniform(-30.0, 30.0, (3, 3)))
-        x = chain(torch.from_numpy(q)).numpy() + off + 2e-3 * rng.standard_normal(q.shape)
-        groups = np.arange(20) if grouped else None
-        model = HybridForwardModel(chain, "auto", calibrate=(), random_state=0)
-        model.fit(q[:20], x[:20], groups=groups)
-        scores.append(model.cv_results_["mean_distance"][-1])
-        expected.append(model.cv_results_["expected_distance"])
-        new.append(np.linalg.norm(model.predict(q[20:]) - x[20:], axis=1).mean())
-    assert np.sum(expected) > 1.05 * np.sum(scores)
-    assert 0.9 < np.sum(expected) / np.sum(new) < 1.3
-
-
-@pytest.mark.slow
 def test_candidates_are_the_models_that_auto_compared(chosen, trunk, tmp_path):
     q = torch.from_numpy(trunk[0])
     weights = chosen.cv_results_["weights"]
@@ -141,46 +119,6 @@ def test_slack_tendons_get_elastic_ones():
         as_given.fit(q[:80], x[:80])
     assert len(said) == 1  # of all rows, not of every fold and candidate again
     assert isinstance(as_given.mechanical_model_, ConstantCurvatureChain)
-
-
-@pytest.mark.slow
-def test_fits_in_threads_are_independent():
-    """The filters for warnings belong to the process: no fit may touch them."""
-    rng, groups = np.random.default_rng(0), np.arange(40) // 8
-    chain = ConstantCurvatureChain([0.04])
-    logs = []
-    for _ in range(2):
-        q = rng.uniform(0.18, 0.22, (40, 3))
-        x = chain(torch.from_numpy(q + 9.0 * (q[:, ::-1] - 0.2) ** 2)).numpy()
-        logs.append((q, x + 1e-3 * rng.standard_normal(x.shape)))
-
-    def predicted(k):
-        start = ConstantCurvatureChain([0.05])
-        model = HybridForwardModel(start, "auto", calibrate=("radii",), random_state=0)
-        model.fit(*logs[k % 2], groups=groups)
-        return model.module_(torch.from_numpy(logs[0][0])).numpy()
-
-    one_by_one = [predicted(k) for k in range(2)]
-    filters = [*warnings.filters]
-    with ThreadPoolExecutor(4) as pool:
-        at_once = [*pool.map(predicted, range(4))]
-    assert warnings.filters == filters
-    assert_allclose(at_once, 2 * one_by_one, rtol=0, atol=1e-12)
-
-
-@pytest.mark.slow
-def test_kernel_by_name_is_tuned_on_motions(trunk):
-    q, x = trunk
-    groups = np.arange(250) // 5
-    model = HybridForwardModel(bha(), "kernel").fit(q[:250], x[:250], groups=groups)
-    assert model.error_model_.kernel == "rbf"
-    errors = [
-        np.linalg.norm(m.fit(q[:250], x[:250]).predict(q[250:]) - x[250:], axis=1).mean()
-        for m in (model, HybridForwardModel(bha(), KernelRidge(kernel="rbf")))
-    ]
-    assert errors[0] < 0.9 * errors[1]
-    with pytest.raises(TypeError, match="inside the robot"):
-        HybridForwardModel(bha(), "kernel", coupling="serial").fit(q, x)
 
 
 @pytest.mark.slow

@@ -114,13 +114,6 @@ def test_one_domain_in_torch_and_compiled(kind, groups):
             assert_allclose(found, distance, rtol=1e-8, atol=1e-12)
 
 
-def test_the_warning_names_what_does_not_move():
-    q = log("rest")
-    q[:, 1] = 0.5 - q[:, 0]
-    with pytest.warns(UserWarning, match=r"along (\+1 q\[0\] \+1 q\[1\]; \+1 q\[4\]|\+1 q\[4\]; )"):
-        HybridForwardModel(CHAIN, "linear").fit(q, tips(q))
-
-
 @pytest.mark.parametrize("n", [3, 5])
 def test_few_rows_move_as_many_directions_as_they_can(n):
     """Then only the warning of few rows is given; the corrections are constant all the same."""
@@ -129,28 +122,6 @@ def test_few_rows_move_as_many_directions_as_they_can(n):
         model = HybridForwardModel(CHAIN, "quadratic").fit(q, tips(q))
     assert len(caught) == 1
     assert not model.in_domain(q + 0.5 * across(q)[0]).any()
-
-
-@pytest.mark.slow
-def test_one_posture_with_auto_and_a_radius():
-    q = log("posture")
-    model = fitted(q, "auto", calibrate=(), coverage=0.5)
-    new = np.vstack([q[:1], log("all")[1:]])
-    assert_array_equal(model.predict(new), model.predict_mechanical(new))
-    assert_array_equal(model.in_domain(new), [True] + [False] * 39)
-    radius = model.predict(new, return_radius=True)[1]
-    assert np.isfinite(radius[0])
-    assert np.isinf(radius[1:]).all()
-
-
-def test_one_posture_of_several_markers():
-    chain = CHAIN.with_markers([(0, 1.0), (1, 1.0)])
-    q = log("posture")
-    x = chain(torch.from_numpy(q)).numpy() + 1e-3 * np.random.default_rng(1).random((40, 6))
-    with pytest.warns(UserWarning, match="single configuration"):
-        model = HybridForwardModel(chain, "linear").fit(q, x)
-    assert_array_equal(model.predict(q), model.predict_mechanical(q))
-    assert_array_equal(model.in_domain(log("all")), [True] + [False] * 39)
 
 
 def test_without_a_mechanical_model_the_tip_is_constant_where_no_row_moves():

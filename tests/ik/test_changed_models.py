@@ -199,19 +199,6 @@ def test_a_refit_makes_a_tracker_forget_the_offset(array):
         assert (missed < 1e-5) == (refit is adapt)
 
 
-def test_limits_of_the_model_are_those_of_the_refit():
-    model = HybridForwardModel(ConstantCurvatureChain([0.02, 0.018]), "drop")
-    q = DRAW.uniform(0.1, 0.14, (30, 6))
-    x = model.mechanical_model(torch.from_numpy(q)).numpy()
-    ik = InverseKinematics(model.fit(q, x))
-    given = InverseKinematics(model, q_min=0.05)
-    assert float(ik.settings.q_min.max()) == 0.0
-    model.set_params(mechanical_model=ConstantCurvatureChain([0.02, 0.018], actuator_zeros=0.01))
-    model.fit(q, x)
-    np.testing.assert_array_equal(ik.settings.q_min.numpy(), np.full(6, 0.01))
-    assert given.settings.q_min.tolist() == 0.05
-
-
 def test_a_refit_for_another_robot_is_refused():
     model, n = fitted(), "must keep its 6 actuators, but now has 3"
     ik = InverseKinematics(model, q_min=0.05, q_max=0.2)
@@ -239,22 +226,6 @@ def test_a_pose_task_follows_its_estimator():
     np.testing.assert_array_equal(after, fresh.step(NOW, poses[8].numpy()).dq)
 
 
-def test_arguments_are_copied():
-    given = {name: torch.full((6,), a).double() for name, a in [("q_min", 0.1), ("q_max", 0.2)]}
-    given |= {name: torch.ones(6).double() for name in ("dq_max", "ddq_max", "weights")}
-    given["q_pref"] = torch.full((6,), 0.15).double()
-    normals, offsets = torch.eye(3).double(), torch.ones(3).double()
-    ik = InverseKinematics(CHAIN, **given, tip_limits=(normals, offsets))
-    limits = ik.settings.tip_limits
-    before = [getattr(ik.settings, name).clone() for name in given]
-    before += [limits.normals.clone(), limits.offsets.clone()]
-    for a in (*given.values(), normals, offsets):
-        a += 1.0
-    after = [getattr(ik.settings, name) for name in given] + [limits.normals, limits.offsets]
-    for was, now in zip(before, after, strict=True):
-        np.testing.assert_array_equal(was, now)
-
-
 def test_a_thread_waits_until_another_one_has_done_its_step():
     inside, go_on, done = threading.Event(), threading.Event(), []
 
@@ -279,11 +250,3 @@ def test_a_thread_waits_until_another_one_has_done_its_step():
     go_on.set()
     [thread.join(10.0) for thread in (first, second)]
     assert len(done) == 2
-
-
-def test_an_error_in_a_step_gives_the_turn_back():
-    tracker = InverseKinematics(CHAIN, q_min=0.05, q_max=0.2).tracker(NOW)
-    for _ in range(2):
-        with pytest.raises(ValueError, match="x_target"):
-            tracker.step([1.0, 2.0])
-    assert tracker.step(TARGET).shape == (6,)

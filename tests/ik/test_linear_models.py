@@ -5,22 +5,13 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from hybridkin import ConstantCurvatureChain, InverseKinematics, RigidChain
-from hybridkin.ik._gram import (
-    adaptive_damping,
-    apply_columns,
-    apply_rows,
-    damped_solve,
-    row_gram,
-    solve_rows,
-)
+from hybridkin import InverseKinematics, RigidChain
 from hybridkin.ik.solver import IKStatus
 from hybridkin.ik.tasks import PositionTask
 from hybridkin.ik.trajectories import Trajectory
 
 A = torch.randn(3, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 MODEL = (lambda q: q @ A.T, lambda q: A.expand(*q.shape[:-1], 3, 5))
-TENDONS = ConstantCurvatureChain([0.02] * 2, lengths=[0.1] * 2)
 
 
 def test_a_trajectory_brings_its_times_and_t_goes_before_them():
@@ -71,38 +62,6 @@ def test_rows_without_limits_start_again_each_around_itself():
     assert found.n_starts[2] == 1
 
 
-def test_a_step_is_stopped_where_a_plane_turns_it():
-    """Only then; a step along the plane, or away from it, is free. Signs of q do not matter."""
-    ik = InverseKinematics(MODEL, tip_limits=([[0.0, 0.0, 1.0]], [1e-3]), beta=0.0)
-    way = torch.tensor([[0.1, -0.2, 9.0], [0.1, -0.2, -0.3], [-0.1, 0.2, 0.0], [-0.1, 0.0, 0.9e-3]])
-    expected = torch.tensor([True, False, False, False])
-    for k, target in enumerate(way.double()):
-        tracker = ik.tracker(torch.zeros(5, dtype=torch.float64))
-        tracker.step(target)
-        assert (tracker.status is IKStatus.AT_LIMITS) == expected[k]
-        tracker.step(target)
-        assert_close(tracker.x, torch.where(target == 9.0, 1e-3, target), rtol=0.0, atol=1e-12)
-
-
-@pytest.mark.parametrize("m", [2, 3, 6])
-def test_lost_rows_and_no_motion_at_all_leave_finite_numbers(m):
-    """J with dependent rows: what can be reached is, with and without eigenvalues."""
-    draw = torch.Generator().manual_seed(3)
-    J = torch.randn(4, m, 8, generator=draw, dtype=torch.float64)
-    J[::2, -1] = J[::2, 0]
-    J[1] = 0.0
-    v = apply_rows(J, torch.randn(4, 8, generator=draw, dtype=torch.float64))
-    gram = row_gram(J)
-    for mu in (damped_solve(gram, v), solve_rows(J, v, v.new_zeros(4))):
-        assert_close(apply_rows(J, apply_columns(J, mu)), v, rtol=1e-6, atol=1e-6)
-        assert (mu[1] == 0.0).all()
-    assert (gram.sigma_min[[0, 2]] < 1e-6).all()
-    assert gram.sigma_max[1] == gram.sigma_min[1] == 0.0
-    damping = adaptive_damping(gram)
-    assert damping[1] == 0.0
-    assert_close(damping[[0, 2]], (0.02 * gram.sigma_max[[0, 2]]) ** 2, rtol=1e-3, atol=0.0)
-
-
 def test_angles_come_into_uneven_limits_by_whole_turns():
     origins = np.tile(np.eye(4), (2, 1, 1))
     arm = RigidChain(origins, [[0.0, 0.0, 1.0]] * 2, tool=[1.0, 0.0, 0.0])
@@ -123,16 +82,6 @@ def test_a_gap_in_a_path_stops_the_feed_forward_only_there():
     np.testing.assert_allclose(track.x[known], path[known], rtol=0.0, atol=1e-12)
     np.testing.assert_allclose(track.x[2:4], path[[1, 1]], rtol=0.0, atol=1e-12)
     assert track.status[2] == IKStatus.INVALID_INPUT
-
-
-def test_a_tracker_of_a_model_with_parameters_has_no_graph():
-    B = A.clone().requires_grad_()
-    q = torch.ones(5, dtype=torch.float64)
-    model = (lambda q: q @ B.T, lambda q: B.expand(*q.shape[:-1], 3, 5))
-    tracker = InverseKinematics(model).tracker(q)
-    assert not tracker.x.requires_grad
-    assert_close(tracker.x, A @ q)
-    assert not tracker.step(torch.ones(3, dtype=torch.float64)).requires_grad
 
 
 def test_a_posture_costs_no_accuracy():

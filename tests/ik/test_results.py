@@ -1,12 +1,7 @@
-from dataclasses import FrozenInstanceError
-
 import numpy as np
 import pytest
 
-from hybridkin import InverseKinematics, robots
 from hybridkin.ik.results import IKStatus, Track
-
-TRUNK = robots.bionic_handling_assistant()
 
 
 def a_track(q, error):
@@ -25,14 +20,3 @@ def test_figures_of_a_track_leave_out_what_is_not_known():
     assert repr(track) == text
     empty = a_track(np.empty((0, 2)), [])
     assert repr(empty) == "Track(0 targets; no error known; largest step 0)"
-
-
-TRUNK_TIP = TRUNK(TRUNK.base.new_full((9,), 0.25)).numpy()
-
-
-def test_results_are_frozen():
-    ik = InverseKinematics(TRUNK, q_min=0.1, q_max=0.4)
-    q, target = np.full(9, 0.25), TRUNK_TIP
-    for result in (ik.solve(target), ik.track(target[None], q0=q), ik.step(q, target)):
-        with pytest.raises(FrozenInstanceError):
-            result.error = 0.0

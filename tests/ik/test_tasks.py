@@ -6,7 +6,7 @@ import torch
 from torch.testing import assert_close
 
 from hybridkin import ForwardModel, HybridForwardModel, RigidChain, datasets, robots
-from hybridkin.ik._gram import apply_rows, damped_solve, null_projection, row_gram
+from hybridkin.ik._gram import apply_rows
 from hybridkin.ik.solver import IKStatus, InverseKinematics
 from hybridkin.ik.tasks import (
     PointsTask,
@@ -40,23 +40,6 @@ def pose(chain, q):
 
 
 # ---------------------------------------------------------------- solvers of any number of rows
-
-
-@pytest.mark.parametrize("m", [1, 2, 3, 6, 8])
-def test_solves_and_projections_of_any_number_of_rows(rng, m):
-    J = randn(rng, 60, m, 9)
-    if m > 1:
-        J[::3, -1] = J[::3, 0] + 1e-3 * J[::3, -1]
-    gram = row_gram(J)
-    exact = torch.linalg.svdvals(J)
-    assert_close(gram.sigma_max, exact[:, 0], rtol=1e-12, atol=0.0)
-    assert ((gram.sigma_min - exact[:, -1]).abs() <= 1e-7 * exact[:, 0]).all()
-    v, p = randn(rng, 60, m), randn(rng, 60, 9)
-    G = J @ J.mT + 1e-3 * torch.eye(m, dtype=torch.float64)
-    assert_close(damped_solve(gram, v, 1e-3), torch.linalg.solve(G, v), rtol=1e-7, atol=1e-9)
-    z = null_projection(J, gram, p)
-    assert apply_rows(J, z).abs().max() < 1e-12
-    assert_close(null_projection(J, gram, z), z, rtol=0.0, atol=1e-12)  # N N = N
 
 
 # ---------------------------------------------------------------- weights
@@ -168,31 +151,6 @@ def test_pairs_of_functions_for_torch_and_for_numpy(rng):
 
 
 # ---------------------------------------------------------------- secondary objectives
-
-
-def test_a_users_gradient_in_the_null_space(rng):
-    target = CHAIN(uniform(rng, 0.15, 0.35, 50, 9))
-    start = InverseKinematics(CHAIN, beta=0.0, **LIMITS).solve(
-        target, uniform(rng, 0.1, 0.4, 50, 9)
-    )
-    away = InverseKinematics(CHAIN, q_pref=lambda q: q - 0.15 * ((q - 0.25) / 0.15) ** 3, **LIMITS)
-    solution = away.solve(target, start.q)
-
-    def crowding(q):
-        return ((q - 0.25) / 0.15).pow(4).sum(-1)
-
-    done = start.converged & solution.converged
-    assert done.sum() > 45
-    assert (crowding(solution.q) <= crowding(start.q) + 1e-12)[done].all()
-    assert crowding(solution.q)[done].mean() < 0.7 * crowding(start.q)[done].mean()
-    # A quadratic cost: the minimum on a linear model is known.
-    A, S, c = randn(rng, 3, 7), randn(rng, 7, 7), randn(rng, 7)
-    S = torch.eye(7, dtype=torch.float64) + 0.05 * S @ S.T
-    linear = InverseKinematics(Linear(A), q_pref=lambda q: q - 0.5 * (q - c) @ S)
-    x = randn(rng, 3)
-    K = torch.cat([torch.cat([S, A.T], 1), torch.cat([A, torch.zeros(3, 3).double()], 1)])
-    expected = torch.linalg.solve(K, torch.cat([S @ c, x]))[:7]
-    assert_close(linear.solve(x, randn(rng, 7)).q, expected, rtol=0.0, atol=1e-2)
 
 
 # ---------------------------------------------------------------- the error model's domain

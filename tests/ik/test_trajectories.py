@@ -104,20 +104,3 @@ def test_csv_with_and_without_times(tmp_path):
     path = from_csv(file, dt=0.25)
     assert_array_equal(path.t, [0.0, 0.25])
     assert_array_equal(path.x, [[1, 2, 3], [4, 5, 6]])
-
-
-@pytest.mark.parametrize(
-    ("text", "settings", "message"),
-    [
-        ("1,2,3\n", {}, "4 columns"),
-        ("0,1,2,3\n", {"dt": 0.1}, "3 columns"),
-        ("t,x,y,z\n0,1,two,3\n", {}, "numbers"),
-        ("t,x,y,z\n0,1,2,3\n1,2\n", {}, "columns"),
-        ("t,x,y,z\n", {}, "4 columns"),
-    ],
-)
-def test_bad_files_say_what_was_needed(tmp_path, text, settings, message):
-    file = tmp_path / "path.csv"
-    file.write_text(text)
-    with pytest.raises(ValueError, match=message):
-        from_csv(file, **settings)

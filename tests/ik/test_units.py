@@ -10,7 +10,7 @@ from hybridkin import (
     InverseKinematics,
     RigidChain,
 )
-from hybridkin.ik.tasks import PoseTask, PositionTask
+from hybridkin.ik.tasks import PoseTask
 
 TRUNK = ConstantCurvatureChain([0.100, 0.093, 0.079])
 TENDONS = ConstantCurvatureChain([0.02] * 2, lengths=[0.1] * 2)
@@ -74,12 +74,3 @@ def test_targets_in_millimetres_are_noticed():
     base[:3, 3] = [30.0, -20.0, 5.0]
     far = ConstantCurvatureChain([0.02] * 2, lengths=[0.1] * 2, base=base)
     assert InverseKinematics(far, q_pref=0.0).solve([30.0, -20.0, 5.19]).converged
-
-
-def test_repr_shows_limits_and_what_differs_from_the_default():
-    assert repr(InverseKinematics(TENDONS)) == "InverseKinematics(ConstantCurvatureChain)"
-    ik = InverseKinematics(TRUNK, q_min=0.1, q_max=np.linspace(0.3, 0.4, 9), dq_max=0.5, beta=2)
-    shown = "q_min=0.1, q_max=0.3 to 0.4, dq_max=0.5, beta=2.0"
-    assert repr(ik) == f"InverseKinematics(ConstantCurvatureChain, {shown})"
-    ik = InverseKinematics(PositionTask(TENDONS), q_pref=[0.0] * 6, damping=0.0, weights=[1.0] * 6)
-    assert repr(ik) == "InverseKinematics(PositionTask, q_pref=0, damping=0.0, weights=1)"

@@ -13,7 +13,6 @@ from sklearn.base import clone
 from sklearn.exceptions import NotFittedError
 from sklearn.linear_model import Ridge
 from sklearn.utils.estimator_checks import parametrize_with_checks
-from torch.testing import assert_close
 
 from hybridkin import ELMRegressor
 
@@ -201,22 +200,6 @@ def test_sample_weight_is_repetition(fit_intercept, input_scaling):
     assert weighted.n_samples_seen_ == w.sum()
 
 
-@pytest.mark.parametrize("fit_intercept", [False, True])
-def test_every_output_may_have_its_own_alpha(fit_intercept):
-    X, Y = trunk()
-    alphas = [1e-3, 10.0, 0.1]
-    model = elm(alpha=alphas, fit_intercept=fit_intercept).fit(X, Y)
-    for j, alpha in enumerate(alphas):
-        alone = elm(alpha=alpha, fit_intercept=fit_intercept).fit(X, Y[:, j])
-        assert_allclose(model.predict(X)[:, j], alone.predict(X), rtol=0, atol=1e-10)
-        assert_allclose(model.noise_variance_[j], alone.noise_variance_[0], rtol=1e-9)
-    flexible = elm(alpha=1e-3, fit_intercept=fit_intercept).fit(X, Y)
-    assert_allclose(model.leverage(X), flexible.leverage(X), rtol=1e-12)
-    for wrong in ([0.1, 0.2], [0.1, 0.2, -1.0], [0.1, 0.2, np.nan], [[0.1, 0.2, 0.3]]):
-        with pytest.raises(ValueError, match="`alpha` must be a number >= 0, or 3 of them"):
-            elm(alpha=wrong).fit(X, Y)
-
-
 # Derivatives
 
 
@@ -246,37 +229,6 @@ def test_gradcheck(params):
     for function in (module, module.jacobian, module.leverage):
         assert torch.autograd.gradcheck(function, (q,), eps=1e-7, atol=1e-5)
     assert torch.autograd.gradgradcheck(module, (q,), eps=1e-7, atol=1e-4)
-
-
-def test_module_batches_dtypes_and_transforms():
-    X, Y = trunk()
-    model = elm(direct_link=True).fit(X, Y)
-    module = model.module_
-    q = torch.tensor(X[:24]).reshape(2, 3, 4, 9)
-    eps, J = module.forward_and_jacobian(q)
-    assert eps.shape == (2, 3, 4, 3)
-    assert J.shape == (2, 3, 4, 3, 9)
-    assert module.leverage(q).shape == (2, 3, 4)
-    assert_close(eps.reshape(24, 3).numpy(), model.predict(X[:24]), rtol=1e-13, atol=1e-13)
-    one = q[1, 2, 3]
-    assert_close(module(one), eps[1, 2, 3])
-    assert_close(module.jacobian(one), J[1, 2, 3])
-    assert_close(module.leverage(one), module.leverage(q)[1, 2, 3])
-    assert module(q[:0]).shape == (0, 3, 4, 3)
-    assert_close(torch.func.vmap(module.jacobian)(q), J)
-    buffers = dict(module.named_buffers())
-    assert_close(torch.func.functional_call(module, buffers, (q,)), eps)
-    single = module(q.float())
-    assert single.dtype == torch.float32
-    assert_close(single.double(), eps, rtol=1e-4, atol=1e-4)
-    assert list(module.parameters()) == []
-    small = copy.deepcopy(module).to(torch.float32)
-    assert small.jacobian(q.float()).dtype == torch.float32
-    assert_close(small(q).float(), single, rtol=1e-3, atol=1e-3)
-    with pytest.raises(ValueError, match=r"shape \(\.\.\., 9\), got \(8,\); this ELM"):
-        module(one[:8])
-    with pytest.raises(TypeError, match=r"floating tensor, float64 or float32, got torch\.int64"):
-        module(torch.zeros(9, dtype=torch.int64))
 
 
 # Uncertainty
@@ -385,27 +337,6 @@ def test_pickle_clone_copy_and_hash():
     fresh = clone(model)
     assert not hasattr(fresh, "module_")
     assert joblib.hash(fresh) == joblib.hash(elm(input_scaling=BOUNDS))
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-def test_cuda_equals_cpu():
-    X, Y = trunk()
-    w = np.random.default_rng(1).integers(0, 4, 300)
-    cuda = elm(device="cuda", block_size=64).fit(X, Y, sample_weight=w)
-    assert cuda.module_.input_bias.is_cuda
-    assert_same_model(cuda, elm().fit(X, Y, sample_weight=w))
-
-
-def test_seeds():
-    X, Y = trunk()
-    assert_array_equal(elm().fit(X, Y).predict(X), elm().fit(X, Y).predict(X))
-    other = ELMRegressor(30, random_state=1).fit(X, Y)
-    assert np.abs(other.input_weights_ - elm().fit(X, Y).input_weights_).max() > 0.1
-    rng = np.random.RandomState(0)
-    assert_array_equal(
-        ELMRegressor(30, random_state=rng).fit(X, Y).input_weights_,
-        elm().fit(X, Y).input_weights_,
-    )
 
 
 def test_clear_errors():

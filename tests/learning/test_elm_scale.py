@@ -1,15 +1,11 @@
 """The ELM at scale: streams of chunks, dask, processes, searches over frames, metadata."""
 
-import importlib.util
-from pathlib import Path
-
-import joblib
 import numpy as np
 import pandas as pd
 import polars as pl
 import pytest
 import torch
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 from sklearn.model_selection import GridSearchCV, cross_val_score
 
 from hybridkin import (
@@ -17,7 +13,6 @@ from hybridkin import (
     ELMRegressorCV,
 )
 
-EXAMPLE = Path(__file__).parents[2] / "examples" / "plot_elm_dask.py"
 BOUNDS = [[-1.0] * 4, [1.0] * 4]
 SEARCH = {"alpha": [1e-4, 1e-1, 1e2], "n_hidden": [10, 20]}
 
@@ -86,67 +81,7 @@ def test_decay_is_a_weight_that_falls_with_age(fit_intercept):
     assert np.abs(forgetful.predict(X) - elm(**params).fit(X, y).predict(X)).max() > 1e-3
 
 
-@pytest.mark.parametrize("decay", [0, 1.5, np.nan])
-def test_a_wrong_decay_or_chunk_changes_nothing(decay):
-    X, y = data()
-    model = elm(input_scaling=BOUNDS).fit(X, y)
-    before = joblib.hash(model)
-    for victim in (model, elm()):
-        with pytest.raises(ValueError, match=rf"`decay` must lie in \(0, 1\], got {decay!r}"):
-            victim.partial_fit(X, y, decay=decay)
-    with pytest.raises(ValueError, match="NaN"):
-        model.partial_fit(np.where(X > 0.9, np.nan, X), y, decay=0.5)
-    assert joblib.hash(model) == before
-
-
 # Dask
-
-
-def load_example():
-    # Not in sys.modules: dask then sends its functions by value, as it does from a script.
-    spec = importlib.util.spec_from_file_location("plot_elm_dask", EXAMPLE)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-BLOCKS = [range(3), range(3, 5), range(5, 6), range(6, 10), range(10, 11)]
-N_ROWS = 400
-
-
-@pytest.fixture(scope="module")
-def scaled_out():
-    """The example on few rows, in a cluster that then serves the other tests too."""
-    distributed = pytest.importorskip("dask.distributed")
-    example = load_example()
-    with (
-        distributed.LocalCluster(
-            n_workers=1, threads_per_worker=1, dashboard_address=None
-        ) as cluster,
-        distributed.Client(cluster) as client,
-    ):
-        yield example, client, example.compare(cluster, client, BLOCKS, N_ROWS)
-
-
-@pytest.mark.slow
-def test_dask_example_equals_one_fit(scaled_out):
-    example, client, (model, looped, tree, curve, seconds) = scaled_out
-    rows = [example.chunk(number, N_ROWS) for number in range(11)]
-    q, error = (np.vstack(part) for part in zip(*rows, strict=True))
-    bounds = example.bounds_by_dask(client, BLOCKS, N_ROWS)
-    assert_array_equal(bounds, [q.min(axis=0), q.max(axis=0)])
-    whole = ELMRegressor(**example.NETWORK, input_scaling=bounds).fit(q, error)
-    for other in (model, looped):
-        assert other.n_samples_seen_ == 11 * N_ROWS
-        assert_same_predictions(other, whole, q)
-    assert example.relative_difference(model.predict(q), whole.predict(q)) < 1e-10
-    assert_array_equal(tree[:5, 0], [N_ROWS * len(block) for block in BLOCKS])
-    assert_array_equal(tree[5:, 0], N_ROWS * np.array([5, 5, 1, 10, 1, 11]))
-    for end in (tree[-1], curve[-1]):
-        assert_allclose(end, [11 * N_ROWS, example.tip_error(whole)], rtol=1e-9)
-    assert curve[-1, 1] < 0.8 * curve[0, 1]
-    assert seconds.min() > 0
-    assert len(example.draw(tree, curve, seconds).axes) == 2
 
 
 # Frames, pipelines, pictures, metadata

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 from numpy.testing import assert_allclose
-from sklearn.dummy import DummyRegressor
 from sklearn.ensemble import RandomForestRegressor
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF
@@ -16,7 +15,6 @@ from sklearn.svm import LinearSVR
 from torch.autograd import gradcheck
 from torch.testing import assert_close
 
-from hybridkin import ELMRegressor
 from hybridkin.learning.regressor_modules import (
     AffineModule,
     KernelModule,
@@ -124,18 +122,6 @@ def test_differences_of_two_outputs_and_their_graph():
     assert_close(slope, J[..., 1, :])
 
 
-class _ReadOnly(DummyRegressor):
-    def predict(self, X):
-        return np.broadcast_to(self.constant_, (len(X), 1))
-
-
-def test_a_read_only_prediction_gives_no_warning():
-    X, y = data(1)
-    regressor = _ReadOnly().fit(X, y)
-    x = error_module(regressor, torch.from_numpy(X))(torch.from_numpy(X[:3]))
-    assert_allclose(x.numpy(), regressor.predict(X[:3]))
-
-
 @pytest.mark.parametrize("unit", [1e-4, 1e4])
 def test_differences_follow_the_range_of_the_inputs(unit):
     """In another unit the Jacobian is the same, counted in that unit."""
@@ -148,9 +134,3 @@ def test_differences_follow_the_range_of_the_inputs(unit):
         assert type(module) is RegressorModule
         jacobians.append(factor * module.jacobian(q))
     assert_close(*jacobians, rtol=1e-6, atol=1e-6 * float(jacobians[0].abs().max()))
-
-
-def test_a_module_of_its_own_is_taken():
-    X, y = data(2)
-    elm = ELMRegressor(random_state=0).fit(X, y)
-    assert error_module(elm, torch.from_numpy(X)) is elm.module_

@@ -4,7 +4,6 @@ import importlib.util
 import re
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +19,6 @@ from hybridkin import (
     load_model,
 )
 from hybridkin._core.plan import NoKernel
-from hybridkin.cli.main import main
 from hybridkin.ik.tasks import PointsTask, PoseTask, as_task
 from hybridkin.native import export_c
 
@@ -30,7 +28,6 @@ MODELS += ("drift_and_radius", "elm", "adapted")
 WARNINGS = "-Wall -Wextra -pedantic -Wconversion -Wdouble-promotion -Werror".split()
 CC, ZIG = shutil.which("cc"), importlib.util.find_spec("ziglang")
 needs_cc = pytest.mark.skipif(CC is None, reason="no C compiler `cc`")
-needs_zig = pytest.mark.skipif(ZIG is None, reason="the package ziglang is not there")
 
 
 def limited(model, **settings):
@@ -99,15 +96,6 @@ def test_without_limits_no_limit_is_kept_or_promised(tmp_path, dtype):
     assert "It keeps q between" not in readme
 
 
-@needs_cc
-@pytest.mark.slow
-def test_a_soft_backbone_of_few_taut_tendons(tmp_path):
-    rng = np.random.default_rng(2)
-    radii, lengths = rng.uniform(0.004, 0.03, 3), rng.uniform(0.05, 0.15, 3)
-    soft = {"bending_stiffness": 1e-8, "axial_stiffness": 1e-3}
-    assert agrees(tmp_path, ElasticTendonChain(radii, lengths, **soft))
-
-
 FOLLOWS = """
 #include <stdio.h>
 #include "robot.h"
@@ -145,17 +133,6 @@ def test_on_tendons_that_only_pull_it_arrives_as_in_python(tmp_path, start):
 
 @needs_cc
 @pytest.mark.slow
-@pytest.mark.parametrize("level", ["-O0", "-O1", "-O3", "-Os"])
-@pytest.mark.parametrize("compiler", ["gcc", "clang"])
-def test_no_level_of_optimisation_warns(tmp_path, compiler, level):
-    if shutil.which(compiler) is None:
-        pytest.skip(f"no {compiler}")
-    export_c(limited(load_model(FOLDER / "serial_pose.safetensors")), tmp_path, name="robot")
-    built(tmp_path, level, compiler=[compiler])
-
-
-@needs_cc
-@pytest.mark.slow
 def test_the_readme_bounds_the_stack(tmp_path):
     model = limited(load_model(FOLDER / "blend.safetensors"))
     export_c(model, tmp_path, name="robot")
@@ -165,15 +142,6 @@ def test_the_readme_bounds_the_stack(tmp_path):
     for name, size in stacks(program).items():
         assert 0 < size <= bound + 1024, name  # and the functions of math.h
     assert bound <= LIMIT
-
-
-@needs_zig
-@pytest.mark.slow
-@pytest.mark.parametrize("target", ["x86_64-linux-gnu", "aarch64-linux-gnu"])
-def test_clang_compiles_the_code_for_other_processors(tmp_path, target):
-    export_c(limited(tendon_chain()), tmp_path, name="robot", dtype="float32")
-    compiler = (sys.executable, "-m", "ziglang", "cc", "-target", target)
-    assert built(tmp_path, compiler=compiler).read_bytes()[:4] == b"\x7fELF"
 
 
 @needs_cc
@@ -201,17 +169,6 @@ def test_the_loop_of_the_docs_runs(tmp_path):
     counts = [[int(word) for word in line.split()[1:]] for line in lines]
     assert [sum(column) for column in zip(*counts, strict=True)] == [300, 300]
     assert "worst: command after" in last
-
-
-@needs_cc
-def test_the_code_holds_what_the_model_needs_and_no_more(tmp_path):
-    source = export_c(load_model(FOLDER / "rigid.safetensors"), tmp_path)[1]
-    assert not any(word in source.read_text() for word in ("malloc", "hkv_", "ik_tick", "@"))
-    options = ["-std=c99", "-O1", "-fno-inline", "-c", source, "-o", tmp_path / "model.o"]
-    subprocess.run([CC, *options], check=True)
-    names = (tmp_path / "model.o").read_bytes()
-    assert b"hk_rigid" in names
-    assert not any(name in names for name in (b"hk_stumpff", b"hk_settle", b"hk_elm"))
 
 
 def test_only_files_of_an_export_are_replaced(tmp_path):
@@ -252,34 +209,3 @@ def test_wrong_arguments(tmp_path):
     with pytest.raises(TypeError, match="`model` must be"):
         export_c(3, tmp_path / "out")
     assert not (tmp_path / "out").exists()
-
-
-@needs_cc
-@pytest.mark.slow
-def test_command_line(tmp_path, capsys):
-    robot = tmp_path / "robot.toml"
-    robot.write_text(
-        "[[segment]]\nradius = 0.005\nlength = 0.1\nrepeat = 2\n"
-        "[limits]\nq_min = -0.004\nq_max = 0.004\ndq_max = 0.1\nddq_max = 5.0\n"
-    )
-    out = str(tmp_path / "c")
-    options = ["--out", out, "--name", "robot", "--dtype", "float32", "--dt", "0.002"]
-    assert main(["export", str(robot), *options]) == 0
-    assert "Steps of 0.002 s within limits: robot description." in capsys.readouterr().out
-    readme = Path(out, "README.md").read_text()
-    assert "every 0.002 s" in readme
-    assert "change of\nthat speed below (5, 5, 5, 5, 5, 5) per second" in readme
-    assert subprocess.run([built(Path(out))], capture_output=True).returncode == 0
-
-
-def test_files_are_replaced_once_all_are_written(tmp_path, monkeypatch):
-    """Another process may write or read them at the same time."""
-    before = {path: path.read_text() for path in export_c(tendon_chain(), tmp_path)}
-
-    def stopped(source, texts):
-        raise OSError("stopped")
-
-    monkeypatch.setattr("hybridkin.native.export._measured", stopped)
-    with pytest.raises(OSError, match="stopped"):
-        export_c(ConstantCurvatureChain([0.05]), tmp_path)
-    assert {path: path.read_text() for path in tmp_path.iterdir()} == before

@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 import torch
 from compiled import random_settings
-from scipy.spatial.transform import Rotation
 from sklearn.linear_model import LinearRegression
 
 from hybridkin import (
@@ -11,8 +10,6 @@ from hybridkin import (
     ELMRegressor,
     HybridForwardModel,
     InverseKinematics,
-    RigidChain,
-    datasets,
     robots,
 )
 from hybridkin._core.plan import NoKernel, Plan
@@ -173,79 +170,6 @@ def test_a_model_of_data_alone_is_compiled_with_scalar_limits(error_model):
     np.testing.assert_array_equal(tracker.step(x[1]), vectors.step(x[1]))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("guard", ["leverage", "box"])
-def test_a_search_slides_into_the_domain_as_in_torch(guard):
-    data, chain = datasets.load_trunk(), ConstantCurvatureChain([0.100, 0.093, 0.079])
-    hybrid = HybridForwardModel(chain, ELMRegressor(20, random_state=0), guard=guard)
-    model = hybrid.fit(data.q[:400], data.x[:400]).module_
-    low, high = data.q[:400].min(0) - 0.02, data.q[:400].max(0) + 0.02
-    draw = np.random.default_rng(5)
-    corners = np.where(draw.random((60, 9)) < 0.5, low, high)
-    q = data.q[:60] + np.linspace(0.0, 1.0, 60)[:, None] * (corners - data.q[:60])
-    x = model(torch.from_numpy(q)).detach().numpy()
-    ik = InverseKinematics(model, q_min=low, q_max=high)
-    assert ik.tracker(q[0]).backend == "compiled"
-    ours, theirs = ik.solve(x, q, restarts=4), ik.solve(*in_torch(x, q), restarts=4)
-    np.testing.assert_array_equal(ours.status, theirs.status.numpy())
-    np.testing.assert_array_equal(ours.n_starts, theirs.n_starts.numpy())
-    outside = ~model.in_domain(torch.from_numpy(q)).numpy()
-    assert (ours.status[outside] == IKStatus.CONVERGED).sum() > 5
-
-
-def arm_of(draw, kinds):
-    origins = np.tile(np.eye(4), (len(kinds), 1, 1))
-    origins[:, :3, :3] = Rotation.from_quat(draw.standard_normal((len(kinds), 4))).as_matrix()
-    origins[:, :3, 3] = draw.uniform(-0.3, 0.3, (len(kinds), 3))
-    tip = np.eye(4)
-    tip[:3, :3] = Rotation.from_quat(draw.standard_normal(4)).as_matrix()
-    tip[:3, 3] = [0.05, -0.1, 0.2]
-    axes = draw.standard_normal((len(kinds), 3))
-    more = {"tip": tip, "tool": [0.1, 0.0, 0.05], "base": origins[0]}
-    if kinds[:2] == COUPLED[:2]:
-        couplings = np.vstack([np.eye(6), [[0, -1, 0, 0, 0, 0], [0, 0.5, 0, 0, 2, 0]]])
-        more |= {"couplings": couplings, "joint_zeros": draw.uniform(-1.0, 1.0, 6)}
-    return RigidChain(origins, axes, kinds=kinds, **more)
-
-
-COUPLED = ["prismatic", "revolute", *["revolute"] * 6]
-KINDS = {
-    "eight by six actuators": COUPLED,
-    "six": ["revolute"] * 6,
-    "seven, one slides": ["revolute"] * 3 + ["prismatic"] + ["revolute"] * 3,
-    "eight": ["revolute"] * 8,
-}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", KINDS)
-def test_poses_are_solved_as_in_torch(name):
-    draw = np.random.default_rng(8)
-    arm = arm_of(draw, KINDS[name])
-    n = arm.n_actuators
-    high = np.where(np.arange(n) % 2, 2.5, 3.2)  # of some a whole turn
-    q = draw.uniform(-high, high, (40, n))
-    x = arm.pose(torch.from_numpy(q)).numpy()
-    x[::10, :3, 3] *= 5.0
-    x[7, 0, 0] = np.nan
-    for settings in ({"weights": 1.0 + np.arange(n) / n}, {"beta": 0.0, "damping": 0.01}):
-        ik = InverseKinematics(PoseTask(arm), q_min=-high, q_max=high, **settings)
-        options = {"tol": (1e-3, 1e-2), "restarts": 4}
-        ours, theirs = ik.solve(x, **options), ik.solve(torch.from_numpy(x), **options)
-        assert (ours.status == theirs.status.numpy()).mean() > 0.95
-        assert ours.status[7] == theirs.status[7] == IKStatus.INVALID_INPUT
-        reached = ours.converged
-        assert reached.mean() > (0.5 if KINDS[name] is COUPLED else 0.8)  # it slides by metres
-        both = reached & theirs.converged.numpy()
-        assert both.sum() >= 0.95 * reached.sum()
-        known = np.arange(40) != 7
-        assert ((ours.q[known] >= -high) & (ours.q[known] <= high)).all()
-        at = arm.pose(torch.from_numpy(ours.q[reached])).numpy()
-        turn = Rotation.from_matrix(at[:, :3, :3] @ x[reached][:, :3, :3].swapaxes(1, 2))
-        assert np.linalg.norm(at[:, :3, 3] - x[reached][:, :3, 3], axis=1).max() <= 1e-3
-        assert turn.magnitude().max() <= 1e-2 + 1e-9
-
-
 @pytest.mark.parametrize("limits", [{}, {"dq_max": 0.05}, {"ddq_max": 1.0}, {"weights": 2.0}])
 def test_what_is_infinite_or_overflows_holds_still(limits):
     ik = InverseKinematics(BHA, q_min=0.1, q_max=0.4, **limits)
@@ -268,19 +192,3 @@ def test_what_is_infinite_or_overflows_holds_still(limits):
     dq = ik.step(q[0], x[0]).dq
     assert dq[3] < 0.0
     np.testing.assert_array_equal(np.delete(dq, 3), 0.0)
-
-
-@pytest.mark.parametrize("settings", [{}, {"dq_max": 0.5, "ddq_max": 5.0}, {"limits": "off"}])
-def test_targets_too_far_to_compute_with_stop_nothing_but_the_step(settings):
-    ik, here = InverseKinematics(BHA, q_min=0.1, q_max=0.4, **settings), np.array([0.1, 0.0, 0.7])
-    q0 = 0.25 + 0.01 * np.cos(np.arange(9.0))
-    for start in (q0, torch.from_numpy(q0)):
-        tracker = ik.tracker(start)
-        run = [start, *(tracker.step(x) for x in (here, *[np.full(3, 1.7e308)] * 3, here))]
-        steps = np.diff(np.stack([np.asarray(q) for q in run]), axis=0)
-        assert np.isfinite(steps).all()
-        assert steps[-1].any()
-        if settings.get("ddq_max"):
-            assert abs(np.diff(steps, axis=0)).max() < 5e-4 * (1.0 + 1e-9)
-        else:
-            assert not steps[1:-1].any()

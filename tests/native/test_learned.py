@@ -212,15 +212,6 @@ def test_distance_from_other_groups(trust, n_rows):
             assert_as_in_torch(module, inputs(spread, 38))
 
 
-@pytest.mark.parametrize("longest", [0.0, 1e-4])
-@pytest.mark.parametrize("coupling", ["parallel", "serial"])
-def test_corrections_that_are_too_long(coupling, longest):
-    module = hybrid("quadratic", coupling, "leverage")
-    (correction,) = module.corrections
-    correction.guard.largest.fill_(longest)
-    assert_as_in_torch(module, inputs(1.5, 19))
-
-
 @pytest.mark.parametrize(("n", "m"), [(1, 1), (3, 2), (6, 3), (9, 3), (17, 64), (64, 5)])
 @pytest.mark.parametrize("n_hidden", [1, 4, 12, 101])
 def test_networks_of_any_size(n, m, n_hidden):
@@ -249,23 +240,6 @@ def test_stored_models_of_every_kind(path):
         found = program.evaluate(q, True, True)
         for ours, theirs in zip(found, (x, J, distance), strict=True):
             assert_close_rows(ours, theirs, 2e-11)
-
-
-def test_saturated_units_far_away():
-    for kind in ("logistic", "tanh", "kernel"):
-        module = regressor(kind)
-        q = CENTER + 1e6 * draw(11, N)
-        x, J = (part.numpy() for part in module.forward_and_jacobian(torch.from_numpy(q)))
-        found = program_of(module).evaluate(q, True)
-        assert_close_rows(found[0], x)
-        assert_close_rows(found[1], J)
-
-
-def log():
-    rng = np.random.default_rng(0)
-    q = 0.25 + 0.05 * rng.uniform(-1, 1, (60, 3))
-    x = ConstantCurvatureChain([0.055])(torch.from_numpy(q)).numpy() + 0.01 * np.sin(20 * q)
-    return q, x
 
 
 def test_parts_without_kernel_leave_the_model_to_torch():

@@ -1,10 +1,7 @@
-import copy
 import multiprocessing
 import os
-import pickle
 import shutil
 
-import joblib
 import numpy as np
 import pytest
 import torch
@@ -60,14 +57,6 @@ def test_results_are_those_of_torch(lead):
     x, J, distance = library.program_of(model).evaluate(q)
     assert J is None
     assert distance is None
-
-
-@pytest.mark.needs_core
-def test_models_that_carry_a_graph_are_computed():
-    offsets = torch.tensor([0.01, 0.02], dtype=torch.float64, requires_grad=True)
-    model = chain().with_geometry(offsets=offsets)
-    with torch.no_grad():
-        agree(library.program_of(model).evaluate(ROWS[:3], True)[:2], by_torch(model, ROWS[:3]))
 
 
 @pytest.mark.needs_core
@@ -152,20 +141,6 @@ def test_a_program_is_kept_until_the_model_changes():
         first = program
 
 
-@pytest.mark.needs_core
-def test_a_program_is_no_part_of_its_model():
-    model = chain()
-    pickled, hashed, names = pickle.dumps(model), joblib.hash(model), [*model.state_dict()]
-    program = library.program_of(model)
-    assert (pickle.dumps(model), joblib.hash(model)) == (pickled, hashed)
-    assert [*model.state_dict()] == names
-    for twin in (copy.deepcopy(model), copy.copy(model), pickle.loads(pickled)):
-        assert "_program" not in vars(twin)
-        twin.offsets = twin.offsets + 0.01
-        agree(library.program_of(twin).evaluate(ROWS[:3], True)[:2], by_torch(twin, ROWS[:3]))
-    assert library.program_of(model) is program
-
-
 def compute(model):
     return backend(model), library.program_of(model).evaluate(ROWS, jacobian=True)[:2]
 
@@ -180,15 +155,6 @@ def test_models_work_after_a_fork():
         said, found = pool.apply_async(compute, (model,)).get(timeout=300)
     assert said == "compiled"
     agree(found, by_torch(model, ROWS))
-
-
-@pytest.mark.needs_core
-@pytest.mark.slow
-def test_models_work_in_workers():
-    model = chain()
-    compute(model)
-    (found,) = joblib.Parallel(2)([joblib.delayed(library.program_of(model).evaluate)(ROWS, True)])
-    agree(found[:2], by_torch(model, ROWS))
 
 
 class Longer(ConstantCurvatureChain):

@@ -7,7 +7,7 @@ import pytest
 import systems
 import torch
 
-from hybridkin import InverseKinematics, native
+from hybridkin import native
 
 pytestmark = [
     pytest.mark.slow,
@@ -51,25 +51,6 @@ def test_a_unit_of_a_controller_steps_as_python(kind, tmp_path):
     np.testing.assert_allclose(steps, commands, rtol=0, atol=1e-12)
 
 
-def test_limits_and_gains_of_a_unit_are_parameters(tmp_path):
-    controller = systems.CONTROLLERS["trunk"]()
-    unit = systems.Unit(native.export_fmu(controller, tmp_path / "a.fmu"), tmp_path / "unpacked")
-    limits = {"q_min": 0.15, "q_max": 0.3, "dq_max": 0.05}
-    changed = InverseKinematics(
-        systems.TRUNK, **limits, q_pref=0.25, ddq_max=2.0, dt=0.02, gain=5.0
-    )
-    q = np.full(9, 0.2)
-    tracker = changed.tracker(q)
-    arrays = {name: np.full(9, value) for name, value in limits.items()}
-    unit.start(start=q, gain=5.0, **arrays)
-    target = np.array([0.3, 0.0, 0.7])
-    for _ in range(50):
-        unit.set(target=target)
-        unit.step(0.02)
-        np.testing.assert_allclose(unit.get("command"), tracker.step(target), rtol=0, atol=1e-12)
-    assert unit.get("status")[0] == 1.0
-
-
 def test_a_unit_closes_the_loop_with_measurements_and_restores_its_state(tmp_path):
     controller = systems.CONTROLLERS["trunk"]()
     unit = systems.Unit(native.export_fmu(controller, tmp_path / "a.fmu"), tmp_path / "unpacked")
@@ -91,18 +72,6 @@ def test_a_unit_closes_the_loop_with_measurements_and_restores_its_state(tmp_pat
     unit.set(target=[np.nan] * 3)
     unit.step(0.02)
     assert unit.get("status")[0] == 2.0
-
-
-def test_a_unit_refuses_half_a_period_and_outputs_that_are_set(tmp_path):
-    from fmpy.fmi1 import FMICallException
-
-    path = native.export_fmu(systems.CONTROLLERS["trunk"](), tmp_path / "a.fmu")
-    unit = systems.Unit(path, tmp_path / "unpacked")
-    unit.start()
-    with pytest.raises(FMICallException):
-        unit.step(0.03)
-    with pytest.raises(FMICallException):
-        unit.set(command=np.zeros(9))
 
 
 @NEEDS_OCTAVE

@@ -21,8 +21,6 @@ from hybridkin import (
 from hybridkin.ik._compiled import core_of
 from hybridkin.ik.results import IKStatus
 from hybridkin.ik.tasks import PointsTask, PoseTask, PositionTask
-from hybridkin.native import backend
-from hybridkin.native.library import program_of
 
 pytestmark = pytest.mark.needs_core
 
@@ -219,17 +217,6 @@ def test_a_target_that_is_no_rotation_is_refused():
     assert_array_equal(tracker.q, start)
 
 
-def test_models_of_markers_and_poses_are_compiled():
-    for model in (TURNED.with_markers(MARKERS), hybrid_of_markers(), fitted_pose(), adapted_pose()):
-        assert backend(model) == "compiled"
-        q = torch.from_numpy(log(TURNED, 0.15, 0.35, 20)[0])
-        x, J, distance = program_of(model).evaluate(q.numpy(), True, True)
-        with torch.no_grad():
-            expected = *model.forward_and_jacobian(q), model.domain_distance(q)
-        for a, b in zip((x, J, distance), expected, strict=True):
-            assert_allclose(a, b, rtol=1e-9, atol=1e-11)
-
-
 # ---------------------------------------------------------------- half-spaces
 
 
@@ -323,43 +310,3 @@ def test_braking_does_not_lead_out_of_a_half_space(core):
     path, start = (path, start) if core else in_torch(path, start)
     x = np.asarray(ik.track(path, q0=start).x)
     assert -1e-4 < (x @ normal - offset).max() < 5e-6
-
-
-@pytest.mark.parametrize("memory", [None, 0.05])
-def test_a_stream_within_half_spaces_is_that_of_torch(memory):
-    normals = [[1.0, 0.3, 0.2], [0.0, -1.0, 0.1], [0.0, 0.0, 1.0]]
-    ik = InverseKinematics(
-        BHA, q_min=0.1, q_max=0.4, dq_max=2.0, tip_limits=(normals, [0.2, 0.05, 0.8])
-    )
-    start = np.full(9, 0.25) + 0.01 * np.cos(np.arange(9.0))
-    ours, theirs = (
-        ik.tracker(start, memory=memory),
-        ik.tracker(torch.from_numpy(start), memory=memory),
-    )
-    seen = set()
-    for i in range(60):
-        target = np.array([0.3 * np.sin(0.2 * i), 0.1 * np.cos(0.3 * i), 0.75 + 0.01 * (i % 9)])
-        tip = {"x_measured": ours.x + 0.01} if 10 < i < 30 else {}
-        command = ours.step(target, **tip)
-        expected = theirs.step(
-            *in_torch(target), **{k: torch.from_numpy(a) for k, a in tip.items()}
-        )
-        assert_allclose(command, expected.numpy(), rtol=0.0, atol=1e-9)
-        assert ours.status is theirs.status
-        seen.add(ours.status)
-    assert IKStatus.AT_LIMITS in seen
-    assert ours.backend == "compiled"
-
-
-def test_half_spaces_of_several_markers():
-    """All coordinates of all markers may be in a half-space."""
-    task = PositionTask(BHA.with_markers([(1, 1.0), (2, 1.0)]), size=6)
-    q, x, target = motions(4, task.models[0])
-    normals, offsets = planes(4, 3, x)
-    limits = {"q_min": 0.1, "q_max": 0.4, "dq_max": 2.0, "damping": 0.01}
-    ik = InverseKinematics(task, **limits, tip_limits=(normals, offsets))
-    assert ik.tracker(q[0]).backend == "compiled"
-    ours, theirs = ik.step(q, target), ik.step(*in_torch(q, target))
-    assert_allclose(ours.dq, theirs.dq.numpy(), rtol=0.0, atol=1e-9)
-    solution = ik.solve(target[:5], tol=1e-6)
-    assert (solution.x @ normals.T <= offsets + 1e-6).all()

@@ -65,36 +65,6 @@ def test_legends_do_not_cover_data(draw):
     assert legend.y1 < ax.xaxis.get_tightbbox().y0
 
 
-def test_errors_behind_the_end_of_the_axis_are_numbers():
-    shown = {"hybrid, ELM": [0.001, 0.002, 0.003], "hybrid, auto": [0.001, 0.001, 0.002]}
-    shown["data-driven, ELM"] = [0.0021, 0.004, 1.2]
-    _, ax = plots.new_figure(6, 3)
-    plots.ErrorBoxDisplay(shown).plot(ax, unit="mm")
-    end = ax.get_xlim()[1]
-    assert 4 < end < 402
-    (number,) = ax.texts
-    assert number.get_text().endswith("mean 402, max 1200")
-    assert number.xy == (end, 1)  # in the row of its model
-    assert [text.get_text() for text in ax.get_yticklabels()] == [*shown]
-    _, ax = plots.new_figure(6, 3)
-    plots.ErrorBoxDisplay(shown).plot(ax, unit="mm", log=True)
-    assert (ax.get_xscale(), len(ax.texts)) == ("log", 0)
-    assert ax.get_xlim()[1] > 1200
-
-
-def test_a_track_shows_what_to_expect_of_the_robot():
-    display = plots.TrackingDisplay(TRACK, {"solver on hybrid": TRACK + 1e-6})
-    _, ax = plots.new_figure(4, 3)
-    radius = np.where(np.arange(20) < 5, np.inf, 0.03)
-    mean = np.linspace(0.01, 0.03, 20)
-    display.plot_error(ax, unit="mm", expected={"mean": mean, "radius": radius})
-    lines = {line.get_label(): line.get_ydata() for line in ax.lines}
-    np.testing.assert_allclose(lines["mean: 20 mm"], 1e3 * mean)  # the mean over the path
-    np.testing.assert_allclose(lines["radius: 30 mm"][5:], 30.0)
-    assert any(label.startswith("solver on hybrid: mean error 0.0017 mm") for label in lines)
-    assert ax.get_yscale() == "log"
-
-
 # Bodies
 
 

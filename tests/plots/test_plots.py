@@ -1,8 +1,5 @@
 import base64
-import json
 import re
-import shutil
-import subprocess
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -64,10 +61,6 @@ def track():
 def drawn(figure, tmp_path):
     figure.savefig(tmp_path / "figure.png")
     return (tmp_path / "figure.png").stat().st_size > 2000
-
-
-def distances(a, b):
-    return np.linalg.norm(a - b, axis=1)
 
 
 def path_lengths(points):
@@ -176,25 +169,6 @@ def test_learning_curve_draws_mean_and_band(tmp_path):
 # Space
 
 
-@pytest.mark.slow
-def test_workspace_colours_are_the_errors(data, hybrid, tmp_path):
-    q, x = data.q[:100], data.x[:100].copy()
-    x[7] = np.nan
-    predicted = hybrid.predict(q)
-    backbone = hybrid.mechanical_model_.backbone(torch.from_numpy(q[3]))
-    figure, ax = plots.new_figure(5, 4, subplot_kw=SPACE)
-    plots.WorkspaceDisplay(x, predicted, backbone, row=3).plot(ax, unit="mm")
-    errors = distances(predicted, x)
-    known = np.sort(errors[np.isfinite(errors)])
-    np.testing.assert_allclose(ax.collections[0].get_array(), 1e3 * known)
-    shown = [np.array(line.get_data_3d()).T for line in ax.lines]
-    np.testing.assert_allclose(shown[0], 1e3 * backbone)
-    np.testing.assert_allclose(shown[1], 1e3 * np.stack([x[3], predicted[3]]))
-    assert ax.get_zlabel() == "z [mm]"
-    assert "tip error [mm]" in [a.get_ylabel() for a in figure.axes]
-    assert drawn(figure, tmp_path)
-
-
 def turned():
     base = np.eye(4)
     base[:3, :3] = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]
@@ -209,18 +183,6 @@ def test_chambers_drawn_are_as_long_as_commanded():
     assert display.segments == (0, 0, 0, 1, 1, 1, 2, 2, 2)
     lengths = [path_lengths(path)[0] for path in display.actuators]
     np.testing.assert_allclose(lengths, BENT, rtol=1e-5)
-
-
-def test_tendons_drawn_from_the_base_change_their_length_as_commanded():
-    lengths = [0.1, 0.08]
-    chain = ConstantCurvatureChain(
-        [0.01, 0.008], n_actuators=(3, 4), lengths=lengths, routing="base"
-    )
-    q = np.array([-0.004, 0.002, 0.002, -0.006, -0.001, 0.006, 0.001])
-    display = plots.BackboneDisplay.from_estimator(chain, q[None], n_points=400)
-    straight = np.array([0.1] * 3 + [0.18] * 4)
-    found = np.array([path_lengths(path)[0] for path in display.actuators])
-    np.testing.assert_allclose(found - straight, q, atol=2e-6)
 
 
 def test_disks_and_frames_stand_on_the_backbone():
@@ -288,19 +250,6 @@ def test_several_bodies_and_rows_without_one(data):
 
 
 @pytest.mark.slow
-def test_tracking_draws_target_and_tracks(x, tmp_path):
-    figure, axes = plots.new_figure(6, 3, 1, 2)
-    display = plots.TrackingDisplay(x, {"one": x + 0.01, "two": x})
-    display.plot(axes[0], plane="xz")
-    display.plot_time(axes[1])
-    np.testing.assert_allclose(axes[0].lines[0].get_xydata(), 100 * (x + 0.01)[:, [0, 2]])
-    np.testing.assert_allclose(axes[0].lines[2].get_xydata(), 100 * x[:, [0, 2]])
-    assert len(axes[1].lines) == 9
-    assert axes[1].get_xlabel() == "time step"
-    assert drawn(figure, tmp_path)
-
-
-@pytest.mark.slow
 def test_tracks_show_what_was_measured(track, tmp_path):
     display = plots.TrackingDisplay.from_tracks({"a": track, "b": track})
     np.testing.assert_array_equal(display.tracks["a"], track.x_measured)
@@ -317,33 +266,6 @@ def test_tracks_show_what_was_measured(track, tmp_path):
     np.testing.assert_array_equal(single.tracks["free"], free.x)
     with pytest.raises(ValueError, match="one path"):
         plots.TrackingDisplay.from_tracks({"a": track, "b": free})
-
-
-@pytest.mark.slow
-def test_unknown_tips_leave_gaps(x, tmp_path):
-    reached = x + 1.5 * SHIFT
-    reached[10:20] = np.nan
-    display = plots.TrackingDisplay(x, {"a": reached, "lost": np.full_like(x, np.nan)})
-    figure = Figure(layout="constrained")
-    display.plot(figure.add_subplot(221)).plot_time(figure.add_subplot(222))
-    display.plot_error(figure.add_subplot(223))
-    labels = [t.get_text() for t in display.ax_.get_legend().get_texts()]
-    assert labels == ["a: mean error 3.35 cm", "lost: mean error nan cm"]
-    assert drawn(figure, tmp_path)
-
-
-@pytest.mark.slow
-def test_actuators_share_out_over_segments(track, tmp_path):
-    figure, axes = plots.new_figure(4, 4, 2, 1)
-    q = np.arange(21.0).reshape(3, 7)
-    plots.ActuatorDisplay({"a": q}, (3, 4)).plot(axes, unit="deg")
-    assert [len(ax.lines) for ax in axes] == [3, 4]
-    np.testing.assert_allclose(axes[1].lines[0].get_ydata(), np.degrees(q[:, 3]))
-    assert axes[1].get_ylabel() == "segment 2 [deg]"
-    assert drawn(figure, tmp_path)
-    display = plots.ActuatorDisplay.from_tracks({"a": track}, (3, 3, 3))
-    np.testing.assert_array_equal(display.paths["a"], track.q)
-    np.testing.assert_array_equal(display.t, track.t)
 
 
 @pytest.mark.slow
@@ -420,42 +342,6 @@ def test_gif_has_every_frame_and_reports_progress(film, tmp_path):
         first = np.array(image.convert("RGB"), dtype=int)
         image.seek(2)
         assert np.abs(np.array(image.convert("RGB"), dtype=int) - first).max() > 100
-
-
-@pytest.mark.slow
-def test_film_is_seen_from_where_asked(film, tmp_path):
-    pictures = []
-    for view in ((30.0, -60.0), (90.0, -90.0)):
-        with Image.open(film.save(tmp_path / "a.gif", dpi=50, view=view)) as image:
-            pictures.append(np.array(image.convert("RGB"), dtype=int))
-    scene, error = np.split(np.abs(pictures[1] - pictures[0]).max(axis=-1), [270], axis=1)
-    assert (scene > 100).sum() > 500
-    assert (error > 100).sum() < 50
-
-
-def test_mp4_plays_as_long_as_the_motion(film, tmp_path):
-    if shutil.which("ffmpeg") is None or shutil.which("ffprobe") is None:
-        pytest.skip("needs ffmpeg")
-    path = film.save(tmp_path / "a.mp4", dpi=50)
-    show = "stream=nb_frames,pix_fmt,r_frame_rate"
-    command = ["ffprobe", "-v", "error", "-show_entries", show, "-of", "json", str(path)]
-    done = subprocess.run(command, check=True, capture_output=True)
-    (stream,) = json.loads(done.stdout)["streams"]
-    assert stream == {"pix_fmt": "yuv420p", "r_frame_rate": "2/1", "nb_frames": "5"}
-
-
-@pytest.mark.slow
-def test_film_of_rows_that_are_not_known(tmp_path):
-    q = np.tile(BENT, (4, 1))
-    q[1], target = np.nan, np.full((4, 3), 0.5)
-    target[2] = np.nan
-    film = plots.TrackAnimation.from_estimator(robots.bionic_handling_assistant(), q, target=target)
-    assert film.caption(1, "cm") == "step 1, error not known"
-    with Image.open(film.save(tmp_path / "a.gif", dpi=40)) as image:
-        assert image.n_frames == 4
-    frames = frames_of(film.save(tmp_path / "a.html"))
-    assert "/tip (model)/marks" not in frames[1]
-    assert np.isfinite(frames[0]["/tip (model)/marks"]).all()
 
 
 def frames_of(path):

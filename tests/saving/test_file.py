@@ -1,10 +1,7 @@
-import copy
 import json
 import shutil
 import struct
 import warnings
-from collections import Counter
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +15,6 @@ from hybridkin.saving.saved_model import model_header
 
 STORED = sorted(FOLDER.glob("*.safetensors"))
 NAMES = [path.stem for path in STORED]
-IGNORED = {"created", "domain", "units", "versions"}  # entries for readers that are people
 NOT_LEARNING = {"adapted_pose", "chain", "chain_of_all_parts", "elastic_chain", "elm", "elm_cv"}
 NOT_LEARNING |= {"pose_output", "rigid"}  # that have no `partial_fit` of tips
 LEARNING = [path for path in STORED if path.stem not in NOT_LEARNING]
@@ -93,23 +89,6 @@ def test_there_is_a_file_of_every_kind_and_writing_keeps_it(tmp_path, fitted):
     assert_array_equal(said_of(tmp_path / "models" / "rigid.safetensors")[0][0], [-1, -0.75, -0.5])
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["chain", "drift_and_radius"])
-def test_flipped_bits_are_noticed(tmp_path, kind):
-    source = FOLDER / f"{kind}.safetensors"
-    q, said = said_of(source)
-    whole, path = source.read_bytes(), tmp_path / "model"
-    rng = np.random.default_rng(0)
-    places = [*range(64), *rng.integers(64, len(whole), 400)]
-    passed = 0
-    for place in places:
-        flipped = bytearray(whole)
-        flipped[place] ^= 1 << int(rng.integers(8))
-        path.write_bytes(flipped)
-        passed += not refused_or_the_same(path, q, said)
-    assert passed <= 2  # a letter of an escape sequence may say the same in capitals
-
-
 def test_cut_and_stretched_files(tmp_path):
     whole, path = (FOLDER / "drift_and_radius.safetensors").read_bytes(), tmp_path / "model"
     for end in [*range(0, 40, 3), *range(40, len(whole), 97), len(whole) - 1]:
@@ -180,69 +159,6 @@ def test_arrays_that_do_not_fit_are_refused_with_a_right_checksum_too(tmp_path, 
                 load_model(path)
     write(path, header, {**arrays, "../../a": np.zeros(3), "new": np.zeros(2)})
     assert not refused_or_the_same(path, q, said)
-
-
-def _entries(header: Any, at: tuple[Any, ...] = ()) -> list[Any]:
-    """Return the ways to all entries of a header."""
-    ways = [at] if at else []
-    for key in header if isinstance(header, dict) else range(len(header)):
-        if isinstance(header[key], (dict, list)):
-            ways += _entries(header[key], (*at, key))
-        else:
-            ways.append((*at, key))
-    return ways
-
-
-def _damaged_entries(header):
-    """Yield ways to entries of a header, each with a hostile value that it takes.
-
-    The same lines of code read the entries of a kind: the names of arrays, the items of a list,
-    one setting of several parts. The first of a kind takes all values, the others one each in turn.
-    """
-    hostile: list[Any] = [None, True, -1, 1e300, "../../x", [], {}, [[[]]]]
-    counts: Counter[Any] = Counter()
-    for way in _entries(header):
-        if way[0] in ("format", "version"):
-            continue
-        kind = way[-1] if isinstance(way[-1], str) else way[-2]
-        kind = "arrays of parts" if way[-2:-1] == ("arrays",) else kind
-        kind = way[0] if way[0] in IGNORED else kind
-        turn = counts[kind]
-        counts[kind] += 1
-        for value in [hostile[turn % len(hostile)]] if turn else hostile:
-            yield way, value
-
-
-def _may_be(entry, value):
-    """Return whether a hostile value is of the type that an entry has, and not empty."""
-    number = type(entry) in (int, float) and type(value) in (int, float)
-    return number or (type(value) is type(entry) and bool(value))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "kind", ["chain", "elm", "drift_and_radius", "parallel_kernel", "serial_elm"]
-)
-def test_headers_that_say_something_else_are_refused_or_do_no_harm(tmp_path, kind):
-    source, path = FOLDER / f"{kind}.safetensors", tmp_path / "model"
-    header, arrays = model_header(source), load_file(source)
-    q, said = said_of(source)
-    nullable = ("gamma",)
-    refused = set()
-    for way, value in _damaged_entries(header):
-        changed: Any = copy.deepcopy(header)
-        entry = changed
-        for key in way[:-1]:
-            entry = entry[key]
-        if _may_be(entry[way[-1]], value) or (value is None and way[-1] in nullable):
-            continue  # that is another model, and a sound one
-        entry[way[-1]] = value
-        write(path, changed, arrays)
-        if refused_or_the_same(path, q, said):
-            refused.add(way[0])
-    assert "kind" in refused
-    assert refused.isdisjoint(IGNORED)
-    assert list(tmp_path.iterdir()) == [path]
 
 
 @pytest.mark.parametrize(

@@ -12,17 +12,14 @@ from saved_models import (
     elastic_chain,
     predictions,
     tendon_chain,
-    trunk,
     trunk_log,
 )
 from sklearn.base import clone
 from sklearn.kernel_ridge import KernelRidge
-from sklearn.model_selection import GroupKFold
 
 import hybridkin
 from hybridkin import (
     ConstantCurvatureChain,
-    ELMRegressorCV,
     HybridForwardModel,
     load_model,
     robots,
@@ -160,19 +157,6 @@ def test_a_loaded_hybrid_is_fitted_again_as_what_it_was(tmp_path, kind, fitted):
     assert_allclose(twin.predict(q), again.predict(q), rtol=1e-12)
 
 
-def test_settings_that_json_lacks_become_the_default(tmp_path):
-    q, x, groups = trunk_log()
-    for coupling in ("parallel", "serial"):
-        network = ELMRegressorCV(4, cv=GroupKFold(2), max_hidden=4, random_state=0)
-        model = HybridForwardModel(trunk(), network, coupling=coupling).fit(q, x, groups=groups)
-        save_model(model, tmp_path / "model")
-        twin = load_model(tmp_path / "model")
-        assert twin.error_model.cv is None
-        assert twin.error_model.n_hidden == 4
-        assert_array_equal(twin.predict(q), model.predict(q))
-        assert twin.fit(q, x, groups=groups).predict(q).shape == x.shape
-
-
 def test_the_header_describes_the_model(tmp_path, fitted):
     path = tmp_path / "model"
     model, q = fitted["serial_quadratic"]
@@ -222,14 +206,6 @@ def test_devices(tmp_path, kind, fitted):
     assert {buffer.device.type for buffer in module.buffers()} == {"cuda"}
     if module is not twin:
         assert_allclose(twin.predict(q), model.predict(q), rtol=1e-12)
-
-
-@pytest.mark.parametrize("header", ["[]", "3", "null", "{", "[" * 100_000, '{"format": 1}'])
-def test_foreign_headers(tmp_path, header):
-    path = tmp_path / "model"
-    save_file({"a": np.zeros(3)}, path, metadata={"hybridkin": header})
-    with pytest.raises(ValueError, match="is not a model"):
-        load_model(path)
 
 
 @pytest.mark.parametrize(

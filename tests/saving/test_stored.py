@@ -10,7 +10,7 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import PolynomialFeatures, StandardScaler
 from torch.testing import assert_close
 
-from hybridkin import ELMRegressor, HybridForwardModel, as_forward_model, load_model, save_model
+from hybridkin import ELMRegressor, load_model, save_model
 from hybridkin._core.digests import row_digests
 from hybridkin._core.stored import Stored
 from hybridkin.learning.regressor_modules import error_module
@@ -55,19 +55,6 @@ def test_shared_parts_are_shared_again(tmp_path, fitted):
     correction = serial.module_.corrections[0]
     assert correction.module.features.chain is serial.mechanical_model_
     assert serial.mechanical_model is not serial.mechanical_model_
-
-
-def test_models_of_code_say_so():
-    with pytest.raises(TypeError, match="FunctionModel could only be stored as code"):
-        as_forward_model(torch.sin).stored()
-    q, x, _ = trunk_log()
-    model = HybridForwardModel(torch.nn.Identity(), LinearOfCode()).fit(q, x)
-    with pytest.raises(TypeError, match="could only be stored as code"):
-        save_model(model, "model")
-
-
-class LinearOfCode(Ridge):
-    pass
 
 
 def test_entries_are_checked_when_they_are_read():

@@ -111,11 +111,6 @@ def test_dragging_the_target_moves_the_tip(page, shown):
     page.get_by_text("On target").wait_for()
 
 
-def test_out_of_reach_is_said(page, shown):
-    shown.follow([0.0, 0.0, 2.0])
-    page.get_by_text("Out of reach").wait_for(timeout=20_000)
-
-
 def test_two_clients_see_the_same_robot_and_a_reload_comes_back(browser, page, shown):
     second = opened(browser, shown)
     shown.follow(shown.robot.x + np.array([0.1, 0.0, 0.0]))

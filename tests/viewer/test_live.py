@@ -3,7 +3,6 @@
 import builtins
 import socket
 import time
-from contextlib import suppress
 from types import SimpleNamespace
 
 import numpy as np
@@ -109,16 +108,6 @@ def test_a_path_is_followed_in_a_loop(fitted):
     np.testing.assert_allclose(targets[:20], targets[20:40])
 
 
-def test_rows_with_unknown_numbers_are_left_out(fitted):
-    log = fitted[1]
-    q = log.q.copy()
-    q[3, 2] = np.nan
-    x = log.x.copy()
-    x[5] = np.nan
-    with hybridkin.view(fitted[0], datasets.Log(q, x), port=9350) as shown:
-        assert len(shown._rows.dots.points) == len(q) - 2
-
-
 def test_an_error_of_the_drawing_is_raised_where_one_waits(shown):
     def fail(robot):
         raise RuntimeError("no picture")
@@ -137,22 +126,6 @@ def test_a_closed_view_frees_its_port_and_a_taken_port_is_passed_over(fitted):
     for port in ports:
         with socket.socket() as probe:
             assert probe.connect_ex(("127.0.0.1", port)) != 0
-
-
-def test_rubbish_from_a_client_does_not_stop_the_view(shown):
-    import viser
-    from websockets.exceptions import WebSocketException
-    from websockets.sync.client import connect
-
-    address = shown.address.replace("http", "ws")
-    protocol = f"viser-v{viser.__version__}"
-    for rubbish in (b"\xff" * 1000, "not a message", b""):
-        with suppress(WebSocketException, TimeoutError, OSError):
-            with connect(address, subprotocols=[protocol], open_timeout=2) as client:
-                client.send(rubbish)
-                client.recv(timeout=0.2)
-    shown.follow(shown.robot.x + np.array([0.02, 0.0, 0.0]))
-    until(lambda: shown.robot.situation.reached)
 
 
 def test_messages_of_what_cannot_be_shown(fitted, monkeypatch):
@@ -187,15 +160,3 @@ def test_the_command_ends_at_ctrl_c(fitted, tmp_path, capsys, monkeypatch):
     assert opened
     assert opened[0] in err
     assert opened[0].startswith("http://127.0.0.1:93")
-
-
-def test_markers_are_drawn_where_the_model_predicts_them():
-    base = robots.bionic_handling_assistant()
-    chain = base.with_markers([(0, 1.0), (1, 1.0), (2, 1.0)])
-    with hybridkin.view(chain, q_min=0.1, q_max=0.4, port=9330) as shown:
-        shown.go_to(np.linspace(0.2, 0.3, 9))
-        until(lambda: shown.robot._resting)
-        time.sleep(0.2)
-        expected = shown.robot.loaded.predict(shown.robot.q[None]).reshape(3, 3)
-        assert shown._body._markers.points == pytest.approx(expected, abs=1e-3)
-        assert expected[-1] == pytest.approx(shown.robot.x)

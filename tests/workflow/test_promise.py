@@ -57,13 +57,6 @@ def test_a_path_outside_is_moved_to_where_it_lies_inside(domain):
     np.testing.assert_array_equal(stays.x, moved.x)
 
 
-def test_a_path_that_is_too_large_is_to_be_made_smaller(domain):
-    tips = domain.sample[1]
-    wide = trajectories.figure_eight(tips.mean(axis=0), [3.0, 2.0], dt=0.1)
-    assert placed(domain, wide, 1e-4)[1] < 0.5
-    assert better_place(domain, wide, 1e-4).startswith("make it smaller (--scale)")
-
-
 def test_a_path_is_placed_where_its_promise_is_least(domain):
     training = {
         "saved": "h",

@@ -149,19 +149,6 @@ def test_an_error_of_no_known_cause_is_not_explained(verified):
     assert "None of these explains the error" in report.plain()
 
 
-def test_parts_of_the_path_have_their_own_errors(verified):
-    q, tips = partly_outside(loops(0.6 * SIZE))
-    parts = verified(q, tips).record.parts
-    assert [*parts] == [
-        "path",
-        "inside the log",
-        "outside the log",
-        *(f"quarter {k}" for k in "1234"),
-    ]
-    assert parts["inside the log"].mean < 0.3 * parts["outside the log"].mean
-    assert parts["path"].rows == sum(parts[f"quarter {k}"].rows for k in "1234")
-
-
 def test_rows_are_matched_by_time(loaded, tmp_path):
     q = loops(0.6 * SIZE)
     track = written(tmp_path / "track.csv", q, truth(q))
@@ -172,13 +159,6 @@ def test_rows_are_matched_by_time(loaded, tmp_path):
     assert report.record.parts["path"].mean < NOISE
     with pytest.raises(ValueError, match="`log` must have as many rows as the track or a column"):
         workflow.verify_track(loaded, track, Log(q[few], truth(q)[few]))
-
-
-def test_a_log_of_other_commands_is_refused(loaded, tmp_path):
-    q = loops(0.6 * SIZE)
-    track = written(tmp_path / "track.csv", q, truth(q))
-    with pytest.raises(ValueError, match=r"commands of the track, but they differ by \d+ %"):
-        workflow.verify_track(loaded, track, Log(-q, truth(q)))
 
 
 def test_the_command_leaves_out_rows_without_a_tip(loaded, tmp_path, capsys):

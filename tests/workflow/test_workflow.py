@@ -9,10 +9,8 @@ import torch
 
 from hybridkin import (
     ConstantCurvatureChain,
-    ElasticTendonChain,
     HybridForwardModel,
     PlayOperator,
-    calibrate,
     datasets,
     robots,
     save_model,
@@ -21,7 +19,6 @@ from hybridkin import (
 )
 from hybridkin.cli.main import main
 from hybridkin.hybrid.estimator import fit_quietly
-from hybridkin.workflow.calibrated import calibrated_parameters
 from hybridkin.workflow.compare import Mechanical, compare_by_group, with_play_detected
 from hybridkin.workflow.domain import Domain
 from hybridkin.workflow.log import checked
@@ -102,18 +99,6 @@ def test_rows_outside_the_domain_count_for_no_radius(log, tmp_path):
     assert re.search(r"\| 1[.0]* +\|.*\| +0 \| +- \|", report.markdown())
     text = " ".join(report.plain().split())
     assert "covers 80 % of the tips inside the domain. Rows without a radius" in text
-
-
-def test_parameters_of_elastic_tendons_have_their_units():
-    q = 0.004 * np.random.default_rng(0).uniform(-1, 1, (120, 3))
-    options = {"bending_stiffness": 1e-6, "axial_stiffness": 2.0, "tendon_zeros": -2e-4}
-    x = ElasticTendonChain([0.005], [0.1], **options)(torch.from_numpy(q)).numpy()
-    start = ElasticTendonChain([0.005], [0.1])
-    names = ["bending_stiffness", "axial_stiffness", "tendon_zeros"]
-    entries = calibrated_parameters(start, calibrate(start, q, x, names))
-    assert [entry.unit for entry in entries] == ["mm²/rad²", "-", *3 * ["mm"]]
-    assert [entry.start for entry in entries[:2]] == pytest.approx([0.25, 10.0])
-    assert [entry.value for entry in entries] == pytest.approx([1.0, 2.0, *3 * [-0.2]], rel=0.01)
 
 
 @pytest.fixture(scope="module")
@@ -313,19 +298,6 @@ def test_a_log_that_does_not_pass_its_check_stops_the_fit(log, tmp_path):
     with pytest.raises(ValueError, match="`play` requires"):
         workflow.fit_log(measured, description, tmp_path / "m", settings)
     assert not (tmp_path / "m").exists()
-
-
-def test_columns_in_a_wrong_order_are_named_by_the_calibrated_chain(log):
-    path, toml = log
-    robot = robots.read_description(toml)
-    q = ("l1", "l4", "l3", "l2", "l5", "l6")
-    log_format = replace(robot.log, q=q)
-    unchecked = workflow.read_log(path, log_format)
-    (message,) = unchecked.misread(robot.chain)
-    assert 'set q = ["l1", "l2", "l3", "l4", "l5", "l6"] in [log]' in message
-    checked = workflow.read_log(path, log_format, chain=robot.chain)
-    assert [f.kind for f in checked.report.misread] == ["order"]
-    assert checked.misread(robot.chain) == []
 
 
 def test_the_range_and_the_preferred_configuration_move_with_the_zeros(tmp_path):
