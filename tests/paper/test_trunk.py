@@ -121,4 +121,3 @@ def test_an_unstable_equilibrium_is_not_settled():
     upright = TrunkPlant(tilt=np.pi, torsional_stiffness=50.0, bending_stiffness=0.02)
     with pytest.raises(NotSettledError, match=r"lowest stiffness is -\d"):
         upright.settle(np.full(9, 0.25))
-
