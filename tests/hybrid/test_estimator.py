@@ -1,8 +1,5 @@
-import copy
-import pickle
 import warnings
 
-import joblib
 import numpy as np
 import pytest
 import torch
@@ -134,20 +131,6 @@ def test_guard_leaves_the_training_rows_and_falls_back_to_mechanics(log):
         assert free.in_domain(far).all()
 
 
-@pytest.mark.slow
-def test_calibration_happens_inside_fit(log):
-    q, x, groups = log
-    nominal = ConstantCurvatureChain([0.12, 0.12, 0.12])
-    truth = bha()(torch.from_numpy(q)).numpy()
-    model = HybridForwardModel(nominal, "drop", calibrate="default").fit(q, truth)
-    assert_allclose(model.mechanical_model_.radii, bha().radii, rtol=0, atol=1e-9)
-    assert_allclose(nominal.radii, [0.12] * 3)
-    assert model.calibration_.cv_rmse is None
-    nominal = ConstantCurvatureChain([0.10, 0.10, 0.10])
-    model = HybridForwardModel(nominal, "drop", calibrate=("radii",)).fit(q, x, groups=groups)
-    assert model.calibration_.cv_rmse > model.calibration_.rmse
-
-
 @pytest.mark.parametrize("coupling", ["parallel", "serial"])
 def test_networks_without_a_seed_have_that_of_the_hybrid(log, coupling):
     q, x, _ = (part[:120] for part in log)
@@ -183,17 +166,6 @@ def test_numbers_too_large_for_a_model_leave_the_other_rows_alone(log, size):
         weights = model.error_weight(far)
         assert weights[0] == weights[2] == 1.0
         assert weights[1] < 1e-12
-
-
-def test_clone_pickle_and_hash(log):
-    q, x, _ = log
-    model = HybridForwardModel(bha(), ELMRegressor(random_state=0)).fit(q, x)
-    fresh = clone(model)
-    assert not hasattr(fresh, "module_")
-    assert joblib.hash(fresh) == joblib.hash(clone(model))
-    for twin in (pickle.loads(pickle.dumps(model)), copy.deepcopy(model)):
-        assert_array_equal(twin.predict(q), model.predict(q))
-        assert joblib.hash(twin) == joblib.hash(model)
 
 
 @pytest.mark.parametrize(
@@ -280,8 +252,8 @@ def test_value_and_jacobian_in_one_pass_are_those_of_value_and_weight(alpha):
     module = model.module_
     rng = np.random.default_rng(0)
     low, high = data.q.min(0), data.q.max(0)
-    wide = low + (high - low) * rng.uniform(-0.7, 1.7, (4000, 9))
-    q = torch.from_numpy(np.concatenate([data.q, wide]))
+    wide = low + (high - low) * rng.uniform(-0.7, 1.7, (400, 9))
+    q = torch.from_numpy(np.concatenate([data.q[::10], wide]))
     inside = module.in_domain(q)
     assert inside.any()
     assert (~inside).any()
@@ -289,8 +261,8 @@ def test_value_and_jacobian_in_one_pass_are_those_of_value_and_weight(alpha):
     assert_close(x, module(q), rtol=0, atol=1e-12)
     alone = module.forward_and_jacobian(q[inside])
     assert_close(alone, (x[inside], J[inside]), rtol=0, atol=1e-12)
-    expected = torch.func.vmap(torch.func.jacrev(module))(q[::50])
-    assert_close(J[::50], expected, rtol=1e-8, atol=1e-9)
+    expected = torch.func.vmap(torch.func.jacrev(module))(q[::10])
+    assert_close(J[::10], expected, rtol=1e-8, atol=1e-9)
 
 
 @pytest.mark.slow
@@ -331,12 +303,3 @@ def test_no_configuration_is_far_from_the_mechanical_model(guard, error_model):
     assert_close(module.forward_and_jacobian(at)[0], module(at), rtol=0, atol=1e-9)
     reverse = torch.func.vmap(torch.func.jacrev(module))(at)
     assert_close(module.jacobian(at), reverse, rtol=1e-6, atol=1e-6 * float(reverse.abs().max()))
-
-
-def test_warnings_of_units_name_the_line_of_the_caller():
-    q = np.random.default_rng(0).uniform(0.2, 0.3, (30, 9))
-    model = HybridForwardModel(robots.bionic_handling_assistant(), "drop")
-    model.fit(q, model.mechanical_model(torch.from_numpy(q)).numpy())
-    with pytest.warns(UserWarning, match="`X`") as caught:
-        model.predict(1e3 * q)
-    assert {one.filename for one in caught} == {__file__}

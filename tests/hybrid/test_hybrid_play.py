@@ -48,6 +48,7 @@ def split(log):
     return [part[~test] for part in log], [part[test] for part in log]
 
 
+@pytest.mark.slow
 def test_the_width_is_found_where_a_marker_is_missing(log):
     q, _, groups = log
     chain = CHAIN.with_markers([(1, 1.0), (2, 1.0)])

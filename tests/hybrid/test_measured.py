@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 from sklearn.compose import TransformedTargetRegressor
-from sklearn.linear_model import LinearRegression
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import MinMaxScaler, StandardScaler
 
@@ -35,11 +34,6 @@ def test_a_scaler_before_the_hybrid_is_refused(rows, scaler, calibrate):
         make_pipeline(scaler, model).fit(q, x)
     with pytest.raises(ValueError, match=r"`y` must hold tip positions.* out of the pipeline"):
         TransformedTargetRegressor(model, transformer=StandardScaler()).fit(q, x)
-
-
-def test_a_scaler_before_a_model_of_data_alone_is_fine(rows):
-    _, q, x = rows
-    make_pipeline(StandardScaler(), HybridForwardModel(None, LinearRegression())).fit(q, x)
 
 
 @pytest.mark.parametrize("name", ["X", "y"])

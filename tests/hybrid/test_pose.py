@@ -202,17 +202,6 @@ def test_half_turns_do_no_harm():
     )
 
 
-def test_calibration_looks_at_the_positions():
-    true = bha().with_geometry(radii=torch.tensor([0.106, 0.090, 0.082]).double())
-    q = actuators(200)
-    y = rows_of(end(true, q))
-    model = pose_model("drop", calibrate=("radii",)).fit(q, y)
-    assert_allclose(model.mechanical_model_.radii.numpy(), true.radii.numpy(), rtol=1e-6)
-    assert_allclose(model.predict(q), y, rtol=0, atol=1e-6)
-    assert model.error_model_ is None
-    assert not model.predict_error(q).any()
-
-
 # ---------------------------------------------------------------- Jacobians
 
 
@@ -250,17 +239,6 @@ def test_pose_jacobian_is_the_derivative(log, kind):
         linear = (ahead[:, :3, 3] - behind[:, :3, 3]) / (2 * h)
         angular = rotation_vector(ahead[:, :3, :3] @ behind[:, :3, :3].mT) / (2 * h)
         assert_close(J[:, :, k], torch.cat([linear, angular], dim=1), rtol=0, atol=1e-6)
-
-
-def test_shapes_lead_and_rows_stand_alone(fitted):
-    module = fitted.module_
-    q = torch.from_numpy(actuators(12, spread=0.15)).reshape(3, 4, 9)
-    T, J = module.pose_and_jacobian(q)
-    assert T.shape == (3, 4, 4, 4)
-    assert_close(module.pose(q[1, 2]), T[1, 2], rtol=0, atol=1e-14)
-    assert_close(module.pose_jacobian(q[1, 2]), J[1, 2], rtol=0, atol=1e-12)
-    assert module.pose(q[:0]).shape == (0, 4, 4, 4)
-    assert module.pose_jacobian(q[:0]).shape == (0, 4, 6, 9)
 
 
 def test_the_guard_bounds_position_and_orientation(fitted, log, monkeypatch):

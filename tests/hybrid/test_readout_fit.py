@@ -105,28 +105,6 @@ def disturbed(chain, q, rng, size=0.02, noise=0.0):
     return truth, x + noise * torch.randn(x.shape, generator=rng, dtype=x.dtype)
 
 
-def central_differences(function, q, step=1e-6):
-    columns = []
-    for j in range(q.shape[-1]):
-        move = torch.zeros_like(q)
-        move[..., j] = step
-        columns.append((function(q + move) - function(q - move)) / (2 * step))
-    return torch.stack(columns, -1)
-
-
-@pytest.mark.parametrize("kind", ["linear", "quadratic", "hidden"])
-def test_slopes_of_features(kind, rng):
-    q = 0.25 + 0.1 * uniform(rng, 40, 5)
-    features = some_features(kind, q, rng)
-    weights = uniform(rng, 2, features(q).shape[1])
-    value, slope = features.readout(q, weights)
-    assert_close(value, features(q) @ weights.mT)
-    assert_close(
-        slope, central_differences(lambda q: features(q) @ weights.mT, q), atol=1e-7, rtol=0
-    )
-    assert_close(features(q[3]), features(q)[3])
-
-
 def test_quadratic_features_span_all_monomials(rng):
     q = uniform(rng, 60, 3)
     u = (q - q.amin(0)) / (q.amax(0) - q.amin(0)) * 2 - 1

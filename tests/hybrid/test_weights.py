@@ -17,10 +17,9 @@ from hybridkin import (
 )
 
 SERIAL = ("elm", "linear", "quadratic", "pose", "network")
-SLOW = {"marks": pytest.mark.slow}
-PAIRS = [("parallel", kind) for kind in (*SERIAL, "drop", "ridge")]
-PAIRS += [("serial", kind) for kind in SERIAL]
-PAIRS += [pytest.param("parallel", "kernel", **SLOW)]
+PAIRS = [(("parallel", kind), ()) for kind in (*SERIAL, "drop", "ridge")]
+PAIRS += [(("serial", kind), ()) for kind in SERIAL]
+PAIRS += [(("parallel", "kernel"), pytest.mark.slow)]
 
 
 def hybrid(kind, coupling="parallel", **options):
@@ -58,13 +57,16 @@ def assert_equal_models(weighed, repeated, weights, new):
             assert_allclose(np.repeat(one, weights, axis=0), many, rtol=0, atol=1e-10)
 
 
-@pytest.mark.parametrize(("coupling", "kind"), PAIRS)
+RADIUS = {"calibrate": ("radii",), "coverage": 0.8}
+WITH_RADIUS = [("parallel", "elm"), ("serial", "quadratic"), ("parallel", "kernel")]
+
+
 @pytest.mark.parametrize(
-    ("by_motion", "options"),
+    ("by_motion", "options", "coupling", "kind"),
     [
-        (False, {}),
-        (True, {"guard": "box"}),
-        pytest.param(True, {"calibrate": ("radii",), "coverage": 0.8}, **SLOW),
+        *[pytest.param(False, {}, *pair, marks=marks) for pair, marks in PAIRS],
+        *[pytest.param(True, {"guard": "box"}, *pair, marks=marks) for pair, marks in PAIRS],
+        *[pytest.param(True, RADIUS, *pair, marks=pytest.mark.slow) for pair in WITH_RADIUS],
     ],
 )
 def test_weights_are_repetitions(coupling, kind, by_motion, options, log):
@@ -88,7 +90,7 @@ def test_weights_are_repetitions_in_the_selection(log):
     assert_equal_models(weighed, repeated, weights, new)
 
 
-@pytest.mark.parametrize("kind", ["linear", "network", pytest.param("kernel", **SLOW)])
+@pytest.mark.parametrize("kind", ["linear", "network"])
 def test_weights_are_repetitions_with_play(kind, log):
     q, x, weights, motions, new = log
     weights = np.maximum(weights, 1)
