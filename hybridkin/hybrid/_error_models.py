@@ -11,12 +11,12 @@ from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from math import inf, nan
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar, cast
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from sklearn.base import BaseEstimator, clone
+from sklearn.base import clone
 from sklearn.kernel_ridge import KernelRidge
 from sklearn.utils.validation import has_fit_parameter
 from torch import Tensor
@@ -43,7 +43,7 @@ from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._spec import ErrorModel, FittedError, Seed, Spec, Weighted
 from hybridkin.learning.elm import ELMRegressor, draw_layer
 from hybridkin.learning.elm_cv import ELMRegressorCV
-from hybridkin.learning.regressor_modules import error_module
+from hybridkin.learning.regressor_modules import Regressor, error_module
 
 _LEAST = 0.2  # assumed lower limit of training errors, as a share of the errors before learning
 _LARGEST_LEVERAGE = 0.999
@@ -52,6 +52,7 @@ _MOST = 2000  # rows whose training errors are computed
 NAMED: dict[str, type[ErrorModel]] = {}
 """Error models by name."""
 _Class = TypeVar("_Class", bound=type[ErrorModel])
+_Regressor = TypeVar("_Regressor")
 
 
 def named(name: str) -> Callable[[_Class], _Class]:
@@ -100,14 +101,18 @@ def _of_markers(fits: list[FittedError]) -> FittedError:
     """Return the fits of all markers as one."""
     if len(fits) == 1:
         return fits[0]
-    results = tuple(fitted.result for fitted in fits)
+    first = fits[0]
+    results = None
+    if first.result is not None:
+        results = tuple(fitted.result for fitted in fits)
+    variances = [fitted.noise**2 for fitted in fits]
     return FittedError(
-        None if results[0] is None else results,
+        results,
         [fitted.corrections[0] for fitted in fits],
         PerMarker([fitted.settled for fitted in fits]),
-        float(np.sqrt(np.mean([fitted.noise**2 for fitted in fits]))),
-        fits[0].rejected,
-        fits[0].held_out,
+        float(np.sqrt(np.mean(variances))),
+        first.rejected,
+        first.held_out,
     )
 
 
@@ -125,7 +130,7 @@ class NoCorrection(TipModel):
 
 def _nothing(model: ErrorModel, rows: Rows) -> FittedError:
     """Return the result of an error model for rows that give nothing to learn."""
-    return FittedError(None, [[]], model, _spread(rows.residual, rows.counts))
+    return FittedError(None, [[]], model, _spread(_residual(rows), rows.counts))
 
 
 class FeatureModel(TipModel):
@@ -166,6 +171,7 @@ class FeatureModel(TipModel):
         read_out = self.read_out(rows, spec)
         fits = []
         for of_marker, marker in markers:
+            assert isinstance(marker.mechanical, ArcChain)
             readout = read_out.readout.up_to(marker.mechanical)
             fit = read_out._replace(readout=readout)
             fits.append(self._fitted(fit, of_marker))
@@ -282,7 +288,7 @@ class HiddenLayer(FeatureModel):
         )
 
 
-class RegressorModel(TipModel):
+class RegressorModel(TipModel, Generic[_Regressor]):
     """A scikit-learn regressor of the residual at the tip.
 
     Parameters
@@ -296,7 +302,7 @@ class RegressorModel(TipModel):
     needs_mechanical = False
     holds_out = False  # whether `_noise` is that of held-out rows
 
-    def __init__(self, regressor: BaseEstimator) -> None:
+    def __init__(self, regressor: _Regressor) -> None:
         self.regressor = regressor
 
     def fit_tip(self, rows: Rows, spec: Spec) -> FittedError:
@@ -309,8 +315,10 @@ class RegressorModel(TipModel):
             matrix, offset = directions.projection()
             rows = replace(rows, X=(rows.X @ matrix + offset).astype(rows.X.dtype))
         regressor = self._fitted(rows)
-        module = error_module(regressor, rows.q)
-        noise = self._noise(regressor, module, rows) if spec.held_out else nan
+        module = error_module(cast(Regressor, regressor), rows.q)
+        noise = nan
+        if spec.held_out:
+            noise = self._noise(regressor, module, rows)
         correction = TipCorrection(_on_moved_directions(module, directions))
         return FittedError(
             regressor,
@@ -320,13 +328,13 @@ class RegressorModel(TipModel):
             held_out=self.holds_out,
         )
 
-    def _fitted(self, rows: Rows) -> Any:
+    def _fitted(self, rows: Rows) -> _Regressor:
         return _fitted(self.regressor, rows)
 
-    def _settled(self, regressor: Any) -> ErrorModel:
+    def _settled(self, regressor: _Regressor) -> ErrorModel:
         return self
 
-    def _noise(self, regressor: Any, module: ForwardModel, rows: Rows) -> float:
+    def _noise(self, regressor: _Regressor, module: ForwardModel, rows: Rows) -> float:
         """Return the spread of training errors; regressors may overfit, so it has a least share."""
         rows = rows.thinned(_MOST)
         before = _residual(rows)
@@ -336,12 +344,14 @@ class RegressorModel(TipModel):
         return max(_spread(after, rows.counts), float(least))
 
 
-class NetworkModel(RegressorModel):
+class NetworkModel(RegressorModel[ELMRegressor]):
     """An extreme learning machine of the residual at the tip."""
 
     holds_out = True
 
-    def _noise(self, regressor: Any, module: ForwardModel, rows: Rows) -> float:
+    def _noise(
+        self, regressor: ELMRegressor, module: ForwardModel, rows: Rows
+    ) -> float:
         """Return the spread of leave-one-out errors."""
         rows = rows.thinned(_MOST)
         network = regressor.module_
@@ -352,44 +362,48 @@ class NetworkModel(RegressorModel):
         return _spread(after / remaining[:, None], rows.counts)
 
 
-class NetworkModelCV(RegressorModel):
+class NetworkModelCV(RegressorModel[ELMRegressorCV]):
     """An extreme learning machine that chooses its own settings."""
 
     holds_out = True
 
-    def _fitted(self, rows: Rows) -> Any:
+    def _fitted(self, rows: Rows) -> ELMRegressorCV:
         network = super()._fitted(rows)
         network.left_out_errors_ = rows.as_given(network.left_out_errors_)
         return network
 
-    def _settled(self, regressor: Any) -> ErrorModel:
+    def _settled(self, regressor: ELMRegressorCV) -> ErrorModel:
         return NetworkModel(ELMRegressor(**regressor.best_params_))
 
-    def _noise(self, regressor: Any, module: ForwardModel, rows: Rows) -> float:
+    def _noise(
+        self, regressor: ELMRegressorCV, module: ForwardModel, rows: Rows
+    ) -> float:
         """Return the spread of the errors of rows that were held out."""
-        return float(np.sqrt(np.nanmean(np.square(regressor.left_out_errors_))))
+        squares = np.square(regressor.left_out_errors_)
+        return float(np.sqrt(np.nanmean(squares)))
 
 
 @named("kernel")
-class KernelModel(RegressorModel):
+class KernelModel(RegressorModel[KernelRidge]):
     """Kernel ridge with the width and the penalty of least held-out error."""
 
     def __init__(self) -> None:
         super().__init__(KernelRidge())
 
-    def _fitted(self, rows: Rows) -> Any:
+    def _fitted(self, rows: Rows) -> KernelRidge:
+        assert rows.residual is not None
         tuned = tuned_kernel(rows.X, rows.residual, rows.counts, rows.groups)
         return _fitted(tuned, rows)
 
-    def _settled(self, regressor: Any) -> ErrorModel:
-        return RegressorModel(clone(regressor))
+    def _settled(self, regressor: KernelRidge) -> ErrorModel:
+        return RegressorModel(_copy(regressor))
 
 
 class FittedBlend(NamedTuple):
     """Several fitted error models; the result is the weighted mean of their hybrids."""
 
     weights: tuple[float, ...]
-    error_models: tuple[Any, ...]
+    error_models: tuple[object, ...]
 
 
 class Blend(ErrorModel):
@@ -424,7 +438,7 @@ def network_model(
     setting: ELMRegressor | ELMRegressorCV, coupling: str, random_state: Seed
 ) -> ErrorModel:
     """Return the error model of a network, with this seed if it has none."""
-    network = clone(setting)
+    network = _copy(setting)
     if network.random_state is None:
         network.set_params(random_state=random_state)
     if coupling == "serial":
@@ -434,18 +448,28 @@ def network_model(
     return NetworkModel(network)
 
 
-def _fitted(regressor: BaseEstimator, rows: Rows) -> Any:
+def _copy(regressor: _Regressor) -> _Regressor:
+    """Return an unfitted copy of a regressor."""
+    copied: Any = clone(regressor)
+    return copied
+
+
+def _fitted(regressor: _Regressor, rows: Rows) -> _Regressor:
     """Return a copy of the regressor fitted to the residuals, with the weights that it takes."""
-    regressor = clone(regressor)
-    if not has_fit_parameter(regressor, "sample_weight"):
+    copied: Any = clone(regressor)
+    if not has_fit_parameter(copied, "sample_weight"):
         rows = rows.repeated()
     options = {}
     if rows.weights is not None:
         options["sample_weight"] = rows.weights
-    if rows.groups is not None and has_fit_parameter(regressor, "groups"):
+    if rows.groups is not None and has_fit_parameter(copied, "groups"):
         options["groups"] = rows.groups
-    with TURNS.filters if isinstance(regressor, KernelRidge) else nullcontext():
-        return regressor.fit(rows.X, rows.residual, **options)
+    turn = nullcontext()
+    if isinstance(regressor, KernelRidge):
+        turn = TURNS.filters
+    with turn:
+        copied.fit(rows.X, rows.residual, **options)
+    return copied
 
 
 def _on_moved_directions(module: ForwardModel, directions: Directions) -> ForwardModel:
@@ -458,10 +482,12 @@ def _on_moved_directions(module: ForwardModel, directions: Directions) -> Forwar
 
 def _residual(rows: Rows) -> NDArray:
     """Return the residuals as a matrix (N, m) [m]."""
+    assert rows.residual is not None
     return rows.residual.reshape(len(rows), -1)
 
 
 def _spread(residual: NDArray, counts: NDArray) -> float:
-    """Return the root mean square of residuals (N, m) or (N,), without missing markers."""
-    squares = np.ma.masked_invalid(residual.reshape(len(residual), -1) ** 2)
-    return float(np.ma.average(squares, axis=0, weights=counts).mean() ** 0.5)
+    """Return the root mean square of residuals (N, m), without missing markers."""
+    squares = np.ma.masked_invalid(residual**2)
+    variances = np.ma.average(squares, axis=0, weights=counts)
+    return float(variances.mean() ** 0.5)

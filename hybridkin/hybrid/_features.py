@@ -53,9 +53,9 @@ class Features(PortableModule):
         self.register_buffer("scale", scale)
 
     @classmethod
-    def of_range(cls, q: Tensor, *args: Any, **options: Any) -> Self:
+    def of_range(cls, q: Tensor, *args: Any) -> Self:
         """Return the features for the range of rows q (N, n); constant columns get scale 1."""
-        return cls(*center_and_scale(q), *args, **options)
+        return cls(*center_and_scale(q), *args)
 
     @property
     def n_linear(self) -> int:

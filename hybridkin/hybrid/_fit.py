@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hybridkin._core.model import PoseModel
 from hybridkin._core.units import motion_message
 from hybridkin.calibration.choice import unmoved
 from hybridkin.calibration.measured import points
@@ -19,7 +18,7 @@ from hybridkin.hybrid._guards import GroupDistance, Plane, fit_guard
 from hybridkin.hybrid._module import Hybrid, HybridModule
 from hybridkin.hybrid._rows import Rows, rare_marker
 from hybridkin.hybrid._spec import FittedError, Spec, Weighted, residuals
-from hybridkin.hybrid._wrapped import Stacked, WithPose
+from hybridkin.hybrid._wrapped import Stacked, WithPose, posed
 
 _NEVER = 1e-9  # part of an actuator in the moved directions, if it never moves
 _COUNTS = 1e12  # largest ratio of weights; a smaller weight is lost in a float64 sum
@@ -56,17 +55,15 @@ def fit_hybrid(spec: Spec, rows: Rows) -> FittedHybrid:
     error = spec.error_model.fit(rows, spec)
     modules = []
     markers = spec.by_marker(rows)
-    for (of_marker, marker), corrections in zip(
-        markers, error.corrections, strict=True
-    ):
-        modules.append(_module(marker, of_marker, corrections))
+    for part, corrections in zip(markers, error.corrections, strict=True):
+        modules.append(_module(*part, corrections))
     module = modules[0]
     if len(modules) > 1:
         module = Stacked(spec.mechanical, modules)
     return FittedHybrid(spec, error, module)
 
 
-def _module(spec: Spec, rows: Rows, weighted: Weighted) -> HybridModule | WithPose:
+def _module(rows: Rows, spec: Spec, weighted: Weighted) -> HybridModule | WithPose:
     """Return the hybrid of one tip, with guarded corrections and its domain."""
     corrections = [correction for _, correction in weighted]
     weights = rows.q.new_tensor([weight for weight, _ in weighted])
@@ -85,10 +82,12 @@ def _module(spec: Spec, rows: Rows, weighted: Weighted) -> HybridModule | WithPo
     if spec.error_model.learns or not directions.moved.size:
         # Backlash moves actuators off the plane of their commands, but only by its width.
         plane = Plane.of_log(spec.mechanical, rows.q, spec.commanded or directions)
-        groups = rows.groups if guarded else None
+        groups = None
+        if guarded:
+            groups = rows.groups
         tested = GroupDistance.of_log(rows.q, groups, directions, plane)
     if spec.output == "pose":
-        mechanical = cast(PoseModel, spec.mechanical)
+        mechanical = posed(spec.mechanical)
         return WithPose.of(mechanical, corrections, weights, tested, plane)
     return HybridModule(spec.mechanical, corrections, weights, None, tested, plane)
 

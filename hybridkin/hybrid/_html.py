@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from hybridkin._core.html import numbers
+from hybridkin.hybrid._predictor import HybridPredictor
 
 
-def fitted_rows(model: Any) -> dict[str, object]:
+def fitted_rows(model: HybridPredictor) -> dict[str, object]:
     """Return names and values of what the fit of a hybrid found, for `html_table`."""
     mechanical = model.mechanical_model_
-    rows = {
+    kind = "none"
+    if mechanical is not None:
+        kind = type(mechanical).__name__
+    rows: dict[str, object] = {
         "actuators": model.n_features_in_,
-        "mechanical model": "none" if mechanical is None else type(mechanical).__name__,
+        "mechanical model": kind,
         "calibrated": _calibrated(model),
         "error model": _error_model(model),
         **_error(model),
@@ -33,7 +35,7 @@ def fitted_rows(model: Any) -> dict[str, object]:
     return rows
 
 
-def _calibrated(model: Any) -> str:
+def _calibrated(model: HybridPredictor) -> str:
     if model.calibration_ is not None:
         return ", ".join(model.calibration_.values)
     if model.cv_results_ is not None:  # of a model from a file
@@ -43,7 +45,7 @@ def _calibrated(model: Any) -> str:
     return ", ".join(model.calibrate or ()) or "nothing"
 
 
-def _domain(model: Any) -> str:
+def _domain(model: HybridPredictor) -> str:
     domain = "close to the training rows (guard by leverage)"
     if model.guard is None:
         domain = "everywhere (no guard)"
@@ -54,7 +56,7 @@ def _domain(model: Any) -> str:
     return f"{domain}, as far as held-out groups tested it"
 
 
-def _error_model(model: Any) -> str:
+def _error_model(model: HybridPredictor) -> str:
     if model.cv_results_ is not None:
         parts = []
         for name, weight in model.cv_results_["weights"].items():
@@ -69,21 +71,22 @@ def _error_model(model: Any) -> str:
     return f"{name}, {model.coupling}"
 
 
-def _error(model: Any) -> dict[str, str]:
+def _error(model: HybridPredictor) -> dict[str, str]:
     """Return the error on held-out rows or, where it is not known, on training rows."""
     results = model.cv_results_
     if results is not None:
-        alone = (
-            f"{results['candidate'][0]} model alone {_mm(results['mean_distance'][0])}"
-        )
-        return {"held-out error": f"mean {_mm(results['expected_distance'])}, {alone}"}
+        mean = _mm(results["expected_distance"])
+        first = results["candidate"][0]
+        error_of_first = _mm(results["mean_distance"][0])
+        words = f"mean {mean}, {first} model alone {error_of_first}"
+        return {"held-out error": words}
     words = f"standard deviation of a coordinate {_mm(model._noise)}"
     if model._learned.held_out:
         return {"held-out error": words}
     return {"training error": words}
 
 
-def _range(model: Any) -> dict[str, object]:
+def _range(model: HybridPredictor) -> dict[str, object]:
     low, high = model.training_range_
     names = vars(model).get("feature_names_in_", [f"q[{k}]" for k in range(len(low))])
     ranges: dict[str, object] = {"": ("least", "largest")}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
@@ -18,17 +19,19 @@ from hybridkin._core.html import html_table
 from hybridkin._core.model import ForwardModel, as_forward_model
 from hybridkin._core.plausible import PlausibleRows
 from hybridkin._core.units import motion_message
+from hybridkin.calibration.calibrate import CalibrationResult
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.play import PlayOperator
 from hybridkin.hybrid._adapt import Change
 from hybridkin.hybrid._drift import Drift
 from hybridkin.hybrid._fit import known_tips
-from hybridkin.hybrid._html import fitted_rows
 from hybridkin.hybrid._module import Hybrid
 from hybridkin.hybrid._radius import Radius
 from hybridkin.hybrid._range import TrainingRange
 from hybridkin.hybrid._rows import Rows
+from hybridkin.hybrid._spec import Learned
 from hybridkin.hybrid._wrapped import in_columns, pose_difference
+from hybridkin.hybrid.cv_results import CvResults
 from hybridkin.learning.hidden_layer import check_inputs
 from hybridkin.native.library import evaluate
 
@@ -36,13 +39,23 @@ from hybridkin.native.library import evaluate
 class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     """The prediction methods of a `HybridForwardModel`; they use only the results of `fit`."""
 
+    error_model: object
+    coupling: str
+    calibrate: Sequence[str] | str | None
+    guard: str | None
     output: str
+    n_features_in_: int
     module_: ForwardModel
     fitted_module_: Hybrid
     change_: Change
     mechanical_model_: ForwardModel | None
+    calibration_: CalibrationResult | None
+    cv_results_: CvResults | None
     play_: PlayOperator | None
     radius_: Radius | None
+    _learned: Learned
+    _noise: float
+    _fitted_rows: NDArray
     _single_output: bool
     _fitted_range: TrainingRange
     _drift: Drift
@@ -100,15 +113,14 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         x = self.predict(X)
         measured = np.asarray(y, dtype=float).reshape(len(x), -1)
         predicted = x.reshape(measured.shape)
-        weights = (
-            np.ones(len(x)) if sample_weight is None else np.asarray(sample_weight)
-        )
+        weights = np.ones(len(x))
+        if sample_weight is not None:
+            weights = np.asarray(sample_weight)
         scores = []
         for column, expected in zip(measured.T, predicted.T, strict=True):
             rows = ~np.isnan(column)
-            scores.append(
-                r2_score(column[rows], expected[rows], sample_weight=weights[rows])
-            )
+            score = r2_score(column[rows], expected[rows], sample_weight=weights[rows])
+            scores.append(score)
         return float(np.mean(scores))
 
     def jacobian(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray:
@@ -171,7 +183,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         shown = super()._repr_html_
         return lambda: shown() + self._fit_html()
 
-    def _repr_mimebundle_(self, **kwargs: Any) -> dict[str, str]:
+    def _repr_mimebundle_(self, **kwargs: object) -> dict[str, str]:
         bundle = super()._repr_mimebundle_(**kwargs)
         if "text/html" in bundle:
             bundle["text/html"] += self._fit_html()
@@ -183,15 +195,16 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         title = f"{type(self).__name__}: what the fit found"
         return html_table(title, self.html_rows())
 
+    @abstractmethod
     def html_rows(self) -> dict[str, object]:
         """Return names and values of what the fit found, which a notebook shows."""
-        return fitted_rows(self)
 
     @property
     def _chain(self) -> Chain | None:
         """The mechanical model if it is a chain."""
-        mechanical = self.mechanical_model_
-        return mechanical if isinstance(mechanical, Chain) else None
+        if isinstance(self.mechanical_model_, Chain):
+            return self.mechanical_model_
+        return None
 
     def _warn_of_units(self, rows: Rows) -> None:
         """Warn if measured tips span far more than the robot, so they cannot be in metres."""
@@ -222,9 +235,9 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """Return the motion of the actuators: with backlash, not the commands X themselves."""
         if self.play_ is None or not len(X):
             return X
-        return self.play_.apply_by_group(
-            X, np.zeros(len(X)) if groups is None else groups
-        )
+        if groups is None:
+            groups = np.zeros(len(X))
+        return self.play_.apply_by_group(X, groups)
 
     def _follow_robot(self) -> None:
         """Set the module and its mechanical model after the change and the drift of the robot."""

@@ -5,14 +5,14 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.linear_model import LinearRegression
 from typing_extensions import Self
 
-from hybridkin.calibration.choice import Errors
+from hybridkin.calibration.choice import Errors, GeometryChoice
 from hybridkin.calibration.measured import distance, inner_and_outer
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.hybrid._error_models import (
@@ -29,6 +29,7 @@ from hybridkin.hybrid._fit import FittedHybrid, fit_hybrid
 from hybridkin.hybrid._kernel import folds_of
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._spec import ErrorModel, FittedError, Seed, Spec
+from hybridkin.hybrid.cv_results import CvResults
 from hybridkin.learning.elm_cv import ELMRegressorCV
 
 _PICKS = 10  # picks of a blend; each is a weight of 0.1
@@ -88,7 +89,9 @@ class Auto(ErrorModel):
             training_rows = replace(rows, groups=None).take(train)
             recalibrated = spec.recalibrated(training_rows)
             parts.append(Part(recalibrated, training_rows, train, test))
-        by_fold = replace(rows, groups=None if rows.groups is None else fold_of)
+        by_fold = rows
+        if rows.groups is not None:
+            by_fold = replace(rows, groups=fold_of)
         candidates = self._candidates(spec, len(rows))
         fits: dict[str, FittedHybrid] = {}
         predictions = []
@@ -100,14 +103,13 @@ class Auto(ErrorModel):
             predictions.append(_predictions(settled, parts, rows))
         outer = parts[-1].test
         held_out = HeldOut.of(np.array(predictions), rows, fold_of, outer)
-        weights, comparison = chosen_blend([*candidates], held_out, rows)
+        weights, comparison = chosen_blend([*candidates], held_out, rows, spec.geometry)
         if spec.held_out and weights[0] < 1.0 and _is_small(rows):
             unsettled = blend_of(candidates.values(), weights)
             blended = np.tensordot(weights, held_out.predicted, 1)[: len(rows)]
             comparison["expected_distance"] *= _optimism(
                 unsettled, parts[:-1], by_fold, blended
             )
-        _describe_geometry(comparison, spec)
         settled = [fitted.error.settled for fitted in fits.values()]
         return replace(
             blend_of(settled, weights).fit(rows, spec),
@@ -177,22 +179,6 @@ def _optimism(
     return float(after / before)
 
 
-def _describe_geometry(comparison: dict[str, Any], spec: Spec) -> None:
-    """Add the chosen parameters of the mechanical model, and the errors of all sets of them."""
-    name = "nothing"
-    errors = {}
-    if spec.geometry is not None:
-        name = spec.geometry.name
-        errors = spec.geometry.errors
-    if not errors:
-        held_out = float(comparison["mean_distance"][0])
-        errors = {name: Errors(held_out, float(comparison["io_distance"][0]))}
-    comparison["parameters"] = name
-    comparison["mechanical_model"] = {
-        of_set: both.known() for of_set, both in errors.items()
-    }
-
-
 def blend_of(models: Iterable[ErrorModel], weights: NDArray) -> ErrorModel:
     """Return the models of positive weight as one."""
     positive = []
@@ -224,9 +210,10 @@ class HeldOut(NamedTuple):
         y = rows.tips[places]
         counts = rows.counts[places]
         weights = counts.copy()
-        for part, share in ((slice(0, n), 1.0 - _OUTSIDE), (slice(n, None), _OUTSIDE)):
-            total = counts[part] @ distance(predicted[0, part], y[part])
-            weights[part] *= share / max(total, np.finfo(float).eps)
+        error = distance(predicted[0], y)
+        eps = np.finfo(float).eps
+        weights[:n] *= (1.0 - _OUTSIDE) / max(counts[:n] @ error[:n], eps)
+        weights[n:] *= _OUTSIDE / max(counts[n:] @ error[n:], eps)
         return cls(predicted, y, weights, counts, fold_of[places], n)
 
     def blend_weights(self, rows: NDArray) -> NDArray:
@@ -253,8 +240,11 @@ class HeldOut(NamedTuple):
 
 
 def chosen_blend(
-    names: list[str], held_out: HeldOut, rows: Rows
-) -> tuple[NDArray, dict[str, Any]]:
+    names: list[str],
+    held_out: HeldOut,
+    rows: Rows,
+    geometry: GeometryChoice | None = None,
+) -> tuple[NDArray, CvResults]:
     """Return the weights of the candidates, and the errors of all candidates and their blend.
 
     If the gain of the blend over the mechanical model, paired by motion or fold, is within its
@@ -277,17 +267,35 @@ def chosen_blend(
         by_motion = _means_by(rows.groups, of_held_out, counts[:n])
     gains = by_motion[0] - by_motion[-1]
     weights = held_out.blend_weights(np.ones(len(blend), dtype=bool))
-    if gains.mean() <= gains.std(ddof=1) / np.sqrt(len(gains)):
+    standard_error = gains.std(ddof=1) / np.sqrt(len(gains))
+    if gains.mean() <= standard_error:
         weights = np.eye(len(weights))[0]
-    means = np.average(of_held_out, axis=1, weights=counts[:n])
+    held_out_means = np.average(of_held_out, axis=1, weights=counts[:n])
+    outer_means = np.average(distances[:, n:], axis=1, weights=counts[n:])
+    expected = held_out_means[-1]
+    if weights[0] == 1.0:
+        expected = held_out_means[0]
+    chosen = "blend"
+    if weights.max() == 1.0:
+        chosen = names[int(weights.argmax())]
+    parameters = "nothing"
+    tried = {}
+    if geometry is not None:
+        parameters = geometry.name
+        tried = geometry.errors
+    if not tried:
+        errors = Errors(float(held_out_means[0]), float(outer_means[0]))
+        tried = {parameters: errors}
     return weights, {
         "candidate": [*names, "blend"],
-        "mean_distance": means,
-        "expected_distance": float(means[0 if weights[0] == 1.0 else -1]),
+        "mean_distance": held_out_means,
+        "expected_distance": float(expected),
         "std_distance": by_fold.std(axis=1, ddof=1),
-        "io_distance": np.average(distances[:, n:], axis=1, weights=counts[n:]),
-        "chosen": "blend" if (weights < 1.0).all() else names[int(weights.argmax())],
+        "io_distance": outer_means,
+        "chosen": chosen,
         "weights": dict(zip(names, weights.tolist(), strict=True)),
+        "parameters": parameters,
+        "mechanical_model": {name: both.known() for name, both in tried.items()},
     }
 
 

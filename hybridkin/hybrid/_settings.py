@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from numbers import Real
 
-from sklearn.base import BaseEstimator
 from sklearn.utils._param_validation import HasMethods, Interval, StrOptions
 from torch import nn
 
@@ -33,9 +32,7 @@ CONSTRAINTS = {
 }
 
 
-def error_model_of(
-    setting: BaseEstimator | str | None, coupling: str, random_state: Seed
-) -> ErrorModel:
+def error_model_of(setting: object, coupling: str, random_state: Seed) -> ErrorModel:
     """Return the error model for the settings of a HybridForwardModel."""
     if setting is None or setting == "elm":
         setting = ELMRegressor()

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import nan
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple, cast
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from typing_extensions import Self
 
 from hybridkin._core.arrays import countable
 from hybridkin._core.directions import Directions
-from hybridkin._core.model import ForwardModel, PoseModel
+from hybridkin._core.model import ForwardModel
 from hybridkin.calibration.calibrate import CalibrationResult, fit_geometry, refitted
 from hybridkin.calibration.choice import GeometryChoice, choose_geometry
 from hybridkin.chains.arc_chain import ArcChain
@@ -24,7 +24,8 @@ from hybridkin.chains.chain import Chain
 from hybridkin.hybrid._drift import too_far
 from hybridkin.hybrid._module import Hybrid, TipCorrection
 from hybridkin.hybrid._rows import Rows
-from hybridkin.hybrid._wrapped import pose_errors
+from hybridkin.hybrid._wrapped import pose_errors, posed
+from hybridkin.hybrid.cv_results import CvResults
 
 Seed = int | np.random.RandomState | None
 Weighted = list[tuple[float, TipCorrection]]  # weights and corrections, without guards
@@ -84,26 +85,30 @@ class FittedError:
         Whether the errors on held-out rows were least without a correction.
     held_out : bool
         Whether `noise` is that of held-out rows, not of the training rows.
-    comparison : dict or None
+    comparison : CvResults or None
         Of "auto": `HybridForwardModel.cv_results_`.
     candidates : dict of str to Hybrid, or None
         Of "auto": every candidate, fitted to all rows.
     """
 
-    result: Any
+    result: object
     corrections: list[Weighted]
     settled: ErrorModel
     noise: float = nan
     rejected: bool = False
     held_out: bool = False
-    comparison: dict[str, Any] | None = None
+    comparison: CvResults | None = None
     candidates: dict[str, Hybrid] | None = None
 
     @property
     def learned(self) -> Learned:
         """What a description says of it."""
-        kind = self.result[0] if type(self.result) is tuple else self.result
-        name = None if kind is None else type(kind).__name__
+        result = self.result
+        if type(result) is tuple:
+            result = result[0]
+        name = None
+        if result is not None:
+            name = type(result).__name__
         return Learned(name, self.rejected, self.held_out)
 
 
@@ -190,8 +195,10 @@ class Spec:
 
     def positions(self, rows: Rows) -> Tensor:
         """Return the tip positions (N, 3) of rows, which may be poses [m]."""
-        pose = self.output == "pose"
-        return torch.from_numpy(rows.tips[:, :3] if pose else rows.tips)
+        tips = torch.from_numpy(rows.tips)
+        if self.output == "pose":
+            return tips[:, :3]
+        return tips
 
     def by_marker(self, rows: Rows) -> list[tuple[Rows, Spec]]:
         """Return the rows and the specification of every marker; a single tip is one marker."""
@@ -215,12 +222,12 @@ def residuals(
     if mechanical is None:
         return y
     if output == "pose":
-        return pose_errors(cast(PoseModel, mechanical), q, y)
+        return pose_errors(posed(mechanical), q, y)
     with torch.no_grad():
         tips = mechanical(q).numpy()
     if not countable(tips).all():
         raise too_far()
-    if tips.shape != (y.shape if y.ndim == 2 else (len(y), 1)):
+    if tips.shape != y.reshape(len(y), -1).shape:
         raise ValueError(
             f"`y` must have {tips.shape[1]} columns, as many as `mechanical_model` gives, got "
             f"shape {y.shape}."

@@ -78,7 +78,7 @@ class Wrapped(PoseModel):
 
     def pose_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return `pose(q)` and `pose_jacobian(q)` in one pass."""
-        return cast(PoseModel, self.model).pose_and_jacobian(self._inner(q))
+        return posed(self.model).pose_and_jacobian(self._inner(q))
 
     def domain_distance(self, q: Tensor) -> Tensor:
         """Return the distance from the training rows of what the other model gets, (...)."""
@@ -489,7 +489,15 @@ class PoseRows(ForwardModel):
 
 def in_columns(model: ForwardModel, output: str) -> ForwardModel:
     """Return the model whose outputs are the columns of measured y, for this kind of `output`."""
-    return PoseRows(cast(PoseModel, model)) if output == "pose" else model
+    if output == "pose":
+        return PoseRows(posed(model))
+    return model
+
+
+def posed(model: ForwardModel | None) -> PoseModel:
+    """Return a model that is known to have poses."""
+    assert isinstance(model, PoseModel)
+    return model
 
 
 def pose_errors(mechanical: PoseModel, q: Tensor, y: NDArray) -> NDArray:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from math import inf
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
+from sklearn.base import BaseEstimator
 from sklearn.kernel_ridge import KernelRidge
 from sklearn.linear_model import LinearRegression
 
@@ -36,6 +37,7 @@ from hybridkin.hybrid._radius import Radius
 from hybridkin.hybrid._range import TrainingRange
 from hybridkin.hybrid._spec import Learned
 from hybridkin.hybrid._wrapped import WithPose, in_columns
+from hybridkin.hybrid.cv_results import CvResults
 from hybridkin.hybrid.estimator import HybridForwardModel
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.elm_cv import ELMRegressorCV
@@ -49,9 +51,9 @@ _REGRESSORS = {
 
 def restorer() -> Restore:
     """Return a function from descriptions to models; one description always gives one object."""
-    restored: dict[int, Any] = {}
+    restored: dict[int, object] = {}
 
-    def restore(stored: Stored) -> Any:
+    def restore(stored: Stored) -> object:
         if stored.kind == "list":
             return [restore(part) for part in stored.parts.values()]
         model = KINDS_OF_MODELS.get(stored.kind)
@@ -108,8 +110,9 @@ def hybrid_of(stored: Stored, training: object) -> HybridForwardModel:
         model.calibrate = tuple(model.calibrate)
     if "nominal" in stored.parts:
         model.mechanical_model = restorer()(stored.part("nominal"))
-    setting = stored.value("error_model", (str, dict, None))
-    model.error_model = _estimator(setting) if isinstance(setting, dict) else setting
+    model.error_model = stored.value("error_model", (str, dict, None))
+    if isinstance(model.error_model, dict):
+        model.error_model = _estimator(model.error_model)
     model._checked_error_model()
     model.fitted_module_ = restore(stored.part("module"))
     if isinstance(model.fitted_module_, WithPose) != (model.output == "pose"):
@@ -141,10 +144,10 @@ def hybrid_of(stored: Stored, training: object) -> HybridForwardModel:
     model.calibration_ = model.play_ = model.radius_ = model._play_state = None
     model.candidates_ = None
     if "play_width" in stored.arrays:
-        single_width = stored.array("play_width").ndim == 0
-        model.play_ = PlayOperator(
-            stored.array("play_width", () if single_width else (n,))
-        )
+        shape = (n,)
+        if stored.array("play_width").ndim == 0:
+            shape = ()
+        model.play_ = PlayOperator(stored.array("play_width", shape))
     if "radius" in stored.arrays:
         radius = stored.array("radius", (3,), finite=False).tolist()
         inside, coverage, n_rows = radius
@@ -154,11 +157,12 @@ def hybrid_of(stored: Stored, training: object) -> HybridForwardModel:
             )
         model.radius_ = Radius(inside, coverage, int(n_rows))
     model._fitted_rows = stored.array("fitted_rows", "N")
-    results = training.get("cv_results") if isinstance(training, dict) else None
-    if results:
-        model.cv_results_ = {key: _array(value) for key, value in results.items()}
-    else:
-        model.cv_results_ = None
+    model.cv_results_ = None
+    if isinstance(training, dict) and training.get("cv_results"):
+        results = training["cv_results"].items()
+        model.cv_results_ = cast(
+            CvResults, {key: _array(value) for key, value in results}
+        )
     model._noise = stored.value("noise", float)
     return model
 
@@ -177,16 +181,16 @@ def _restored_drift(stored: Stored, empty: Drift) -> Drift:
     return drift._replace(alpha=float(drift.alpha))
 
 
-def training_of(model: HybridForwardModel) -> dict[str, Any]:
+def training_of(model: HybridForwardModel) -> dict[str, object]:
     """Return the results of the training of a fitted hybrid as JSON values, errors in metres."""
-    results: dict[str, Any] = {}
-    results["rows"] = len(model._fitted_rows)
-    if (calibration := model.calibration_) is not None:
+    results: dict[str, object] = {"rows": len(model._fitted_rows)}
+    calibration = model.calibration_
+    if calibration is not None:
         results["calibration"] = {
             "rmse": calibration.rmse,
             "held_out_rmse": calibration.cv_rmse,
+            "converged": calibration.converged,
         }
-        results["calibration"]["converged"] = calibration.converged
     if model.cv_results_ is not None:
         results["cv_results"] = model.cv_results_
     return plain(results)
@@ -203,12 +207,12 @@ def _learned(stored: Stored) -> Learned:
     )
 
 
-def _setting(error_model: object) -> Any:
+def _setting(error_model: object) -> str | dict[str, object] | None:
     """Return the setting `error_model` as JSON; entries that JSON lacks, such as a splitter, go."""
     if error_model is None or isinstance(error_model, str):
         return error_model
     name = type(error_model).__name__
-    if name not in _REGRESSORS:
+    if not isinstance(error_model, BaseEstimator) or name not in _REGRESSORS:
         raise TypeError(f"`error_model` {error_model!r} could only be stored as code.")
     params = {}
     for key, value in params_of(error_model).items():
@@ -217,7 +221,7 @@ def _setting(error_model: object) -> Any:
     return {"class": name, "params": params}
 
 
-def _estimator(setting: dict[str, Any]) -> Any:
+def _estimator(setting: dict[str, object]) -> BaseEstimator:
     """Return the unfitted estimator of a setting."""
     entries = Stored("error_model", setting)
     name = entries.value("class", str)
@@ -233,4 +237,6 @@ def _array(value: object) -> Any:
     if not isinstance(value, list) or any(isinstance(entry, str) for entry in value):
         return value
     array = np.array(value)
-    return array.astype(np.float64) if array.dtype == object else array
+    if array.dtype == object:
+        return array.astype(np.float64)
+    return array

@@ -34,6 +34,7 @@ from hybridkin.hybrid._adapt import (
 )
 from hybridkin.hybrid._drift import Drift
 from hybridkin.hybrid._fit import few_rows, fit_hybrid, fit_messages
+from hybridkin.hybrid._html import fitted_rows
 from hybridkin.hybrid._play import play_of
 from hybridkin.hybrid._predictor import HybridPredictor
 from hybridkin.hybrid._radius import Radius, conformal_radius
@@ -169,13 +170,12 @@ class HybridForwardModel(HybridPredictor):
     """
 
     _parameter_constraints = CONSTRAINTS
-    n_features_in_: int
     feature_names_in_: NDArray
 
     def __init__(
         self,
         mechanical_model: nn.Module | None = None,
-        error_model: Any = None,
+        error_model: object = None,
         *,
         coupling: str = "parallel",
         calibrate: Sequence[str] | str | None = None,
@@ -333,12 +333,9 @@ class HybridForwardModel(HybridPredictor):
         """
         if not hasattr(self, "module_"):
             return self.fit(X, y, sample_weight)
-        positive = [("decay", decay, 1.0)] + (
-            [] if alpha is None else [("alpha", alpha, np.inf)]
-        )
-        for name, value, high in positive:
-            if not 0.0 < number(value, name) <= high:
-                raise ValueError(f"`{name}` must lie in (0, {high:g}], got {value!r}.")
+        _check_positive("decay", decay, 1.0)
+        if alpha is not None:
+            _check_positive("alpha", alpha, np.inf)
         rows = self._checked_rows(X, y, sample_weight, None, reset=False)
         if self.play_ is not None:
             X, self._play_state = self.play_.apply(rows.X, self._play_state)
@@ -428,6 +425,10 @@ class HybridForwardModel(HybridPredictor):
         self._follow_robot()
         return self
 
+    def html_rows(self) -> dict[str, object]:
+        """Return names and values of what the fit found, which a notebook shows."""
+        return fitted_rows(self)
+
     def _checked_error_model(self) -> ErrorModel:
         """Return the error model of the settings; raise if they are not allowed."""
         self._validate_params()
@@ -442,8 +443,10 @@ class HybridForwardModel(HybridPredictor):
                 f"error_model={self.error_model!r}, which correct a mechanical model. "
                 "To learn without one, give an estimator as `error_model`."
             )
-        names = self.calibrate is not None and not isinstance(self.calibrate, str)
-        if names and [*self.calibrate] and not isinstance(mechanical, Chain):
+        names = self.calibrate
+        if names is None or isinstance(names, str):
+            return error_model
+        if [*names] and not isinstance(mechanical, Chain):
             raise TypeError(
                 f"`mechanical_model` must be a chain to `calibrate` {self.calibrate!r}, got "
                 f"{type(mechanical).__name__}, which has no geometry."
@@ -478,7 +481,7 @@ class HybridForwardModel(HybridPredictor):
         X = table(X, "X")
         y = table(y, "y")
         missing = self._missing_markers(y)
-        y = y if y is None else np.where(missing, 0.0, y)
+        y = None if y is None else np.where(missing, 0.0, y)
         check_finite(X=X, y=y)
         X, y, weights = check_rows(self, X, y, weights, reset)
         y = np.where(missing, np.nan, y)
@@ -508,13 +511,20 @@ class HybridForwardModel(HybridPredictor):
             check_unscaled("y", rows.tips, "tip positions [m]")
             mechanical.check_actuators(rows.q, "X")
             names = self.calibrate
-            if names is None:
-                names = "auto" if error_model.chooses else ()
+            if names is None and error_model.chooses:
+                names = "auto"
+            elif names is None:
+                names = ()
             elif names == "default":
                 names = mechanical.default_parameters
-            elif names != "auto":
+            elif not isinstance(names, str):
                 names = tuple(names)
         return Spec(mechanical, error_model, names, self.guard, self.output)
+
+
+def _check_positive(name: str, value: object, high: float) -> None:
+    if not 0.0 < number(value, name) <= high:
+        raise ValueError(f"`{name}` must lie in (0, {high:g}], got {value!r}.")
 
 
 def fit_quietly(
