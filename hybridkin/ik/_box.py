@@ -23,6 +23,8 @@ class BoxProblem(NamedTuple):
         Desired task steps J dq.
     z : Tensor of shape (N, n)
         Preferred steps; the optimum is as near to them as the task allows.
+    damping_sq : Tensor of shape (N,)
+        lambda^2, in the unit of J J^T.
     lower, upper : Tensor of shape (N, n)
         Bounds of the step, lower <= upper.
     """
@@ -30,6 +32,7 @@ class BoxProblem(NamedTuple):
     J: Tensor
     v: Tensor
     z: Tensor
+    damping_sq: Tensor
     lower: Tensor
     upper: Tensor
 
@@ -37,14 +40,17 @@ class BoxProblem(NamedTuple):
         """Return the problems of some rows."""
         return BoxProblem(*(a[rows] for a in self))
 
-    def at(self, mu: Tensor) -> tuple[Tensor, Tensor]:
-        """Return y = z + J^T mu, and dq, which is y clipped to the box."""
-        y = self.z + apply_columns(self.J, mu)
-        return y, torch.clamp(y, self.lower, self.upper)
+    def clip(self, y: Tensor) -> Tensor:
+        """Return steps clipped to the box."""
+        return torch.clamp(y, self.lower, self.upper)
+
+    def unlimited(self, mu: Tensor) -> Tensor:
+        """Return y = z + J^T mu, the step for multipliers mu without the box."""
+        return self.z + apply_columns(self.J, mu)
 
 
 def box_limited_step(
-    problem: BoxProblem, damping_sq: Tensor, mu: Tensor | None = None
+    problem: BoxProblem, mu: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Return the exact minimiser of |dq - z|^2 + |J dq - v|^2 / lambda^2 in the box.
 
@@ -56,10 +62,7 @@ def box_limited_step(
     Parameters
     ----------
     problem : BoxProblem
-        Jacobians, desired and preferred steps, bounds.
-    damping_sq : Tensor of shape (N,)
-        lambda^2 > 0, in the unit of J J^T; not much below 1e-6 of its largest eigenvalue in
-        float64.
+        With lambda^2 > 0, not much below 1e-6 of the largest eigenvalue of J J^T in float64.
     mu : Tensor of shape (N, m), optional
         Start of the iteration. Default: zero.
 
@@ -80,53 +83,59 @@ def box_limited_step(
     best = mu.clone()
     live = problem  # the rows that are not solved yet
     rows = torch.arange(len(mu), device=mu.device)
-    settled = torch.zeros(len(mu), dtype=torch.bool, device=mu.device)
+    settled = torch.zeros_like(rows, dtype=torch.bool)
     noise = 4.0 * torch.finfo(mu.dtype).eps
     for _ in range(IK_NEWTON):
         # The residual F(mu) of eq. (20), and the size of what is summed up in it.
-        y, dq = live.at(mu)
-        pull = damping_sq[:, None] * mu
+        y = live.unlimited(mu)
+        dq = live.clip(y)
+        pull = live.damping_sq[:, None] * mu
         residual = apply_rows(live.J, dq) + pull - live.v
         size = apply_rows(live.J.abs(), dq.abs()) + pull.abs() + live.v.abs()
         best[rows] = mu
+
         # Go on with the rows that are not solved up to rounding.
-        going = ~settled & (residual.abs() > noise * size).any(-1)
+        unsolved = (residual.abs() > noise * size).any(-1)
+        going = unsolved & ~settled
         if not going.all():
             left = going.nonzero()[:, 0]
             live = live.take(left)
             rows = rows[left]
             mu = mu[left]
-            damping_sq = damping_sq[left]
             y = y[left]
             residual = residual[left]
         if rows.numel() == 0:
             break
+
         # Newton's step of F on the linear piece of y: actuators at a limit stay there.
-        lower = live.lower
-        upper = live.upper
-        free = (y > lower) & (y < upper)
-        newton = -solve_rows(live.J * free[:, None], residual, damping_sq)
+        above = y > live.lower
+        below = y < live.upper
+        J_free = live.J * (above & below)[:, None]
+        newton = -solve_rows(J_free, residual, live.damping_sq)
         slope = apply_columns(live.J, newton)
+
         # A full step that stays on its linear piece has solved the problem.
         end = y + slope
-        same = ((end > lower) == (y > lower)) & ((end < upper) == (y < upper))
-        settled = (same | (lower == upper)).all(-1)
-        # Else the step ends where the objective is least along it: there its derivative,
-        # F(mu + t newton) . newton, is zero.
+        same_lower = (end > live.lower) == above
+        same_upper = (end < live.upper) == below
+        fixed = live.lower == live.upper
+        settled = (same_lower & same_upper | fixed).all(-1)
+
+        # Else it ends where the objective is least along it.
+        length = torch.ones_like(live.damping_sq)
         at_start = (newton * residual).sum(-1)
-        curvature = damping_sq * newton.square().sum(-1)
-        moved = (slope * _moved(y, end, lower, upper)).sum(-1)
-        too_far = ((at_start + curvature + moved > 0.0) & ~settled).nonzero()[:, 0]
-        length = torch.ones_like(damping_sq)
+        curvature = live.damping_sq * newton.square().sum(-1)
+        line = _Line(y, slope, at_start, curvature, live.lower, live.upper)
+        at_end = line.derivative(length[:, None])[:, 0]
+        too_far = ((at_end > 0.0) & ~settled).nonzero()[:, 0]
         if too_far.numel() > 0:
-            line = (y, slope, at_start, curvature, lower, upper)
-            length[too_far] = _exact_line_search(*(a[too_far] for a in line))
+            length[too_far] = line.take(too_far).root()
         mu = mu + length[:, None] * newton
     best[rows] = mu
-    return problem.at(best)[1], best
+    return problem.clip(problem.unlimited(best)), best
 
 
-def strict_box_step(problem: BoxProblem, damping_sq: Tensor) -> Tensor:
+def strict_box_step(problem: BoxProblem) -> Tensor:
     """Return the box-limited step whose task part does not depend on the preferred step z.
 
     Without damping, z only chooses among the steps that reach v, or come nearest to it. Damping
@@ -136,10 +145,8 @@ def strict_box_step(problem: BoxProblem, damping_sq: Tensor) -> Tensor:
     Parameters
     ----------
     problem : BoxProblem
-        Jacobians, desired and preferred steps, bounds.
-    damping_sq : Tensor of shape (N,)
-        lambda^2 >= 0. Below 1e-6 of sigma_max^2 (float64) the box-limited step is solved with this
-        minimum, and proximal rounds on the multipliers remove its task error.
+        With lambda^2 >= 0. Below 1e-6 of sigma_max^2 (float64) the box-limited step is solved with
+        this minimum, and proximal rounds on the multipliers remove its task error.
 
     Returns
     -------
@@ -152,70 +159,89 @@ def strict_box_step(problem: BoxProblem, damping_sq: Tensor) -> Tensor:
     relative = max(1e-6, math.sqrt(torch.finfo(J.dtype).eps))
     floor = torch.where(size_sq > 0.0, relative * size_sq, 1.0)
     centre = torch.zeros_like(problem.v)
-    rows = ((damping_sq > 0.0) & (problem.z != 0.0).any(-1)).nonzero()[:, 0]
+    has_posture = (problem.z != 0.0).any(-1)
+    rows = ((problem.damping_sq > 0.0) & has_posture).nonzero()[:, 0]
     if rows.numel() > 0:
         # The damped task without posture; its tip motion replaces v.
-        damped = problem._replace(z=torch.zeros_like(problem.z)).take(rows)
-        dq, mu = _proximal_box_step(damped, damping_sq[rows], floor[rows], centre[rows])
+        damped = problem.take(rows)
+        damped = damped._replace(z=torch.zeros_like(damped.z))
+        dq, mu = _proximal_box_step(damped, floor[rows], centre[rows])
         v = problem.v.index_put((rows,), apply_rows(damped.J, dq))
-        problem = problem._replace(v=v)
+        undamped = problem.damping_sq.index_fill(0, rows, 0.0)
+        problem = problem._replace(v=v, damping_sq=undamped)
         # Start from these multipliers: they keep the active limits, also if v is out of reach.
         centre[rows] = mu
-        damping_sq = damping_sq.index_fill(0, rows, 0.0)
-    return _proximal_box_step(problem, damping_sq, floor, centre)[0]
+    return _proximal_box_step(problem, floor, centre)[0]
 
 
 def _proximal_box_step(
-    problem: BoxProblem, damping_sq: Tensor, floor: Tensor, centre: Tensor
+    problem: BoxProblem, floor: Tensor, centre: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return `box_limited_step` for any lambda^2 >= 0, without the effect of the floor.
 
     Every round solves J dq + used mu = v + (used - lambda^2) mu_last. At the fixed point
     J dq + lambda^2 mu = v.
     """
-    used = torch.maximum(damping_sq, floor)
-    excess = (used - damping_sq)[:, None]
+    used = torch.maximum(problem.damping_sq, floor)
+    excess = (used - problem.damping_sq)[:, None]
     dq = problem.z
     mu = centre
     for _ in range(1 + IK_PROXIMAL):
-        dq, mu = box_limited_step(problem._replace(v=problem.v + excess * mu), used, mu)
+        v = problem.v + excess * mu
+        damped = problem._replace(v=v, damping_sq=used)
+        dq, mu = box_limited_step(damped, mu)
     return dq, mu
 
 
-def _moved(y: Tensor, end: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
-    """Return the motion from y to its end, both clipped to the box."""
-    return torch.clamp(end, lower, upper) - torch.clamp(y, lower, upper)
+class _Line(NamedTuple):
+    """The derivative of the objective along Newton steps, F(mu + t newton) . newton.
 
-
-def _exact_line_search(
-    y: Tensor,
-    slope: Tensor,
-    at_start: Tensor,
-    curvature: Tensor,
-    lower: Tensor,
-    upper: Tensor,
-) -> Tensor:
-    """Return t in (0, 1) where at_start + t curvature + slope . (clip(y + t slope) - clip(y)) = 0.
-
-    The left side increases with t, is linear between the points where a coordinate reaches a bound,
-    negative at 0 and positive at 1.
+    It is at_start + t curvature + slope . (clip(y + t slope) - clip(y)). It increases with t, and
+    is linear between the points where an actuator reaches a bound.
     """
-    # These points, and both ends, in order.
-    at_bounds = torch.cat([(lower - y) / slope, (upper - y) / slope], dim=-1)
-    at_bounds = torch.nan_to_num(at_bounds, nan=1.0).clamp(0.0, 1.0)
-    first = torch.zeros_like(at_start[:, None])
-    t = torch.cat([first, at_bounds, first + 1.0], dim=-1).sort(-1).values
-    # The left side there.
-    y = y[:, None]
-    slope = slope[:, None]
-    end = y + t[..., None] * slope
-    moved = _moved(y, end, lower[:, None], upper[:, None])
-    value = at_start[:, None] + t * curvature[:, None] + (slope * moved).sum(-1)
-    # The root lies on the linear part before the first positive value.
-    right = (value > 0.0).to(torch.uint8).argmax(-1, keepdim=True).clamp_min(1)
-    left = right - 1
-    t_left = t.gather(-1, left)
-    value_left = value.gather(-1, left)
-    fall = value_left - value.gather(-1, right)
-    fraction = torch.nan_to_num(value_left / fall, nan=1.0).clamp(0.0, 1.0)
-    return (t_left + (t.gather(-1, right) - t_left) * fraction)[:, 0]
+
+    y: Tensor
+    slope: Tensor
+    at_start: Tensor
+    curvature: Tensor
+    lower: Tensor
+    upper: Tensor
+
+    def take(self, rows: Tensor) -> _Line:
+        """Return the lines of some rows."""
+        return _Line(*(a[rows] for a in self))
+
+    def derivative(self, t: Tensor) -> Tensor:
+        """Return the derivative at points t (N, k) of every line."""
+        y = self.y[:, None]
+        slope = self.slope[:, None]
+        lower = self.lower[:, None]
+        upper = self.upper[:, None]
+        end = y + t[..., None] * slope
+        moved = torch.clamp(end, lower, upper) - torch.clamp(y, lower, upper)
+        free = self.at_start[:, None] + t * self.curvature[:, None]
+        return free + (slope * moved).sum(-1)
+
+    def root(self) -> Tensor:
+        """Return t in (0, 1) of the root, for lines that are negative at 0 and positive at 1."""
+        # The points where an actuator reaches a bound, and both ends, in order.
+        to_lower = (self.lower - self.y) / self.slope
+        to_upper = (self.upper - self.y) / self.slope
+        at_bounds = torch.cat([to_lower, to_upper], dim=-1)
+        at_bounds = at_bounds.nan_to_num(nan=1.0).clamp(0.0, 1.0)
+        first = torch.zeros_like(at_bounds[:, :1])
+        points = torch.cat([first, at_bounds, first + 1.0], dim=-1)
+        t = points.sort(-1).values
+
+        # The root lies on the linear part before the first positive value.
+        value = self.derivative(t)
+        positive = (value > 0.0).to(torch.uint8)
+        right = positive.argmax(-1, keepdim=True).clamp_min(1)
+        left = right - 1
+        t_left = t.gather(-1, left)
+        t_right = t.gather(-1, right)
+        value_left = value.gather(-1, left)
+        fall = value_left - value.gather(-1, right)
+        fraction = (value_left / fall).nan_to_num(nan=1.0).clamp(0.0, 1.0)
+        t = t_left + (t_right - t_left) * fraction
+        return t[:, 0]

@@ -46,28 +46,44 @@ def row_gram(J: Tensor) -> RowGram:
         Parts of G and singular values, each of shape (...,).
     """
     if J.shape[-2] != 3:
-        squares, vectors = torch.linalg.eigh(torch.nan_to_num(J @ J.mT))
+        gram = torch.nan_to_num(J @ J.mT)
+        squares, vectors = torch.linalg.eigh(gram)
         roots = squares.clamp_min(0.0).sqrt()
         return RowGram((squares, vectors), roots[..., 0], roots[..., -1])
-    # Eigenvalues of a symmetric 3 x 3 matrix by the trigonometric solution of the cubic equation:
-    # G = mean + radius B, and the angle belongs to the determinant of B.
-    entries = g11, g21, g31, g22, g32, g33 = _entries_3x3(J)
+    entries = _entries_3x3(J)
+    low, high = _extreme_eigenvalues(*entries)
+    return RowGram(entries, low.clamp_min(0.0).sqrt(), high.clamp_min(0.0).sqrt())
+
+
+def _extreme_eigenvalues(
+    g11: Tensor, g21: Tensor, g31: Tensor, g22: Tensor, g32: Tensor, g33: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return the smallest and the largest eigenvalue of a symmetric 3 x 3 matrix.
+
+    This is the trigonometric solution of the cubic equation: G = mean + radius B, and the angle
+    belongs to the determinant of B.
+    """
     mean = (g11 + g22 + g33) / 3.0
     a = g11 - mean
     b = g22 - mean
     c = g33 - mean
-    off = g21 * g21 + g31 * g31 + g32 * g32
-    radius = ((a * a + b * b + c * c + 2.0 * off) / 6.0).sqrt()
-    det = (
-        a * (b * c - g32 * g32)
-        - g21 * (g21 * c - g32 * g31)
-        + g31 * (g21 * g32 - b * g31)
-    )
-    ratio = 0.5 * det / radius.pow(3).clamp_min(torch.finfo(J.dtype).tiny)
-    angle = torch.acos(ratio.clamp(-1.0, 1.0)) / 3.0
-    low = mean + 2.0 * radius * torch.cos(angle + 2.0 * math.pi / 3.0)
+    on_diagonal = a * a + b * b + c * c
+    off_diagonal = g21 * g21 + g31 * g31 + g32 * g32
+    radius = ((on_diagonal + 2.0 * off_diagonal) / 6.0).sqrt()
+
+    # The determinant, along the first row.
+    minor_11 = b * c - g32 * g32
+    minor_21 = g21 * c - g32 * g31
+    minor_31 = g21 * g32 - b * g31
+    determinant = a * minor_11 - g21 * minor_21 + g31 * minor_31
+    cube = radius.pow(3).clamp_min(torch.finfo(mean.dtype).tiny)
+    cosine = (0.5 * determinant / cube).clamp(-1.0, 1.0)
+
+    angle = torch.acos(cosine) / 3.0
+    third_of_turn = 2.0 * math.pi / 3.0
+    low = mean + 2.0 * radius * torch.cos(angle + third_of_turn)
     high = mean + 2.0 * radius * torch.cos(angle)
-    return RowGram(entries, low.clamp_min(0.0).sqrt(), high.clamp_min(0.0).sqrt())
+    return low, high
 
 
 def adaptive_damping(gram: RowGram) -> Tensor:
@@ -120,9 +136,11 @@ def damped_solve(gram: RowGram, v: Tensor, damping_sq: Tensor | float = 0.0) -> 
     squares, vectors = gram.parts
     trace = squares.clamp_min(0.0).sum(-1, keepdim=True)
     floor = 8.0 * torch.finfo(v.dtype).eps * trace
-    damping_sq = torch.as_tensor(damping_sq, dtype=v.dtype, device=v.device)[..., None]
+    if isinstance(damping_sq, Tensor):
+        damping_sq = damping_sq[..., None]
+    inverse = _reciprocal(squares + damping_sq, floor)
     along = apply_columns(vectors, v)
-    return apply_rows(vectors, along * _reciprocal(squares + damping_sq, floor))
+    return apply_rows(vectors, along * inverse)
 
 
 def solve_rows(J: Tensor, v: Tensor, damping_sq: Tensor) -> Tensor:
@@ -133,12 +151,13 @@ def solve_rows(J: Tensor, v: Tensor, damping_sq: Tensor) -> Tensor:
     """
     if J.shape[-2] == 3:
         return _solve_3x3(_entries_3x3(J), v, damping_sq)
-    G = torch.nan_to_num(J @ J.mT)
-    rounding = torch.finfo(G.dtype)
-    trace = torch.diagonal(G, dim1=-2, dim2=-1).sum(-1)
-    used = torch.maximum(damping_sq, 16.0 * rounding.eps * trace + rounding.tiny)
-    damped = G + used[..., None, None] * identity(G.shape[-1], G)
-    factor = torch.linalg.cholesky_ex(damped)[0]
+    gram = torch.nan_to_num(J @ J.mT)
+    limits = torch.finfo(gram.dtype)
+    trace = torch.diagonal(gram, dim1=-2, dim2=-1).sum(-1)
+    least = 16.0 * limits.eps * trace + limits.tiny
+    damping_sq = torch.maximum(damping_sq, least)
+    diagonal = identity(gram.shape[-1], gram) * damping_sq[..., None, None]
+    factor, _ = torch.linalg.cholesky_ex(gram + diagonal)
     return torch.cholesky_solve(v[..., None], factor)[..., 0]
 
 
@@ -163,7 +182,8 @@ def null_projection(J: Tensor, gram: RowGram, step: Tensor) -> Tensor:
         Projected steps.
     """
     for _ in range(2):
-        step = step - apply_columns(J, damped_solve(gram, apply_rows(J, step)))
+        mu = damped_solve(gram, apply_rows(J, step))
+        step = step - apply_columns(J, mu)
     return step
 
 
@@ -179,9 +199,12 @@ def apply_columns(J: Tensor, mu: Tensor) -> Tensor:
 
 def _entries_3x3(J: Tensor) -> tuple[Tensor, ...]:
     """Return the lower half of J J^T, column by column."""
-    G = J @ J.mT
-    pairs = ((0, 0), (1, 0), (2, 0), (1, 1), (2, 1), (2, 2))
-    return tuple(G[..., i, j] for i, j in pairs)
+    first, second, third = (J @ J.mT).unbind(-1)
+    return (
+        *first.unbind(-1),
+        *second[..., 1:].unbind(-1),
+        third[..., 2],
+    )
 
 
 def _solve_3x3(
@@ -193,15 +216,17 @@ def _solve_3x3(
     g11 = g11 + damping_sq
     g22 = g22 + damping_sq
     g33 = g33 + damping_sq
+
     # The factors: L has the entries l21, l31, l32, and D the inverses i1, i2, i3.
     floor = 8.0 * torch.finfo(v.dtype).eps * (g11 + g22 + g33)
     i1 = _reciprocal(g11, floor)
     l21 = g21 * i1
     l31 = g31 * i1
     i2 = _reciprocal(g22 - l21 * g21, floor)
-    t = g32 - l31 * g21
-    l32 = t * i2
-    i3 = _reciprocal(g33 - l31 * g31 - l32 * t, floor)
+    rest = g32 - l31 * g21
+    l32 = rest * i2
+    i3 = _reciprocal(g33 - l31 * g31 - l32 * rest, floor)
+
     # Forwards through L, then backwards through D and L^T.
     v2 = v2 - l21 * v1
     v3 = v3 - l31 * v1 - l32 * v2
@@ -213,4 +238,5 @@ def _solve_3x3(
 
 def _reciprocal(pivot: Tensor, floor: Tensor) -> Tensor:
     """Return 1 / pivot, or 0 if the pivot is only rounding error."""
-    return torch.where(pivot > floor, 1.0 / torch.where(pivot > floor, pivot, 1.0), 0.0)
+    sound = pivot > floor
+    return torch.where(sound, 1.0 / torch.where(sound, pivot, 1.0), 0.0)

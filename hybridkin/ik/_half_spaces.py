@@ -40,16 +40,17 @@ class HalfSpaces(NamedTuple):
         They are -normals^T nu, where nu >= 0 minimises |normals^T nu|^2 / 2 + nu . margin. A change
         of nu is a box-limited step; proximal rounds remove the effect of its damping.
         """
-        n_rows = len(margin)
-        J = self.normals.to(margin).T.expand(n_rows, -1, -1)
-        way = margin.new_zeros(n_rows, J.shape[1])
+        J = self.normals.to(margin).T.expand(len(margin), -1, -1)
+        still = torch.zeros_like(J[..., 0])
+        rounding = math.sqrt(torch.finfo(margin.dtype).eps)
+        damping_sq = torch.full_like(still[:, 0], max(1e-6, rounding))
+        infinite = torch.full_like(margin, math.inf)
+        way = still
         nu = torch.zeros_like(margin)
-        damping = max(1e-6, math.sqrt(torch.finfo(margin.dtype).eps))
-        damping_sq = margin.new_full((n_rows,), damping)
         for _ in range(1 + IK_PROXIMAL):
-            z = (self.along(way) - margin) / damping
-            problem = BoxProblem(J, torch.zeros_like(way), z, -nu, nu + math.inf)
-            change, _ = box_limited_step(problem, damping_sq)
+            z = (self.along(way) - margin) / damping_sq[:, None]
+            problem = BoxProblem(J, still, z, damping_sq, -nu, infinite)
+            change, _ = box_limited_step(problem)
             nu = nu + change
             way = way - apply_rows(J, change)
         return way
@@ -60,7 +61,7 @@ def half_spaces(pair: Sequence[Numbers | Transform], task: Task) -> HalfSpaces:
     if not isinstance(task, PositionTask):
         got = type(task).__name__
         raise ValueError(f"`tip_limits` needs a PositionTask, got a {got}.")
-    m = task.shape[0]
+    (m,) = task.shape
     need = (
         f"`tip_limits` must be a pair (A, b) of shapes (k, {m}) and (k,), finite, with a direction "
         "in every row of A"
@@ -70,7 +71,10 @@ def half_spaces(pair: Sequence[Numbers | Transform], task: Task) -> HalfSpaces:
     A, b = (as_tensor(part, "tip_limits").cpu().double() for part in pair)
     size = A.norm(dim=-1)
     good = b.ndim == 1 and A.shape == (len(b), m)
-    if not good or not torch.isfinite(b + size).all() or not (size > 0.0).all():
+    if good:
+        has_direction = torch.isfinite(b) & torch.isfinite(size) & (size > 0.0)
+        good = has_direction.all()
+    if not good:
         raise ValueError(f"{need}, got {A.tolist()!r:.200} and {b.tolist()!r:.200}.")
     spaces = HalfSpaces(A / size[:, None], b / size)
     margin = spaces.margin(spaces.way_in(spaces.offsets[None]))

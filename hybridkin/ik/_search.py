@@ -20,7 +20,7 @@ from hybridkin._core.kernel_numbers import (
     IK_STATIONARY,
 )
 from hybridkin.ik._gram import apply_columns, apply_rows, row_gram
-from hybridkin.ik._settings import StepSettings
+from hybridkin.ik._settings import Bounds, StepSettings
 from hybridkin.ik._starts import even_starts, nearest_starts
 from hybridkin.ik._step import limited_step, null_step
 from hybridkin.ik.tasks import Tolerance
@@ -290,18 +290,17 @@ class Search:
         error = live.error
         # Damping proportional to the error: the last iterations are Gauss-Newton steps.
         trust = live.nu * (error / live.start)
-        lower, upper = settings.step_bounds(live.q)
+        size = (live.J * settings.unit(live.J)).flatten(1).square().sum(-1)
         # A turning joint may pass its limit and continue at the other one.
+        lower, upper = settings.step_bounds(live.q)
         half_turn = 0.5 * settings.periods.to(live.q)
         stays = torch.isinf(half_turn)
-        bounds = lower.where(stays, -half_turn), upper.where(stays, half_turn)
-        damping_sq = trust * (live.J * settings.unit(live.J)).flatten(1).square().sum(
-            -1
-        )
-        step = limited_step(settings, live.J, live.e, None, *bounds, damping_sq)
+        bounds = Bounds(lower.where(stays, -half_turn), upper.where(stays, half_turn))
+        step = limited_step(settings, live.J, live.e, None, bounds, trust * size)
         new = self._point(settings.inside(live.q + step.dq), live.target)
         error_new = new.error
         predicted = (live.e - apply_rows(live.J, step.dq)).norm(dim=-1)
+
         # The damping follows the ratio of actual to predicted gain.
         gain = error.square() - error_new.square()
         quality = gain / (error.square() - predicted.square()).clamp_min(1e-30)
@@ -418,12 +417,11 @@ class Search:
         self, at: Point, posture: Tensor | None, hold: bool = False
     ) -> Point:
         """Return the point after a step; `hold` fixes actuators at a limit."""
-        lower, upper = self.settings.step_bounds(at.q)
+        bounds = self.settings.step_bounds(at.q)
         if hold:
-            held = (lower >= 0.0) | (upper <= 0.0)
-            lower = torch.where(held, 0.0, lower)
-            upper = torch.where(held, 0.0, upper)
-        step = limited_step(self.settings, at.J, at.e, posture, lower, upper)
+            held = bounds.held(torch.zeros_like(at.q))
+            bounds = Bounds(*(end.where(~held, 0.0) for end in bounds))
+        step = limited_step(self.settings, at.J, at.e, posture, bounds)
         return self._point(at.q + step.dq, at.target)
 
     def _nudged(self, at: Found) -> Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import ClassVar, TypeAlias
+from typing import ClassVar, NamedTuple, TypeAlias
 
 import numpy as np
 import torch
@@ -44,6 +44,21 @@ _FAST = 5.0
 _TURN = 2.0 * math.pi
 _FULL = 0.999  # a range of this fraction of a turn counts as a whole turn
 PLANE_ROUNDS = 8  # of alternating projections onto a plane and a box
+
+
+class Bounds(NamedTuple):
+    """Limits of q or of a step, each of shape () or (..., n)."""
+
+    lower: Tensor
+    upper: Tensor
+
+    def clip(self, values: Tensor) -> Tensor:
+        """Return values moved into the bounds."""
+        return torch.clamp(values, self.lower, self.upper)
+
+    def held(self, values: Tensor) -> Tensor:
+        """Return which values are at a bound."""
+        return (values <= self.lower) | (values >= self.upper)
 
 
 def require(good: bool | Tensor, message: str) -> None:
@@ -446,17 +461,19 @@ class StepSettings(Portable):
 
     # Limits of q and of its steps.
 
-    def box(self, q: Tensor) -> tuple[Tensor, Tensor]:
+    def box(self, q: Tensor) -> Bounds:
         """Return the limits of q."""
         if self.limits == "off":
-            return q.new_tensor(-math.inf), q.new_tensor(math.inf)
-        return self.q_min.to(q), self.q_max.to(q)
+            return Bounds(q.new_tensor(-math.inf), q.new_tensor(math.inf))
+        return Bounds(self.q_min.to(q), self.q_max.to(q))
 
     def inside(self, q: Tensor) -> Tensor:
         """Return q moved into the limits: by whole turns if q is periodic, then clipped."""
-        low, high = self.box(q)
-        turned = q - self.whole_turns(q - 0.5 * (low + high))
-        return torch.clamp(torch.where((q < low) | (q > high), turned, q), low, high)
+        box = self.box(q)
+        middle = 0.5 * (box.lower + box.upper)
+        turned = q - self.whole_turns(q - middle)
+        outside = (q < box.lower) | (q > box.upper)
+        return box.clip(torch.where(outside, turned, q))
 
     def start_at(self, q: Tensor) -> Tensor:
         """Return q moved onto the plane and into the limits."""
@@ -478,7 +495,7 @@ class StepSettings(Portable):
 
     def step_bounds(
         self, q: Tensor, period: float | None = None, last: Tensor | float = 0.0
-    ) -> tuple[Tensor, Tensor]:
+    ) -> Bounds:
         """Return the bounds of dq: position, and for a period [s] speed and acceleration.
 
         They are intersected and never empty. `last` is the previous step, scaled to this period.
@@ -498,15 +515,16 @@ class StepSettings(Portable):
         upper = torch.where(q + upper > q_max, one_less, upper)
         lower = torch.where(q + lower < q_min, one_more, lower)
         if self.limits == "off" or period is None:
-            return lower, upper
+            return Bounds(lower, upper)
         fastest = self.dq_max.to(q) * period
-        ends = [-fastest, fastest]
+        speed = Bounds(-fastest, fastest)
         if self.accelerates:
             change = self.change(q, period)
             lower = -stopping(-lower, change)
             upper = stopping(upper, change)
-            ends = [torch.clamp(end, last - change, last + change) for end in ends]
-        return torch.clamp(lower, *ends), torch.clamp(upper, *ends)
+            reachable = Bounds(last - change, last + change)
+            speed = Bounds(reachable.clip(-fastest), reachable.clip(fastest))
+        return Bounds(speed.clip(lower), speed.clip(upper))
 
     def margin(self, q: Tensor) -> Tensor:
         """Return the smallest distance of an actuator to its limits."""

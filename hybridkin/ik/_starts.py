@@ -39,20 +39,24 @@ def nearest_starts(
         Starts, the nearest one first.
     """
     task = settings.task
-    n = q.shape[-1]
     bounded = torch.isfinite(settings.q_max - settings.q_min).all()
-    k = max(count, _SHARED if bounded else _OWN)
-    sample = settings.start_at(even_starts(settings, q, size, k))
+    n_sample = max(count, _SHARED if bounded else _OWN)
+    sample = even_starts(settings, q, size, n_sample)
+    sample = settings.start_at(sample)
+
+    # Tips outside the domain count as farther away than they are.
     rows = sample.flatten(0, 1)
     x, _ = settings.evaluate(rows)
-    # Tips outside the domain count as farther away than they are.
-    distance = task.distances(x.unflatten(0, (-1, k)), target)
-    inside = task.in_domain(rows).view(-1, k)
+    tips = x.unflatten(0, (-1, n_sample))
+    distance = task.distances(tips, target)
+    inside = task.in_domain(rows).view(-1, n_sample)
     distance = torch.where(inside, distance, _OUTSIDE * distance)
     distance = distance.nan_to_num(torch.inf)
-    nearest = distance.topk(count, largest=False).indices
-    nearest = nearest[..., None].expand(-1, -1, n)
-    return sample.expand(len(q), k, n).gather(1, nearest)
+
+    nearest = distance.topk(count, largest=False)
+    n = q.shape[-1]
+    index = nearest.indices[..., None].expand(-1, -1, n)
+    return sample.expand(len(q), -1, -1).gather(1, index)
 
 
 def even_starts(settings: StepSettings, q: Tensor, size: Tensor, count: int) -> Tensor:
@@ -71,8 +75,9 @@ def even_starts(settings: StepSettings, q: Tensor, size: Tensor, count: int) -> 
         high = torch.where(torch.isfinite(high), high, above)
     low = low[:, None]
     high = high[:, None]
-    fractions = _even_points(n, count, q.device).to(q)
-    return torch.lerp(low, high, fractions).clamp(low, high)
+    fractions = _even_points(n, count, q.device)
+    starts = torch.lerp(low, high, fractions.to(q))
+    return starts.clamp(low, high)
 
 
 def _even_points(n: int, count: int, device: torch.device) -> Tensor:
@@ -89,8 +94,11 @@ def _even_points(n: int, count: int, device: torch.device) -> Tensor:
     ratio = 2.0
     for _ in range(64):
         ratio = (1.0 + ratio) ** (1.0 / (n + 2))
-    dimension = torch.arange(n + 1, dtype=torch.float64, device=device)
-    index = torch.arange(count, dtype=torch.float64, device=device)[:, None]
-    points = (0.5 + index * ratio ** -(dimension + 1.0)) % 1.0
-    from_middle = (points[:, :n] - 0.5) / (1.0 - points[:, n:])
-    return (0.5 + from_middle).clamp(0.0, 1.0)
+    numbers = {"dtype": torch.float64, "device": device}
+    dimension = torch.arange(n + 1, **numbers)
+    index = torch.arange(count, **numbers)
+    steps = ratio ** -(dimension + 1.0)
+    points = (0.5 + index[:, None] * steps) % 1.0
+    beside_middle = points[:, :n] - 0.5
+    distance_to_end = 1.0 - points[:, n:]
+    return (0.5 + beside_middle / distance_to_end).clamp(0.0, 1.0)

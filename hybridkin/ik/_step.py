@@ -31,7 +31,8 @@ from hybridkin.ik._gram import (
     row_gram,
     solve_rows,
 )
-from hybridkin.ik._settings import StepSettings, stopping
+from hybridkin.ik._half_spaces import HalfSpaces
+from hybridkin.ik._settings import Bounds, StepSettings, stopping
 
 
 class StepRows(NamedTuple):
@@ -84,54 +85,64 @@ def control_step(
         The steps; sigma_min is NaN for rows that are not finite.
     """
     gain, beta, seconds = settings.rates(period)
-    feed = torch.zeros_like(e) if feed_forward is None else feed_forward
-    before = torch.zeros_like(q) if last is None else last
+    if feed_forward is None:
+        feed_forward = torch.zeros_like(e)
+    if last is None:
+        last = torch.zeros_like(q)
+
     # Rows that are not finite, or overflow, get zeros, and no step at the end.
-    sizes = torch.stack([e.norm(dim=-1), (feed + gain * e).norm(dim=-1)], dim=-1)
-    known = _finite(before)
-    fine = _finite(q) & _finite(J.flatten(1)) & _finite(sizes) & known
-    before = torch.where(known, before, 0.0)
+    error_size = e.norm(dim=-1, keepdim=True)
+    speed = (feed_forward + gain * e).norm(dim=-1, keepdim=True)
+    moving = _finite(last)
+    fine = _finite(q) & _finite(J.flatten(1)) & _finite(error_size + speed) & moving
+    last = torch.where(moving, last, 0.0)
     at = torch.where(fine, q, 0.0)
     e = torch.where(fine, e, 0.0)
-    feed = torch.where(fine, feed, 0.0)
-    J = _only_taut(settings, torch.where(fine[..., None], J, 0.0))
+    feed_forward = torch.where(fine, feed_forward, 0.0)
+    J = torch.where(fine[..., None], J, 0.0)
+    J = _only_taut(settings, J)
+
+    # Limit the speed towards target and posture so that the actuators can brake in time.
     posture = None
     if settings.has_posture:
-        posture = torch.where(fine, beta * (settings.preferred(at) - at), 0.0)
+        posture = beta * (settings.preferred(at) - at)
+        posture = torch.where(fine, posture, 0.0)
     change = settings.change(q, seconds)
     if settings.accelerates:
-        # Limit the speed towards target and posture so that the actuators can brake in time.
         brake = _braking(settings, J, e, change)
-        gain = stopping(torch.ones_like(brake), brake).clamp_max(gain)[:, None]
+        fastest_gain = stopping(torch.ones_like(brake), brake)
+        gain = fastest_gain.clamp_max(gain)[:, None]
         if posture is not None:
             fastest = stopping((posture / beta).abs(), change)
             posture = torch.clamp(posture, -fastest, fastest)
+
     # Eq. (17), within the limits of q, of its speed and acceleration, and of the tip.
-    v = feed + gain * e
-    bounds = settings.step_bounds(q, seconds, before)
+    v = feed_forward + gain * e
+    bounds = settings.step_bounds(q, seconds, last)
     spaces = settings.tip_limits
     if spaces is None or tip is None:
-        step = limited_step(settings, J, v, posture, *bounds)
+        step = limited_step(settings, J, v, posture, bounds)
     else:
         margin = spaces.margin(torch.where(fine, tip, 0.0))
         if settings.accelerates:
             normals = spaces.normals.to(J)[:, None].expand(-1, len(J), -1)
             brakes = [_braking(settings, J, normal, change) for normal in normals]
             margin = stopping(margin, torch.stack(brakes, dim=-1))
-        step = _step_inside(settings, margin, J, v, posture, *bounds)
-        v = v + spaces.way_in(margin - spaces.along(v))
+        confined = _Confined(settings, spaces, margin, J, posture, bounds)
+        step = confined.step(v)
+        v = confined.allowed(v)
     if settings.pulls.any():
-        step = _arriving(settings, at, J, v, step, *bounds)
-    # The other rows stay, or brake; outside the limits their known actuators return.
+        step = _arriving(settings, at, J, v, step, bounds)
+
+    # The other rows stay, or brake; outside the limits their finite actuators return.
     fine = fine & _finite(step.dq)
-    still = torch.clamp(torch.zeros_like(q), *bounds)
+    still = bounds.clip(torch.zeros_like(q))
     still = torch.where(torch.isfinite(q), still, 0.0)
-    held = (still <= bounds[0]) | (still >= bounds[1])
     return step._replace(
         dq=torch.where(fine, step.dq, still),
         sigma_min=torch.where(fine[:, 0], step.sigma_min, math.nan),
         damping=torch.where(fine[:, 0], step.damping, 0.0),
-        saturated=torch.where(fine, step.saturated, held),
+        saturated=torch.where(fine, step.saturated, bounds.held(still)),
     )
 
 
@@ -140,8 +151,7 @@ def limited_step(
     J: Tensor,
     v: Tensor,
     posture: Tensor | None,
-    lower: Tensor,
-    upper: Tensor,
+    bounds: Bounds,
     damping_sq: Tensor | None = None,
 ) -> StepRows:
     """Return the step for the task v and the posture step, within the bounds.
@@ -151,15 +161,15 @@ def limited_step(
     """
     unit = settings.unit(v)
     J = J * unit
-    low = lower / unit
-    high = upper / unit
+    box = Bounds(bounds.lower / unit, bounds.upper / unit)
     if posture is not None:
         posture = posture / unit
+
     # Eq. (17): damped least squares, and the part of the posture step that does not move the tip.
+    z = torch.zeros_like(J[:, 0])
     if damping_sq is not None:
         mu = solve_rows(J, v, damping_sq)
         sigma_min = torch.full_like(damping_sq, math.nan)
-        z = torch.zeros_like(J[:, 0])
     else:
         gram = row_gram(J)
         sigma_min = gram.sigma_min
@@ -168,24 +178,25 @@ def limited_step(
         else:
             damping_sq = (settings.damping * gram.sigma_max).square()
         mu = damped_solve(gram, v, damping_sq)
-        z = torch.zeros_like(J[:, 0])
         if posture is not None:
             z = null_projection(J, gram, posture)
     dq = apply_columns(J, mu) + z
+
+    # Rows within all limits keep this step; eq. (19) is solved for the others. Weights turn J out
+    # of the plane.
     if settings.limits != "off":
-        # Rows within all limits keep this step; eq. (19) is solved for the others. Weights turn J
-        # out of the plane.
-        clipped = torch.clamp(dq, low, high)
+        clipped = box.clip(dq)
         out_of_plane = settings.plane is not None and settings.weights is not None
         over = ((clipped != dq).any(-1) | out_of_plane).nonzero()[:, 0]
         if over.numel() > 0:
             rows, motion = _with_plane(settings, J, v, posture)
-            ends = (low.expand_as(dq), high.expand_as(dq))
-            problem = BoxProblem(rows, motion, z, *ends).take(over)
-            clipped[over] = strict_box_step(problem, damping_sq[over])
+            lower = box.lower.expand_as(dq)
+            upper = box.upper.expand_as(dq)
+            problem = BoxProblem(rows, motion, z, damping_sq, lower, upper)
+            clipped[over] = strict_box_step(problem.take(over))
         dq = clipped
-    held = (dq <= low) | (dq >= high)
-    dq = torch.clamp(dq * unit, lower, upper)
+    held = box.held(dq)
+    dq = bounds.clip(dq * unit)
     return StepRows(dq, sigma_min, damping_sq.sqrt(), held)
 
 
@@ -226,113 +237,103 @@ def _norm(rows: Tensor) -> Tensor:
 def _braking(settings: StepSettings, J: Tensor, way: Tensor, change: Tensor) -> Tensor:
     """Return the largest change of the tip's motion per period, in multiples of `way` (N,)."""
     free = torch.full_like(J[:, 0], math.inf)
-    dq = limited_step(settings, J, way, None, -free, free).dq
-    return (change / dq.abs()).amin(-1)
+    step = limited_step(settings, J, way, None, Bounds(-free, free))
+    return (change / step.dq.abs()).amin(-1)
 
 
 # Limits of the tip.
 
 
-def _step_inside(
-    settings: StepSettings,
-    margin: Tensor,
-    J: Tensor,
-    v: Tensor,
-    z: Tensor | None,
-    *bounds: Tensor,
-) -> StepRows:
-    """Return a step within the bounds after which, to first order, the tip is within its limits.
+class _Confined(NamedTuple):
+    """Steps that must keep the tip in half-spaces, with margins (N, k) to their planes."""
 
-    The desired motion v is projected onto the half-spaces. If the bounds then move J dq out of
-    them, a safe step is looked for, and the margins of the half-spaces that it does not reach are
-    widened up to it. Alternating projections look for a motion that meets margins and bounds. A
-    remaining violation is removed by taking a fraction of the way from the safe step to this one.
-    """
-    limits = settings.tip_limits
-    close = 32.0 * torch.finfo(v.dtype).eps
-    assert limits is not None
-    wanted = v + limits.way_in(margin - limits.along(v))
-    step = limited_step(settings, J, wanted, z, *bounds)
-    out = limits.along(apply_rows(J, step.dq)) - margin > close
-    if out.any():
-        safe = _safe_step(settings, margin, J, *bounds)
-        least = limits.along(apply_rows(J, safe))
-        reachable = torch.maximum(margin, least)
-        margin = torch.where(out.any(-1, keepdim=True), reachable, margin)
-        step, wanted = _projected(settings, margin, J, step, wanted, z, *bounds)
-        over = limits.along(apply_rows(J, step.dq)) - margin
-        share = _share(least - margin, over)
-        dq = torch.clamp(safe + share * (step.dq - safe), *bounds)
-        dq = torch.where(share < 1.0, dq, step.dq)
-        held = (dq <= bounds[0]) | (dq >= bounds[1])
-        step = step._replace(
-            dq=dq, saturated=torch.where(share < 1.0, held, step.saturated)
-        )
-    return step._replace(stopped=((wanted - v).abs() > close).any(-1))
+    settings: StepSettings
+    spaces: HalfSpaces
+    margin: Tensor
+    J: Tensor
+    posture: Tensor | None
+    bounds: Bounds
 
+    @property
+    def close(self) -> float:
+        """Rounding of a motion [m]."""
+        return 32.0 * torch.finfo(self.margin.dtype).eps
 
-def _safe_step(
-    settings: StepSettings, margin: Tensor, J: Tensor, *bounds: Tensor
-) -> Tensor:
-    """Return steps (N, n) into the half-spaces, or as near to them as found.
+    def allowed(self, v: Tensor) -> Tensor:
+        """Return motions of the tip (N, m) projected onto the half-spaces."""
+        return v + self.spaces.way_in(self.margin - self.spaces.along(v))
 
-    They start at rest, or at the hardest braking, and lead farther out of no half-space than this
-    start. Where the way in turns out of another half-space, only a share of it is taken; else a
-    start outside several could get worse.
-    """
-    limits = settings.tip_limits
-    assert limits is not None
-    rest = torch.clamp(torch.zeros_like(J[:, 0]), *bounds)
-    motion = apply_rows(J, rest)
-    start = limits.along(motion)
-    unknown = torch.full_like(rest[:, 0], math.nan)
-    step = StepRows(rest, unknown, unknown, rest != 0.0)
-    back = _projected(settings, margin, J, step, motion, None, *bounds)[0].dq
-    end = limits.along(apply_rows(J, back))
-    allowed = torch.maximum(margin, start)
-    share = _share(start - allowed, end - allowed)
-    return torch.clamp(rest + share * (back - rest), *bounds)
+    def along(self, dq: Tensor) -> Tensor:
+        """Return the motions (N, k) of the tip along the normals, to first order."""
+        return self.spaces.along(apply_rows(self.J, dq))
 
+    def step(self, v: Tensor) -> StepRows:
+        """Return a step within the bounds after which, to first order, the tip is in its limits.
 
-def _projected(
-    settings: StepSettings,
-    margin: Tensor,
-    J: Tensor,
-    step: StepRows,
-    wanted: Tensor,
-    z: Tensor | None,
-    *bounds: Tensor,
-) -> tuple[StepRows, Tensor]:
-    """Return steps moved towards the margins, and the tip motions (N, m) they were solved for.
+        If the bounds move J dq of the projected motion out of the half-spaces, a safe step is
+        looked for, and the margins of the half-spaces that it does not reach are widened up to it.
+        Alternating projections look for a motion that meets margins and bounds. A remaining
+        violation is removed by taking a fraction of the way from the safe step to this one.
+        """
+        wanted = self.allowed(v)
+        step = limited_step(self.settings, self.J, wanted, self.posture, self.bounds)
+        out = (self.along(step.dq) - self.margin > self.close).any(-1, keepdim=True)
+        if out.any():
+            safe = self._safe()
+            least = self.along(safe)
+            reachable = torch.maximum(self.margin, least)
+            wider = self._replace(margin=torch.where(out, reachable, self.margin))
+            dq, wanted = wider._projected(step.dq, wanted)
+            over = wider.along(dq) - wider.margin
+            fraction = wider._fraction(least - wider.margin, over)
+            between = self.bounds.clip(safe + fraction * (dq - safe))
+            dq = torch.where(fraction < 1.0, between, dq)
+            held = torch.where(out, self.bounds.held(dq), step.saturated)
+            step = step._replace(dq=dq, saturated=held)
+        stopped = ((wanted - v).abs() > self.close).any(-1)
+        return step._replace(stopped=stopped)
 
-    Alternating projections, with some excess so that they end. Rows within their margins keep
-    their step.
-    """
-    limits = settings.tip_limits
-    assert limits is not None
-    close = 32.0 * torch.finfo(margin.dtype).eps
-    for _ in range(IK_PROJECTIONS):
-        motion = apply_rows(J, step.dq)
-        over = limits.along(motion) - margin
-        out = (over > close).any(-1, keepdim=True)
-        if not out.any():
-            break
-        # A bit farther in, because a step in a box is right to rounding only.
-        way = limits.way_in(-over - 8.0 * close)
-        wanted = torch.where(out, motion + IK_EXCESS * way, wanted)
-        moved = limited_step(settings, J, wanted, z, *bounds)
-        step = moved._replace(
-            dq=torch.where(out, moved.dq, step.dq),
-            saturated=torch.where(out, moved.saturated, step.saturated),
-        )
-    return step, wanted
+    def _safe(self) -> Tensor:
+        """Return steps (N, n) into the half-spaces, or as near to them as found.
 
+        They start at rest, or at the hardest braking, and lead farther out of no half-space than
+        this start. Where the way in turns out of another half-space, only a fraction of it is
+        taken; else a start outside several could get worse.
+        """
+        rest = self.bounds.clip(torch.zeros_like(self.J[:, 0]))
+        without_posture = self._replace(posture=None)
+        back, _ = without_posture._projected(rest, apply_rows(self.J, rest))
+        start = self.along(rest)
+        allowed = torch.maximum(self.margin, start)
+        fraction = self._fraction(start - allowed, self.along(back) - allowed)
+        return self.bounds.clip(rest + fraction * (back - rest))
 
-def _share(least: Tensor, over: Tensor) -> Tensor:
-    """Return the shares (N, 1) of ways from `least` to `over` (N, k) that stay below zero."""
-    close = 32.0 * torch.finfo(over.dtype).eps
-    share = ((close - least) / (over - least)).clamp(0.0, 1.0)
-    return torch.where(over > close, share, 1.0).amin(-1, keepdim=True)
+    def _projected(self, dq: Tensor, wanted: Tensor) -> tuple[Tensor, Tensor]:
+        """Return steps moved towards the margins, and the tip motions they were solved for.
+
+        Alternating projections, with some excess so that they end. Rows within their margins keep
+        their step.
+        """
+        for _ in range(IK_PROJECTIONS):
+            motion = apply_rows(self.J, dq)
+            over = self.spaces.along(motion) - self.margin
+            out = (over > self.close).any(-1, keepdim=True)
+            if not out.any():
+                break
+            # A bit farther in, because a step in a box is right to rounding only.
+            way = self.spaces.way_in(-over - 8.0 * self.close)
+            wanted = torch.where(out, motion + IK_EXCESS * way, wanted)
+            step = limited_step(
+                self.settings, self.J, wanted, self.posture, self.bounds
+            )
+            dq = torch.where(out, step.dq, dq)
+        return dq, wanted
+
+    def _fraction(self, least: Tensor, over: Tensor) -> Tensor:
+        """Return the fractions (N, 1) of ways from `least` to `over` (N, k) that stay below 0."""
+        fraction = ((self.close - least) / (over - least)).clamp(0.0, 1.0)
+        fraction = torch.where(over > self.close, fraction, 1.0)
+        return fraction.amin(-1, keepdim=True)
 
 
 # Tendons that can only pull.
@@ -374,8 +375,7 @@ class _Arrival(NamedTuple):
     settings: StepSettings
     q: Tensor
     x: Tensor
-    lower: Tensor
-    upper: Tensor
+    bounds: Bounds
 
     def end(self, dq: Tensor, motion: Tensor) -> _End:
         """Return the end of steps dq, whose tips are to make a motion (N, m)."""
@@ -385,21 +385,20 @@ class _Arrival(NamedTuple):
 
     def approach(self, dq: Tensor, motion: Tensor, close: Tensor) -> _End:
         """Return the best end of Newton's method from steps dq, within the bounds."""
+        lower, upper = self.bounds
         best = end = self.end(dq, motion)
         for _ in range(IK_CORRECTIONS):
             going = best.distance > close
             if not going.any():
                 break
-            low = self.lower - end.dq
-            high = self.upper - end.dq
-            correction = limited_step(
-                self.settings, end.J, end.missing, None, low, high
-            ).dq
-            dq = torch.clamp(end.dq + correction, self.lower, self.upper)
-            dq = torch.where(correction >= high, self.upper, dq)
-            dq = torch.where(correction <= low, self.lower, dq)
+            left = Bounds(lower - end.dq, upper - end.dq)
+            step = limited_step(self.settings, end.J, end.missing, None, left)
+            dq = self.bounds.clip(end.dq + step.dq)
+            dq = torch.where(step.dq >= left.upper, upper, dq)
+            dq = torch.where(step.dq <= left.lower, lower, dq)
             end = self.end(dq, motion)
-            best = best.where(going & (end.distance < best.distance), end)
+            nearer = end.distance < best.distance
+            best = best.where(going & nearer, end)
         return best
 
 
@@ -409,8 +408,7 @@ def _arriving(
     J: Tensor,
     v: Tensor,
     step: StepRows,
-    lower: Tensor,
-    upper: Tensor,
+    bounds: Bounds,
 ) -> StepRows:
     """Return steps whose tips move as the steps promised, with tendons that can only pull.
 
@@ -419,29 +417,31 @@ def _arriving(
     v, slack tendons are pulled in, as far as the tip gets nearer to v or not away.
     """
     x, _ = settings.evaluate(q)
-    arrival = _Arrival(settings, q, x, lower, upper)
+    arrival = _Arrival(settings, q, x, bounds)
     eps = torch.finfo(q.dtype).eps
-    slip = _norm(J.flatten(1)) * (IK_SLIP * _norm(step.dq) + 32.0 * eps * _norm(q))
+    smallest_step = IK_SLIP * _norm(step.dq) + 32.0 * eps * _norm(q)
+    slip = _norm(J.flatten(1)) * smallest_step
     promised = apply_rows(J, step.dq)
     close = torch.maximum(0.5 * _norm(promised), slip)
     end = arrival.approach(step.dq, promised, close)
     end = end._replace(missing=v - promised + end.missing)
+
     # Pull in the slack tendons of weak steps: the whole way to their bound, then less.
     pulls = settings.pulls.to(q)
     slack = (end.J == 0.0).all(-2) & (pulls != 0.0)
-    to = torch.where(pulls < 0.0, lower, upper)
+    to = torch.where(pulls < 0.0, *bounds)
     to = torch.where(slack & torch.isfinite(to), to, end.dq)
     way = to - end.dq
     weak = end.distance > torch.maximum(0.5 * _norm(v), slip)
     weak &= (way != 0.0).any(-1, keepdim=True)
     fraction = 1.0
     while fraction > IK_LEAST_PULL and weak.any():
-        dq = torch.clamp(to - (1.0 - fraction) * way, lower, upper)
+        dq = bounds.clip(to - (1.0 - fraction) * way)
         pulled = arrival.approach(dq, v, slip)
         # A slack tendon moves the tip by rounding alone.
-        better = weak & (pulled.distance <= (1.0 + eps**0.5) * end.distance)
+        allowed = (1.0 + eps**0.5) * end.distance
+        better = weak & (pulled.distance <= allowed)
         end = end.where(better, pulled)
         weak = weak & ~better
         fraction *= IK_PULL_RATIO
-    held = (end.dq <= lower) | (end.dq >= upper)
-    return step._replace(dq=end.dq, saturated=held)
+    return step._replace(dq=end.dq, saturated=bounds.held(end.dq))

@@ -75,7 +75,7 @@ def test_box_limited_step_is_the_optimum_of_a_reference_qp(rng, relative, m):
     lower[::7, 0], upper[::5, 1] = -torch.inf, torch.inf
     upper[::11, 3] = lower[::11, 3]
     damping_sq = relative * row_gram(J).sigma_max ** 2
-    dq, mu = box_limited_step(BoxProblem(J, v, z, lower, upper), damping_sq)
+    dq, mu = box_limited_step(BoxProblem(J, v, z, damping_sq, lower, upper))
     assert ((dq >= lower) & (dq <= upper)).all()
     assert_close(damping_sq[:, None] * mu, v - apply_rows(J, dq), rtol=0.0, atol=1e-8)
     problems = (a.numpy() for a in (J, v, z, lower, upper, damping_sq))
