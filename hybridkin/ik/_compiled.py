@@ -5,9 +5,10 @@ from __future__ import annotations
 import ctypes
 import dataclasses
 import math
+from collections.abc import Sequence
 from struct import Struct
 from struct import error as StructError
-from typing import Any, NamedTuple
+from typing import NamedTuple, overload
 
 import numpy as np
 import torch
@@ -69,33 +70,35 @@ def core_of(settings: StepSettings) -> Core | None:
 
     The core is kept with the settings, and made again if a model has changed.
     """
-    kept = vars(settings).get("_program")
     programs = [program_of(model) for model in settings.task.models]
-    if kept is None or kept[0] != programs:
-        kept = programs, *_core_or_reason(settings, programs)
-        object.__setattr__(settings, "_program", kept)
-    return kept[1]
+    made = vars(settings).get("_program")
+    if made is None or made.programs != programs:
+        made = _Made(settings, programs)
+        object.__setattr__(settings, "_program", made)
+    return made.core
 
 
-def _core_or_reason(
-    settings: StepSettings, programs: list[Program | None]
-) -> tuple[Core | None, str]:
-    compiled = [program for program in programs if program is not None]
-    if len(compiled) < len(programs):
-        return None, ""
-    try:
-        return Core(settings, compiled), ""
-    except (NoKernel, TypeError) as error:
-        return None, str(error)
+class _Made:
+    """The core that was made for settings, or the reason why there is none."""
+
+    def __init__(self, settings: StepSettings, programs: list[Program | None]) -> None:
+        self.programs = programs
+        self.core: Core | None = None
+        self.reason = ""
+        for model in settings.task.models:
+            if program_of(model) is None:
+                self.reason = backend(model).removeprefix("torch: ")
+                return
+        compiled = [program for program in programs if program is not None]
+        try:
+            self.core = Core(settings, compiled)
+        except (NoKernel, TypeError) as error:
+            self.reason = str(error)
 
 
 def why_torch(settings: StepSettings) -> str:
     """Return why settings that `core_of` has seen have no core."""
-    reason = vars(settings)["_program"][2]
-    if reason:
-        return reason
-    reasons = [backend(model) for model in settings.task.models]
-    return next(r for r in reasons if r != "compiled").removeprefix("torch: ")
+    return vars(settings)["_program"].reason
 
 
 class Core:
@@ -153,10 +156,9 @@ class Core:
         except IndexError:  # other threads use them
             follower = Follower(self, None, IK_MUST_SEE + IK_FROM_REST)
         follower.q[...] = q
+        result = None
         if follower.tick(target, dx, tip):
             result = (follower.state.copy(), self._fields)
-        else:
-            result = None
         self._idle.append(follower)
         return result
 
@@ -176,11 +178,9 @@ class Core:
         n = self.n
         out = np.empty((len(q), n + self.width + 3))
         held = np.empty((len(q), n), dtype=bool)
-        arrays = [
-            None if a is None else _plain(a) for a in (q, target, feed, tip, last)
-        ]
         mode = ctypes.c_int32(IK_MUST_SEE | _mode(target, feed, tip))
-        self._run("hk_ik_steps", len(q), [mode], [*arrays, out, held])
+        arrays = [*map(_plain, (q, target, feed, tip, last)), out, held]
+        self._run("hk_ik_steps", len(q), [mode], arrays)
         dq, x, numbers = torch.from_numpy(out).split([n, self.width, 3], dim=1)
         x = x.unflatten(1, self.settings.task.shape)
         return dq, x, *numbers.unbind(1), torch.from_numpy(held)
@@ -213,12 +213,13 @@ class Core:
             tolerances = np.array([tol])
             parts = 0
         numbers = [
-            *(ctypes.c_int32(number) for number in (mode, max_iter, parts)),
+            ctypes.c_int32(mode),
+            ctypes.c_int32(max_iter),
+            ctypes.c_int32(parts),
             ctypes.c_void_p(tolerances.ctypes.data),
         ]
-        self._run(
-            "hk_ik_find", n_rows, numbers, [_plain(target), best, J, e, outcome, n_iter]
-        )
+        arrays = [_plain(target), best, J, e, outcome, n_iter]
+        self._run("hk_ik_find", n_rows, numbers, arrays)
         error = torch.from_numpy(e)
         result = torch.from_numpy(outcome)
         iterations = torch.from_numpy(n_iter).long()
@@ -239,18 +240,22 @@ class Core:
         )
 
     def _run(
-        self, name: str, rows: int, numbers: list[Any], arrays: list[NDArray | None]
+        self,
+        name: str,
+        rows: int,
+        numbers: Sequence[ctypes.c_int32 | ctypes.c_void_p],
+        arrays: Sequence[NDArray | None],
     ) -> None:
         """Call a function of the library for all rows of arrays."""
         function = getattr(opened_library(), name)
-        places = [None if a is None else (a.ctypes.data, a.strides[0]) for a in arrays]
 
         def run(start: int, count: int) -> None:
-            at = [
-                p if p is None else ctypes.c_void_p(p[0] + start * p[1]) for p in places
-            ]
+            places = []
+            for a in arrays:
+                place = None if a is None else a.ctypes.data + start * a.strides[0]
+                places.append(ctypes.c_void_p(place))
             call = ctypes.c_void_p(self._call.place)
-            function(call, ctypes.c_int64(count), *numbers, *at)
+            function(call, ctypes.c_int64(count), *numbers, *places)
 
         in_chunks(rows, run)
 
@@ -309,12 +314,15 @@ class Follower:
         parts = self._parts
         for name in ("target", "feed", "tip", "offset", "held", "J"):
             parts[name][:] = 0.0
-        self.state[[IK_SIGMA_MIN, IK_DISTANCE]] = parts["error"][:] = math.nan
+        parts["error"][:] = math.nan
+        self.state[[IK_SIGMA_MIN, IK_DISTANCE]] = math.nan
         self.state[[IK_DAMPING, IK_STOPPED]] = 0.0
-        parts["x"][:] = self.core.settings.evaluate(q)[0][0].flatten()
+        x, _ = self.core.settings.evaluate(q)
+        parts["x"][:] = x.flatten()
         self.state[IK_LAST] = self._dt
         parts["dq"][:] = dq[0]
-        parts["q"][:] = parts["before"][:] = q[0]
+        parts["q"][:] = q[0]
+        parts["before"][:] = q[0]
 
     def tick(self, target: object, dx: object, tip: object) -> bool:
         """Do a tick with plain arrays: the target, its velocity, the measured tip.
@@ -335,7 +343,8 @@ class Follower:
                 return False
             mode |= IK_HAS_TIP
         if mode != self._mode:
-            self.state[IK_MODE] = self._mode = mode
+            self._mode = mode
+            self.state[IK_MODE] = mode
         return self._follow(self._call.place) > 0
 
     def advance(self, period: float | None, *inputs: Tensor | None) -> Tick:
@@ -343,8 +352,8 @@ class Follower:
         for place, rows in zip(self._inputs, inputs, strict=True):
             if rows is not None:
                 place.numbers[...] = rows[0].numpy()
-        mode = self._least | _mode(*inputs)
-        self.state[IK_MODE] = self._mode = mode
+        self._mode = self._least | _mode(*inputs)
+        self.state[IK_MODE] = self._mode
         self.state[IK_PERIOD] = period or self._dt
         self._follow(self._call.place)
         self.state[IK_PERIOD] = self._dt
@@ -402,9 +411,9 @@ class _Input:
                 return False
             self.numbers[...] = point
             return True
-        if self._shape != (3,) or (
-            type(point) is not list and type(point) is not tuple
-        ):
+        if self._shape != (3,):
+            return False
+        if type(point) is not list and type(point) is not tuple:
             return False
         try:
             _write_point(self._bytes, self._at, *point)
@@ -415,8 +424,19 @@ class _Input:
 
 def places_of(n: int, m: int, width: int) -> dict[str, slice]:
     """Return the places of the parts of the state: of n actuators, m rows and `width` numbers."""
-    lengths = {"target": width, "feed": m, "tip": width, "offset": m, "x": width}
-    lengths |= {"error": m, "q": n, "dq": n, "before": n, "held": n, "J": m * n}
+    lengths = {
+        "target": width,
+        "feed": m,
+        "tip": width,
+        "offset": m,
+        "x": width,
+        "error": m,
+        "q": n,
+        "dq": n,
+        "before": n,
+        "held": n,
+        "J": m * n,
+    }
     places = {}
     start = IK_TARGET
     for name, length in lengths.items():
@@ -430,6 +450,7 @@ class _CoreTask(Task):
 
     def __init__(self, task: Task, core: Core, programs: list[Program]) -> None:
         vars(self).update(vars(task))
+        self.has_rotation = task.has_rotation
         self.check = task.check
         self.difference = task.difference
         self.distances = task.distances
@@ -451,11 +472,11 @@ class _CoreSearch(Search):
     def _attempt(self, q: Tensor, target: Tensor) -> Found:
         return self._find(IK_LOWERS + IK_TO_DOMAIN, q, target)
 
-    def _to_posture(self, found: Found) -> None:
-        rows = found.reached.nonzero()[:, 0]
-        slid = self._find(IK_TO_POSTURE, found.q[rows], found.target[rows])
-        found.put(rows, Point(slid.q, slid.x, slid.J, slid.e, slid.target))
-        found.n_iter[rows] += slid.n_iter
+    def _to_posture(self, ends: Found) -> None:
+        rows = ends.reached.nonzero()[:, 0]
+        slid = self._find(IK_TO_POSTURE, ends.q[rows], ends.target[rows])
+        ends.put(rows, Point(slid.q, slid.x, slid.J, slid.e, slid.target))
+        ends.n_iter[rows] += slid.n_iter
 
     def _find(self, mode: int, q: Tensor, target: Tensor) -> Found:
         return self.core.find(mode, q, target, self.tol, self.max_iter)
@@ -463,10 +484,22 @@ class _CoreSearch(Search):
 
 def _mode(target: Tensor | None, feed: Tensor | None, tip: Tensor | None) -> int:
     """Return the bits of the inputs that there are."""
-    mode = IK_HAS_TARGET * (target is not None) + IK_HAS_FEED * (feed is not None)
-    return mode + IK_HAS_TIP * (tip is not None)
+    mode = 0
+    if target is not None:
+        mode |= IK_HAS_TARGET
+    if feed is not None:
+        mode |= IK_HAS_FEED
+    if tip is not None:
+        mode |= IK_HAS_TIP
+    return mode
 
 
-def _plain(a: Tensor) -> NDArray:
-    """Return rows as a contiguous array."""
+@overload
+def _plain(a: Tensor) -> NDArray: ...
+@overload
+def _plain(a: Tensor | None) -> NDArray | None: ...
+def _plain(a: Tensor | None) -> NDArray | None:
+    """Return rows as a contiguous array, or None."""
+    if a is None:
+        return None
     return a.contiguous().numpy()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from functools import partial
 
 import torch
 from torch import Tensor
@@ -45,18 +44,22 @@ def differentiable(
         the solution but not beside it.
     """
     rows = reached.nonzero()[:, 0]
-    part = q[rows]
+    solved = q[rows]
     goal = target[rows]
-    lower, upper = settings.box(part)
-    free = (part > lower) & (part < upper)
-    best = part
-    least = torch.full_like(part[:, 0], torch.inf)
+    box = settings.box(solved)
+    free = ~box.held(solved)
+
+    # Polish to a root, with the rounding of a few Newton steps.
+    best = solved
+    least = torch.full_like(best[:, 0], torch.inf)
     for _ in range(_POLISHES + 1):
-        dq, lacking = _newton(settings, part, goal.detach(), free, tol)
-        better = lacking < least
-        best = torch.where(better[:, None], part, best)
-        least = torch.where(better, lacking, least)
-        part = torch.clamp(part + dq.detach(), lower, upper)
+        dq, size = _newton(settings, solved, goal.detach(), free, tol)
+        better = size < least
+        best = torch.where(better[:, None], solved, best)
+        least = torch.where(better, size, least)
+        solved = box.clip(solved + dq.detach())
+
+    # A step of zero with the derivatives of the solution.
     dq, _ = _newton(settings, best, goal, free, tol)
     regular = _is_regular(settings, best, free)
     if not regular.all():
@@ -83,32 +86,39 @@ def _newton(
     leaf = q.detach().requires_grad_(True)
     x, J = settings.evaluate(leaf)
     e = settings.task.difference(x, target)
-    held = torch.where(free[:, None], J.detach(), 0.0) * unit
-    inverse = torch.linalg.pinv(held, rtol=cutoff)
-    null = torch.diag_embed(free.to(q)) - inverse @ held
+    J_free = torch.where(free[:, None], J.detach(), 0.0) * unit
+    inverse = torch.linalg.pinv(J_free, rtol=cutoff)
     step = apply_rows(inverse, e)
-    lacking = step
+    residual = step
     if settings.has_posture:
+        # g = wish - J^T mu in these units, and its slope H.
         wish = (settings.preferred(leaf) - leaf) / unit
-        pull = wish - unit * apply_columns(J, apply_columns(inverse, wish.detach()))
+        mu = apply_columns(inverse, wish.detach())
+        pull = wish - unit * apply_columns(J, mu)
         H = unit * slopes(pull, leaf).detach()
-        compliance = (
-            null @ torch.linalg.pinv(null @ H @ null, atol=cutoff, rtol=cutoff) @ null
-        )
-        lacking = torch.cat([step, apply_rows(null, pull)], dim=-1)
+
+        null = torch.diag_embed(free.to(q)) - inverse @ J_free
+        stiffness = null @ H @ null
+        compliance = torch.linalg.pinv(stiffness, atol=cutoff, rtol=cutoff)
+        compliance = null @ compliance @ null
+        residual = torch.cat([step, apply_rows(null, pull)], dim=-1)
         step = step - apply_rows(compliance, pull + apply_rows(H, step))
-    size = lacking.detach().norm(dim=-1)
-    return unit * step, torch.where(settings.task.reached(e, tol), size, torch.inf)
+    size = residual.detach().norm(dim=-1)
+    size = torch.where(settings.task.reached(e, tol), size, torch.inf)
+    return unit * step, size
 
 
 def _is_regular(settings: StepSettings, q: Tensor, free: Tensor) -> Tensor:
     """Return whether the free columns of J have the same rank at q and beside it."""
     # Unequal factors, because equal ones can cancel in a symmetric robot.
-    aside = torch.cos(torch.ones_like(q).cumsum(-1))
-    beside = torch.where(free, q + _cutoff(q) ** 0.5 * aside, q)
-    at_q, at_beside = (settings.evaluate(a)[1] * free[:, None] for a in (q, beside))
-    rank = partial(torch.linalg.matrix_rank, rtol=_cutoff(q))
-    return rank(at_q) == rank(at_beside)
+    cutoff = _cutoff(q)
+    aside = cutoff**0.5 * torch.ones_like(q).cumsum(-1).cos()
+    ranks = []
+    for at in (q, torch.where(free, q + aside, q)):
+        _, J = settings.evaluate(at)
+        J_free = J * free[:, None]
+        ranks.append(torch.linalg.matrix_rank(J_free, rtol=cutoff))
+    return ranks[0] == ranks[1]
 
 
 def _cutoff(q: Tensor) -> float:

@@ -110,8 +110,10 @@ class Search:
         if cold and len(q) > 0:
             q = self._beside_singular_start(q, target)
         best = self._attempt(q, target)
-        rows = (~best.reached & row_gram(best.J).is_singular).nonzero()[:, 0]
-        self._try_again(best, rows, self._nudged(best)[rows, None])
+        stuck = ~best.reached & row_gram(best.J).is_singular
+        rows = stuck.nonzero()[:, 0]
+        nudged = self._nudged(best)[rows]
+        self._try_again(best, rows, nudged[:, None])
         if restarts > 0:
             self._restart(best, q, restarts)
         if settings.tip_limits is not None:
@@ -125,7 +127,8 @@ class Search:
 
         At a straight backbone, motions that cancel to first order would be missed.
         """
-        if not row_gram(self.settings.evaluate(q[:1])[1]).is_singular.all():
+        _, J = self.settings.evaluate(q[:1])
+        if not row_gram(J).is_singular.all():
             return q
         at_start = self._start(q, target)
         stay = at_start.reached | ~torch.isfinite(at_start.error)
@@ -149,10 +152,11 @@ class Search:
         """Return rows that ended outside the tip limits, by targets beyond these limits."""
         for _ in range(_RETURNS):
             way = self.settings.allowed(best.x) - best.x
-            rows = (~best.reached & ~self._within(way)).nonzero()[:, 0]
+            outside = ~best.reached & ~self._within(way)
+            rows = outside.nonzero()[:, 0]
             if rows.numel() == 0:
                 break
-            target = (best.x + 1.5 * way)[rows]
+            target = best.x[rows] + 1.5 * way[rows]
             best.put(rows, self._attempt(best.q[rows], target))
 
     def several(self, best: Found, start: Tensor, restarts: int, count: int) -> Found:
@@ -169,23 +173,30 @@ class Search:
         places = torch.arange(count * len(start), device=start.device)
         solutions = best.take(places // count)
         solutions.q[places % count > 0] = torch.nan
-        for rows in (self._cost(best) == _DONE).nonzero()[:, 0].split(_ROWS):
-            ends = fine._from_even_starts(best.take(rows), start[rows], restarts)
+        done = self._cost(best) == _DONE
+        for rows in done.nonzero()[:, 0].split(_ROWS):
             near = start[rows].repeat_interleave(n_starts, 0)
-            # By whole turns towards the start, where the limits allow it.
-            turned = ends.q + self.settings.whole_turns(near - ends.q)
-            allowed = self.settings.inside(turned) == turned
-            ends.q = torch.where(allowed, turned, ends.q)
+            ends = fine._from_even_starts(best.take(rows), start[rows], restarts)
             ends.n_starts = best.n_starts[rows].repeat_interleave(n_starts) + n_starts
-            distance = ((ends.q - near) / self.settings.spans.to(near)).norm(dim=-1)
+            self._turn_towards(ends, near)
+
+            # The reached ends of every row that differ, the nearest first.
+            way = (ends.q - near) / self.settings.spans.to(near)
+            distance = way.norm(dim=-1)
             distance[fine._cost(ends) != _DONE] = torch.inf
             for k, row in enumerate(rows.tolist()):
                 block = slice(k * n_starts, (k + 1) * n_starts)
                 picks = self._different(ends.q[block], distance[block], count)
-                first = row * count
                 chosen = ends.take(block.start + picks)
+                first = row * count
                 solutions.put(places[first : first + len(picks)], chosen)
         return solutions
+
+    def _turn_towards(self, ends: Found, near: Tensor) -> None:
+        """Turn joints by whole turns towards q (N, n), where the limits allow it."""
+        turned = ends.q + self.settings.whole_turns(near - ends.q)
+        allowed = self.settings.inside(turned) == turned
+        ends.q = torch.where(allowed, turned, ends.q)
 
     def _different(self, q: Tensor, distance: Tensor, count: int) -> Tensor:
         """Return which of the configurations (s, n) differ, up to `count`, by their distance."""
@@ -195,7 +206,8 @@ class Search:
             picks.append(pick)
             apart = q - q[pick]
             apart = apart - self.settings.whole_turns(apart)
-            same = (apart / self.settings.spans.to(q)).abs().amax(-1) <= _SAME
+            relative = (apart / self.settings.spans.to(q)).abs()
+            same = relative.amax(-1) <= _SAME
             distance = torch.where(same, torch.inf, distance)
         return torch.tensor(picks, dtype=torch.long, device=q.device)
 
@@ -203,32 +215,37 @@ class Search:
         """Return the results from the best points and from `restarts` even starts, row by row."""
         anywhere = torch.zeros_like(best.error)
         starts = even_starts(self.settings, start, anywhere, restarts)
-        starts = torch.cat([best.q[:, None], starts.expand(len(start), -1, -1)], dim=1)
-        target = best.target.repeat_interleave(restarts + 1, 0)
-        ends = self._attempt(self.settings.start_at(starts.flatten(0, 1)), target)
+        starts = starts.expand(len(start), -1, -1)
+        starts = torch.cat([best.q[:, None], starts], dim=1)
+        ends = self._from(starts, best.target)
         if self.settings.has_posture:
             self._to_posture(ends)
         return ends
 
-    def _to_posture(self, found: Found) -> None:
-        self._descend(found, lambda q: self.settings.preferred(q) - q)
+    def _from(self, starts: Tensor, target: Tensor) -> Found:
+        """Return the results of several starts (N, s, n) for each target, row by row."""
+        rows = self.settings.start_at(starts.flatten(0, 1))
+        return self._attempt(rows, target.repeat_interleave(starts.shape[1], 0))
+
+    def _to_posture(self, ends: Found) -> None:
+        self._descend(ends, lambda q: self.settings.preferred(q) - q)
 
     def _attempt(self, q: Tensor, target: Tensor) -> Found:
         """Return the result of one start; results outside the domain are moved towards it."""
-        solution = self._lower(q, target)
-        rows = (self._cost(solution) == _OUTSIDE).nonzero()[:, 0]
-        part = solution.take(rows)
-        self._descend(part, self._inward)
-        solution.put(rows, part)
-        return solution
+        ends = self._lower(q, target)
+        outside = self._cost(ends) == _OUTSIDE
+        rows = outside.nonzero()[:, 0]
+        moved = ends.take(rows)
+        self._descend(moved, self._inward)
+        ends.put(rows, moved)
+        return ends
 
     def _try_again(self, best: Found, rows: Tensor, starts: Tensor) -> None:
         """Search rows (k,) from further starts (k, s, n) at once, and keep the best results."""
         n_starts = starts.shape[1]
         if rows.numel() == 0 or n_starts == 0:
             return
-        target = best.target[rows].repeat_interleave(n_starts, 0)
-        ends = self._attempt(self.settings.start_at(starts.flatten(0, 1)), target)
+        ends = self._from(starts, best.target[rows])
         best.n_iter[rows] += ends.n_iter.view(-1, n_starts).sum(1)
         best.n_starts[rows] += n_starts
         # The best end of every row; the counts are those of the row.
@@ -248,13 +265,22 @@ class Search:
 
     def _point(self, q: Tensor, target: Tensor) -> Point:
         x, J = self.settings.evaluate(q)
-        return Point(q, x, J, self.settings.task.difference(x, target), target)
+        e = self.settings.task.difference(x, target)
+        return Point(q, x, J, e, target)
 
     def _start(self, q: Tensor, target: Tensor) -> Found:
         point = self._point(q, target)
-        no = torch.zeros(len(q), dtype=torch.bool, device=q.device)
-        outcome = (self._within(point.e), no, no, no.long(), (~no).long())
-        return Found(*(part.clone() for part in (*vars(point).values(), *outcome)))
+        copies = [part.clone() for part in vars(point).values()]
+        reached = self._within(point.e)
+        n_iter = torch.zeros_like(reached, dtype=torch.long)
+        return Found(
+            *copies,
+            reached=reached,
+            stationary=torch.zeros_like(reached),
+            held=torch.zeros_like(reached),
+            n_iter=n_iter,
+            n_starts=n_iter + 1,
+        )
 
     # Levenberg-Marquardt: eq. (19) without posture, at a damping that follows the progress.
 
@@ -269,9 +295,10 @@ class Search:
         )
         for iteration in range(self.max_iter + 1):
             live.reached = self._within(live.e)
-            live.stationary = self._blocked(live)
-            live.stationary |= (live.nu > IK_LAST_DAMPING) | (
-                live.slow >= IK_SLOW_STEPS
+            live.stationary = (
+                self._blocked(live)
+                | (live.nu > IK_LAST_DAMPING)
+                | (live.slow >= IK_SLOW_STEPS)
             )
             live.n_iter = torch.full_like(live.n_iter, iteration)
             going = ~live.reached & ~live.stationary & (iteration < self.max_iter)
@@ -303,7 +330,8 @@ class Search:
 
         # The damping follows the ratio of actual to predicted gain.
         gain = error.square() - error_new.square()
-        quality = gain / (error.square() - predicted.square()).clamp_min(1e-30)
+        predicted_gain = error.square() - predicted.square()
+        quality = gain / predicted_gain.clamp_min(1e-30)
         factor = (1.0 - (2.0 * quality - 1.0) ** 3).clamp(1.0 / 3.0, 2.0)
         better = error_new < error
         live.nu = live.nu * torch.where(better, factor, live.growth)
@@ -319,13 +347,14 @@ class Search:
 
     def _blocked(self, at: Point) -> Tensor:
         """Return whether no motion within the limits lowers the error to first order."""
-        q = at.q
         lower, upper = self.settings.box(at.q)
         pull = apply_columns(at.J, at.e)
-        out = ((q >= upper) & (pull > 0.0)) | ((q <= lower) & (pull < 0.0))
-        out &= torch.isinf(self.settings.periods.to(q.device))
-        left = torch.where(out, 0.0, pull).norm(dim=-1)
-        return left <= IK_STATIONARY * at.J.flatten(1).norm(dim=-1) * at.error
+        above = (at.q >= upper) & (pull > 0.0)
+        below = (at.q <= lower) & (pull < 0.0)
+        turns = torch.isfinite(self.settings.periods.to(at.q.device))
+        held = (above | below) & ~turns
+        free_pull = torch.where(held, 0.0, pull).norm(dim=-1)
+        return free_pull <= IK_STATIONARY * at.J.flatten(1).norm(dim=-1) * at.error
 
     # Descent in the null space, towards the posture or into the domain.
 
@@ -345,7 +374,8 @@ class Search:
                 )
         beyond = (distance.detach() - IK_INSIDE).clamp_min(0.0)
         square = slope.square().sum(-1)
-        return -(beyond / torch.where(square > 0.0, square, 1.0))[:, None] * slope
+        length = beyond / torch.where(square > 0.0, square, 1.0)
+        return -length[:, None] * slope
 
     def _descend(self, ends: Found, wanted: Callable[[Tensor], Tensor]) -> None:
         """Move reached rows along their null space in the direction of the desired steps.
@@ -363,37 +393,41 @@ class Search:
         task = self.settings.task
         unit = self.settings.unit(ends.q)
         was_inside = task.in_domain(ends.q)
-        whole = torch.ones_like(ends.e[rows, 0])
-        live = self._slide(ends.take(rows), wanted, whole)
+        start = ends.take(rows)
+        live = self._slide(start, wanted, torch.ones_like(start.error))
         for iteration in range(IK_NULL_STEPS):
             # The last step only corrects the error.
             last = iteration == IK_NULL_STEPS - 1
             way = None if last else live.fraction[:, None] * live.free
             point = self._after_step(live, way)
             new = self._slide(point, wanted, live.fraction)
-            moved = (new.q - live.q) / unit
+            dq = new.q - live.q
+            moved = dq / unit
             gain = 0.5 * ((live.free + new.free) / unit * moved).sum(-1)
+
             # Take a step that gains while its error is small, or that corrects a large error, but
             # none that leaves the domain.
             reached = self._within(live.e)
             reached_new = self._within(new.e)
-            unprojected = live.J.flatten(1).norm(dim=-1) * (new.q - live.q).norm(dim=-1)
+            unprojected = live.J.flatten(1).norm(dim=-1) * dq.norm(dim=-1)
             small = reached_new | (new.error <= IK_NULL_SLIP * unprojected)
             corrects = ~reached & (new.error < 0.5 * live.error)
-            taken = (small & (gain > 0.0)) | corrects | last
-            taken &= task.in_domain(new.q) | ~was_inside[rows]
+            stays_inside = task.in_domain(new.q) | ~was_inside[rows]
+            taken = ((small & (gain > 0.0)) | corrects | last) & stays_inside
             recorded = taken & reached_new
             ends.put(rows[recorded], point.take(recorded))
             ends.n_iter[rows] += 1
+
             # Go on while it is worth it, or with shorter steps.
             least_gain = IK_NULL_GAIN * (live.wish / unit).square().sum(-1)
             unfinished = (gain > least_gain) | ~reached | ~reached_new
             going = torch.where(taken, unfinished, live.fraction > 0.01)
+
+            # The fraction that the curvature of a step that is taken suggests for the next one.
             change = (moved * (live.free - new.free) / unit).sum(-1)
             curvature = change / moved.square().sum(-1)
-            fraction = torch.where(
-                curvature > 0.0, 1.0 / curvature, 2.0 * live.fraction
-            )
+            newton = 1.0 / curvature
+            fraction = torch.where(curvature > 0.0, newton, 2.0 * live.fraction)
             new.fraction = fraction.clamp(0.1, 4.0)
             live.fraction = 0.25 * live.fraction
             live.put(taken, new.take(taken))
@@ -402,8 +436,9 @@ class Search:
             if rows.numel() == 0:
                 break
         # A step of the free actuators removes what is left of the error.
-        corrected = self._after_step(ends.take(all_rows), None, hold=True)
-        better = (corrected.error < ends.error[all_rows]) & self._within(corrected.e)
+        best = ends.take(all_rows)
+        corrected = self._after_step(best, None, hold=True)
+        better = (corrected.error < best.error) & self._within(corrected.e)
         ends.put(all_rows[better], corrected.take(better))
 
     def _slide(
@@ -431,13 +466,13 @@ class Search:
         stationary but not minimal. A second-order motion is needed, which is large even for small
         errors: 5 % of the limits, or the motion that moves a regular tip by a tenth of the error.
         """
-        n = at.q.shape[-1]
         settings = self.settings
-        size = 0.1 * _per_tip(at.J, at.error)[:, None].expand_as(at.q)
+        size = 0.1 * _per_tip(at.J, at.error)[:, None]
         span = 0.05 * (settings.q_max - settings.q_min).to(at.q)
-        size = torch.where(torch.isfinite(span), torch.maximum(size, span), size)
+        span = torch.where(torch.isfinite(span), span, 0.0)
         # Unequal factors, because equal ones can cancel in a symmetric robot.
-        return at.q + size * torch.cos(at.q.new_ones(n).cumsum(0))
+        factors = torch.ones_like(at.q).cumsum(-1).cos()
+        return at.q + torch.maximum(size, span) * factors
 
 
 def _per_tip(J: Tensor, error: Tensor) -> Tensor:

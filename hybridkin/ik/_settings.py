@@ -43,6 +43,7 @@ Posture: TypeAlias = Callable[[Tensor], Tensor]
 _FAST = 5.0
 _TURN = 2.0 * math.pi
 _FULL = 0.999  # a range of this fraction of a turn counts as a whole turn
+_VECTORS = ("q_min", "q_max", "dq_max", "ddq_max", "posture")  # in the kernel's order
 PLANE_ROUNDS = 8  # of alternating projections onto a plane and a box
 
 
@@ -97,7 +98,8 @@ def limits_of(task: Task, names: Iterable[str]) -> dict[str, Tensor]:
 
 def stopping(way: Tensor, change: Tensor) -> Tensor:
     """Return the largest first step for which steps that shrink by `change` stop within `way`."""
-    stops = way / (0.5 + 0.5 * (1.0 + 2.0 * (way.clamp_min(0.0) / change)).sqrt())
+    n_changes = way.clamp_min(0.0) / change
+    stops = way / (0.5 + 0.5 * (1.0 + 2.0 * n_changes).sqrt())
     return torch.where((way > 0.0) & torch.isfinite(way), stops, way)
 
 
@@ -129,12 +131,13 @@ def _write_plan(plan: Plan, stored: Stored) -> int:
     m = len(scale)
     plan.limit("rows of a task", m)
     settings = stored.settings
-    names = ("q_min", "q_max", "dq_max", "ddq_max", "posture")
-    vectors = [stored.array(name, [n], finite=False) for name in names]
+    vectors = [stored.array(name, [n], finite=False) for name in _VECTORS]
     weights = stored.array("weights", [n])
     pulls = stored.array("pulls", [n])
     periods = stored.array("periods", [n], finite=False)
     normals = stored.array("normals").T
+    spaces = stored.array("spaces")
+    plan.limit("actuators", spaces.shape[1])  # they share arrays of the kernels
     if len(normals) > IK_NORMALS:
         raise NoKernel(
             f"the log leaves {len(normals)} directions of q out, more than {IK_NORMALS}"
@@ -144,18 +147,15 @@ def _write_plan(plan: Plan, stored: Stored) -> int:
     beta = 1.0 if settings["beta"] is None else settings["beta"]
     damping = -1.0 if settings["damping"] == "adaptive" else settings["damping"]
     rates = [gain, beta, settings["dt"], damping]
-    spaces = stored.array("spaces")
-    plan.limit("actuators", spaces.shape[1])  # they share arrays of the kernels
     flags = IK_LIMITED * (settings["limits"] == "saturate")
     flags |= IK_POSTURE * settings["has_posture"]
     flags |= IK_WEIGHTS * bool((weights != 1.0).any())
     flags |= IK_ACCELERATES * settings["accelerates"]
     flags |= IK_PULLS * bool(pulls.any())
     flags |= IK_POSE * settings["pose"]
-    plane_and_spaces = [normals, spaces, stored.array("offsets")]
-    numbers = [*vectors, weights**-0.5, rates, scale, periods, pulls, *plane_and_spaces]
-    sizes = len(normals), spaces.shape[1]
-    return plan.node("ik", n, m, numbers, model, flags, *sizes)
+    numbers = [*vectors, weights**-0.5, rates, scale, periods, pulls]
+    numbers += [normals, spaces, stored.array("offsets")]
+    return plan.node("ik", n, m, numbers, model, flags, len(normals), spaces.shape[1])
 
 
 @dataclass(frozen=True)
@@ -193,11 +193,10 @@ class StepSettings(Portable):
     def __post_init__(self) -> None:
         """Check the settings against each other and the model, and derive the others."""
         model = self.task.models[0]
-        vectors = {
-            name: len(value)
-            for name, value in vars(self).items()
-            if isinstance(value, Tensor) and value.ndim == 1
-        }
+        vectors = {}
+        for name, value in vars(self).items():
+            if isinstance(value, Tensor) and value.ndim == 1:
+                vectors[name] = len(value)
         sizes = {*vectors.values(), self.task.n_actuators} - {None}
         require(
             len(sizes) < 2,
@@ -289,7 +288,7 @@ class StepSettings(Portable):
 
     def far_messages(self, x: Tensor, name: str) -> list[str]:
         """Return warnings if targets lie too far from the robot to be in metres."""
-        points = self._positions(x)
+        points = self.task.positions(x)
         if points.shape[-1] == 3:
             return self.task.models[0].robot.far_messages(points, name)
         return []
@@ -298,13 +297,10 @@ class StepSettings(Portable):
         """Return proven lower bounds (N,) of the errors at targets [m]; not positive: no proof."""
         low, high = self.box(target.double())
         largest = torch.maximum(low.abs(), high.abs()).clamp(max=LARGEST)
-        missed = self.task.models[0].misses(self._positions(target), largest)
-        return missed[..., None].flatten(1).amax(-1) * min(self.task.units)
-
-    def _positions(self, x: Tensor) -> Tensor:
-        if self.task.shape == (4, 4):
-            return x[..., :3, 3]
-        return x
+        positions = self.task.positions(target)
+        missed = self.task.models[0].misses(positions, largest)
+        worst_point = missed[..., None].flatten(1).amax(-1)
+        return worst_point * min(self.task.units)
 
     @property
     def middle(self) -> Tensor | None:
@@ -351,41 +347,38 @@ class StepSettings(Portable):
             raise TypeError(
                 "the number of actuators is unknown; give one limit for each"
             )
+        # No posture, weights, plane or half-spaces are zeros, ones, and no rows.
         arrays = {
-            "q_min": self.q_min,
-            "q_max": self.q_max,
-            "dq_max": self.dq_max,
-            "ddq_max": self.ddq_max,
-            "posture": 0.0 if self.posture is None else self.posture,
-            "weights": 1.0 if self.weights is None else self.weights,
-            "periods": self.periods,
-            "pulls": self.pulls,
+            "posture": np.zeros(n),
+            "weights": np.ones(n),
+            "normals": np.zeros((n, 0)),
+            "scale": np.repeat(self.task.units, self.task.parts),
+            "spaces": np.zeros((sum(self.task.parts), 0)),
+            "offsets": np.zeros(0),
         }
-        arrays = {name: np.broadcast_to(as_array(a), n) for name, a in arrays.items()}
-        if self.plane is None:
-            arrays["normals"] = np.zeros((n, 0))
-        else:
+        for name in (*_VECTORS, "weights", "periods", "pulls"):
+            value = getattr(self, name)
+            if value is not None:
+                arrays[name] = np.broadcast_to(as_array(value), n)
+        if self.plane is not None:
             arrays["normals"] = as_array(self.plane[1])
-        arrays["scale"] = np.repeat(self.task.units, self.task.parts)
-        if self.tip_limits is None:
-            arrays["spaces"] = np.zeros((sum(self.task.parts), 0))
-            arrays["offsets"] = np.zeros(0)
-        else:
+        if self.tip_limits is not None:
             arrays["spaces"] = as_array(self.tip_limits.normals).T
             arrays["offsets"] = as_array(self.tip_limits.offsets)
-        names = (
-            "beta",
-            "gain",
-            "damping",
-            "limits",
-            "dt",
-            "has_posture",
-            "accelerates",
-        )
-        settings = {name: getattr(self, name) for name in names}
-        settings["pose"] = isinstance(self.task, PoseTask)
         models = {str(k): m.stored() for k, m in enumerate(self.task.steered)}
-        return Stored.of(self.layout.kind, arrays, models, **settings)
+        return Stored.of(
+            self.layout.kind,
+            arrays,
+            models,
+            beta=self.beta,
+            gain=self.gain,
+            damping=self.damping,
+            limits=self.limits,
+            dt=self.dt,
+            has_posture=self.has_posture,
+            accelerates=self.accelerates,
+            pose=self.task.has_rotation,
+        )
 
     # The plane of q to keep to, where the log lies in one.
 
@@ -430,7 +423,9 @@ class StepSettings(Portable):
 
     def start(self, like: Tensor) -> Tensor:
         """Return the preferred configuration (n,); if it is a function, evaluate it mid-range."""
-        start = self.posture if isinstance(self.posture, Tensor) else self.middle
+        start = self.posture
+        if not isinstance(start, Tensor):
+            start = self.middle
         if start is None or self.n_actuators is None:
             raise ValueError(
                 "a start is needed: give `q0` or `q_pref` of shape (n,), or finite `q_min` and "
@@ -586,8 +581,9 @@ class StepSettings(Portable):
         """Return one tolerance [m], or one for every part of the task."""
         tolerances = real_array(tol, "tol").astype(float)
         n = len(self.task.parts)
+        good = tolerances.shape in ((), (n,)) and bool((tolerances > 0.0).all())
         require(
-            tolerances.shape in ((), (n,)) and bool((tolerances > 0.0).all()),
+            good,
             f"`tol` must be positive: one number [m], or {n}, one for every part of the task; got "
             f"{tol!r:.200}.",
         )

@@ -42,6 +42,8 @@ class Task:
         The models that are evaluated.
     estimator, module : Fitted and nn.Module, or None
         The estimator that the model was taken from, and its module then.
+    has_rotation : bool
+        Whether targets are poses (4, 4).
     """
 
     shape: tuple[int, ...]
@@ -50,6 +52,7 @@ class Task:
     models: tuple[ForwardModel, ...]
     estimator: Fitted | None = None
     module: nn.Module | None = None
+    has_rotation = False
 
     def present(self) -> Self:
         """Return the task for the module that its estimator has now."""
@@ -91,12 +94,14 @@ class Task:
 
     def distances(self, x: Tensor, x_target: Tensor) -> Tensor:
         """Return distances (N, k) of x ``(1 or N, k, *shape)`` to targets ``(N, *shape)``."""
-        n = len(x_target)
         k = x.shape[1]
-        x = x.expand(n, k, *self.shape).flatten(0, 1)
-        return (
-            self.difference(x, x_target.repeat_interleave(k, 0)).norm(dim=-1).view(n, k)
-        )
+        x = x.expand(len(x_target), k, *self.shape).flatten(0, 1)
+        error = self.difference(x, x_target.repeat_interleave(k, 0))
+        return error.norm(dim=-1).view(-1, k)
+
+    def positions(self, x: Tensor) -> Tensor:
+        """Return the positions in x ``(..., *shape)`` [m]."""
+        return x[..., :3, 3] if self.has_rotation else x
 
     def check(self, x_target: Tensor, name: str) -> None:
         """Raise if targets ``(..., *shape)`` are not valid, e.g. their rotations."""
@@ -110,28 +115,32 @@ class Task:
         """Return whether errors (N, m) are within one tolerance [m], or one for every part."""
         if not isinstance(tol, tuple):
             return error.norm(dim=-1) <= tol
-        sizes = [part.norm(dim=-1) for part in error.split(self.parts, dim=-1)]
-        limits = (t * unit for t, unit in zip(tol, self.units, strict=True))
-        return torch.stack([a <= b for a, b in zip(sizes, limits, strict=True)]).all(0)
+        parts = error.split(self.parts, dim=-1)
+        reached = torch.ones_like(error[:, 0], dtype=torch.bool)
+        for part, largest, unit in zip(parts, tol, self.units, strict=True):
+            reached &= part.norm(dim=-1) <= largest * unit
+        return reached
 
     @property
     def n_actuators(self) -> int | None:
         """Length of q, or None if no model defines it."""
-        return next(
-            (model.n_actuators for model in self.models if model.n_actuators), None
-        )
+        for model in self.models:
+            if model.n_actuators:
+                return model.n_actuators
+        return None
 
     @property
     def device(self) -> torch.device:
         """Device of the first model with tensors; the CPU if there is none."""
-        tensors = (
-            a for model in self.models for a in (*model.parameters(), *model.buffers())
-        )
-        return next((a.device for a in tensors), torch.device("cpu"))
+        for model in self.models:
+            for tensor in (*model.parameters(), *model.buffers()):
+                return tensor.device
+        return torch.device("cpu")
 
     def domain_distance(self, q: Tensor) -> Tensor:
         """Return the largest domain distance of the models, at most 1 inside, shape (N,)."""
-        return torch.stack([model.domain_distance(q) for model in self.models]).amax(0)
+        distances = [model.domain_distance(q) for model in self.models]
+        return torch.stack(distances).amax(0)
 
     def in_domain(self, q: Tensor) -> Tensor:
         """Return whether q lies inside the domains of all models, shape (N,)."""
@@ -248,6 +257,8 @@ class PoseTask(Task):
     tensor(True)
     """
 
+    has_rotation = True
+
     def __init__(self, model: object, radian: float = 0.1) -> None:
         if not 0.0 < number(radian, "radian") < math.inf:
             raise ValueError(f"`radian` must be a positive length [m], got {radian!r}.")
@@ -271,35 +282,38 @@ class PoseTask(Task):
 
     def evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return the tip's poses (N, 4, 4) and J (N, 6, n), its angular rows times `radian`."""
-        T, J = in_blocks(cast(PoseModel, self.models[0]).pose_and_jacobian, q)
-        return T.to(q), torch.cat([J[:, :3], self.units[1] * J[:, 3:]], dim=-2).to(q)
+        model = cast(PoseModel, self.models[0])
+        T, J = in_blocks(model.pose_and_jacobian, q)
+        scaled = torch.cat([J[:, :3], self.units[1] * J[:, 3:]], dim=-2)
+        return T.to(q), scaled.to(q)
 
     def difference(self, x: Tensor, x_target: Tensor) -> Tensor:
         """Return the displacement [m] and the rotation vector [rad] times `radian`, (N, 6)."""
-        turn = rotation_vector(x_target[..., :3, :3] @ x[..., :3, :3].mT)
-        return torch.cat(
-            [x_target[..., :3, 3] - x[..., :3, 3], self.units[1] * turn], dim=-1
-        )
+        displacement = x_target[..., :3, 3] - x[..., :3, 3]
+        R = x_target[..., :3, :3] @ x[..., :3, :3].mT
+        turn = self.units[1] * rotation_vector(R)
+        return torch.cat([displacement, turn], dim=-1)
 
     def distances(self, x: Tensor, x_target: Tensor) -> Tensor:
         """Return distances of x to targets, with chords instead of angles of rotations."""
+        points = self._in_metres(x)
+        targets = self._in_metres(x_target)
+        if len(points) == 1:  # much faster
+            return torch.cdist(targets, points[0])
+        return torch.cdist(targets[:, None], points)[:, 0]
+
+    def _in_metres(self, T: Tensor) -> Tensor:
+        """Return positions and scaled rotation matrices side by side, (..., 12)."""
+        rotation = T[..., :3, :3].flatten(-2)
         metres_per_radian = self.units[1] / math.sqrt(2.0)
-        x, x_target = (
-            torch.cat(
-                [T[..., :3, 3], metres_per_radian * T[..., :3, :3].flatten(-2)], dim=-1
-            )
-            for T in (x, x_target)
-        )
-        if len(x) == 1:  # much faster
-            return torch.cdist(x_target, x[0])
-        return torch.cdist(x_target[:, None], x)[:, 0]
+        return torch.cat([T[..., :3, 3], metres_per_radian * rotation], dim=-1)
 
     def check(self, x_target: Tensor, name: str) -> None:
         """Raise if a finite target does not hold a rotation."""
         R = x_target[..., :3, :3]
-        R = R[torch.isfinite(R).all(-1).all(-1)]
-        off = (R.mT @ R - identity(3, R)).abs().amax((-2, -1))
-        if ((off > 1e-3) | (torch.linalg.det(R) < 0.0)).any():
+        R = R[torch.isfinite(R).flatten(-2).all(-1)]
+        off = (R.mT @ R - identity(3, R)).abs()
+        if (off > 1e-3).any() or (torch.linalg.det(R) < 0.0).any():
             raise ValueError(
                 f"`{name}` must hold rotations in its upper left 3 x 3 blocks (orthonormal, "
                 f"right-handed), got a block that is off by {float(off.max()):.3g}."
@@ -349,32 +363,31 @@ class PointsTask(Task):
         self.models = tuple(chain.with_tip(number(a, "at")) for a in at)
         n = len(at)
         if weights is None:
-            self.units = (1.0,) * n
-        else:
-            self.units = tuple(number(w, "weights") for w in weights)
-        if (
-            n == 0
-            or len(self.units) != n
-            or not all(0.0 < w < math.inf for w in self.units)
-        ):
-            need = "positive, one for every point of `at`"
+            weights = (1.0,) * n
+        self.units = tuple(number(w, "weights") for w in weights)
+        positive = all(0.0 < w < math.inf for w in self.units)
+        if n == 0 or len(self.units) != n or not positive:
             raise ValueError(
-                f"`weights` must be {need}, got {self.units} for {n} points."
+                "`weights` must be positive, one for every point of `at`, got "
+                f"{self.units} for {n} points."
             )
         self.shape = (n, 3)
         self.parts = (3,) * n
 
     def evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return the points (N, P, 3) and the weighted J (N, 3 P, n)."""
-        x, J = zip(
-            *(model.forward_and_jacobian(q) for model in self.models), strict=True
-        )
-        weighted = [w * rows for w, rows in zip(self.units, J, strict=True)]
-        return torch.stack(x, dim=1).to(q), torch.cat(weighted, dim=-2).to(q)
+        points = []
+        weighted = []
+        for model, weight in zip(self.models, self.units, strict=True):
+            x, J = model.forward_and_jacobian(q)
+            points.append(x)
+            weighted.append(weight * J)
+        return torch.stack(points, dim=1).to(q), torch.cat(weighted, dim=-2).to(q)
 
     def difference(self, x: Tensor, x_target: Tensor) -> Tensor:
         """Return the weighted errors (N, 3 P), one point after another."""
-        return (x.new_tensor(self.units)[:, None] * (x_target - x)).flatten(-2)
+        weights = x.new_tensor(self.units)[:, None]
+        return (weights * (x_target - x)).flatten(-2)
 
 
 def as_task(model: object) -> Task:

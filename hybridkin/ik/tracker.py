@@ -162,12 +162,11 @@ class Tracker(Portable):
         """
         start = as_tensor(q, "q", self._settings.task.device)
         n = self._settings.n_actuators
-        good = (
-            start.ndim == 1 and n in (None, len(start)) and torch.isfinite(start).all()
-        )
-        need = f"finite and of shape ({n or 'n'},)"
+        right_shape = start.ndim == 1 and n in (None, len(start))
         require(
-            good, f"`q` must be {need}, got {start.tolist()}; read it from the robot."
+            right_shape and torch.isfinite(start).all(),
+            f"`q` must be finite and of shape ({n or 'n'},), got {start.tolist()}; read it from "
+            "the robot.",
         )
         with self._lock:
             self._like = start.clone()
@@ -178,13 +177,13 @@ class Tracker(Portable):
         self._settings = settings = self._settings.present()
         core = core_of(settings)
         task = settings.task
-        if core is not None and self._as_numpy and q.dtype == torch.float64:
+        if core is None:
+            reason = why_torch(settings)
+            robot = _InTorch(settings, self._memory, self._as_numpy, reason)
+        elif self._as_numpy and q.dtype == torch.float64:
             robot = Follower(core, self._memory)
         else:
-            if core:
-                reason = "`q0` is no float64 array of NumPy"
-            else:
-                reason = why_torch(settings)
+            reason = "`q0` is no float64 array of NumPy"
             robot = _InTorch(settings, self._memory, self._as_numpy, reason)
         robot.start(q[None], dq[None])
         self._estimator = task.estimator
@@ -219,13 +218,10 @@ class Tracker(Portable):
             finite, the robot stops (with `ddq_max` it brakes first).
         """
         with self._lock:
-            if (
-                self._estimator is not None
-                and self._estimator.module_ is not self._module
-            ):
-                self._start(
-                    as_tensor(self._robot.command, "q"), self._robot.last().step.dq[0]
-                )
+            estimator = self._estimator
+            if estimator is not None and estimator.module_ is not self._module:
+                q = as_tensor(self._robot.command, "q")
+                self._start(q, self._robot.last().step.dq[0])
             robot = self._robot
             if not robot.tick(x_target, dx, x_measured):
                 self._step(x_target, dx, x_measured)
@@ -237,17 +233,16 @@ class Tracker(Portable):
         """Do a step with arguments that need full checks."""
         settings = self._settings
         like = self._like
-        target = settings.points(x_target, "x_target", like, lead="")[None]
+        target = settings.points(x_target, "x_target", like, lead="")
         feed_forward = None
-        tip = None
         if dx is not None:
-            rows = (sum(settings.task.parts),)
-            feed_forward = (
-                settings.dt * settings.points(dx, "dx", like, lead="", shape=rows)[None]
-            )
+            shape = (sum(settings.task.parts),)
+            velocity = settings.points(dx, "dx", like, lead="", shape=shape)
+            feed_forward = settings.dt * velocity[None]
+        tip = None
         if x_measured is not None:
             tip = settings.points(x_measured, "x_measured", like, lead="")[None]
-        self._robot.advance(None, target, feed_forward, tip)
+        self._robot.advance(None, target[None], feed_forward, tip)
 
     def follow(
         self,
@@ -264,8 +259,10 @@ class Tracker(Portable):
         """
         task = self._settings.task
         n = len(targets)
-        ahead = task.difference(targets, torch.cat([targets[1:], targets[-1:]]))
-        ahead = torch.where(torch.isfinite(ahead).all(-1, keepdim=True), ahead, 0.0)
+        following = torch.cat([targets[1:], targets[-1:]])
+        ahead = task.difference(targets, following)
+        countable = torch.isfinite(ahead).all(-1, keepdim=True)
+        ahead = torch.where(countable, ahead, 0.0)
         finite = torch.isfinite(targets.flatten(1)).all(-1).tolist()
         unread = torch.full_like(targets[:1], math.nan)
         held = damped = torch.zeros(1, dtype=torch.bool, device=targets.device)
@@ -273,20 +270,19 @@ class Tracker(Portable):
         for i, target in enumerate(targets.split(1)):
             if progress is not None:
                 progress(i, n)
-            tip = None if plant is None else self._measured(plant, i)
+            tip = None
+            if plant is not None:
+                tip = self._measured(plant, i)
             used = {"model": None, "measured": tip, None: unread}[feedback]
-            ahead_now = ahead[i : i + 1]
             if not finite[i]:
                 target = None
-            tick = self._robot.advance(periods[i], target, ahead_now, used)
-            rows.append(
-                (tick.q, tick.x, tick.x if tip is None else tip, tick.J, held, damped)
-            )
+            tick = self._robot.advance(periods[i], target, ahead[i : i + 1], used)
+            if tip is None:
+                tip = tick.x
+            rows.append((tick.q, tick.x, tip, tick.J, held, damped))
             held = tick.step.saturated.any(-1) | tick.step.stopped
             damped = tick.step.damping > 0.0
-        q, x, measured, J, held, damped = (
-            torch.cat(parts) for parts in zip(*rows, strict=True)
-        )
+        q, x, measured, J, held, damped = map(torch.cat, zip(*rows, strict=True))
         return [q, x, measured, row_gram(J).sigma_min, held, damped]
 
     def _measured(self, plant: Plant, i: int) -> Tensor:
@@ -296,9 +292,8 @@ class Tracker(Portable):
         earlier rows are not lost.
         """
         try:
-            return self._settings.points(plant(self.q), "tip", self._like, lead="")[
-                None
-            ]
+            tip = plant(self.q)
+            return self._settings.points(tip, "tip", self._like, lead="")[None]
         except Exception as error:
             warnings.warn(
                 f"`plant` failed at point {i}: {error!r}; its tip is NaN.", stacklevel=7
@@ -325,8 +320,9 @@ class _InTorch:
         x, J = self._settings.evaluate(q)
         self._offset = x.new_zeros(1, sum(self.task.parts))  # last measured minus model
         unknown = torch.full_like(self._offset, math.nan)
-        none = torch.zeros_like(q)
-        step = StepRows(dq, unknown[:, 0], none[:, 0], none > 0.0)
+        undamped = torch.zeros_like(q[:, 0])
+        free = torch.zeros_like(q, dtype=torch.bool)
+        step = StepRows(dq, unknown[:, 0], undamped, free)
         self._period = self._settings.dt  # of the last step
         self._last = Tick(q, x, J, unknown, step)
 
@@ -364,7 +360,9 @@ class _InTorch:
                 self._offset = torch.where(finite, offset, self._offset)
         seconds = period or settings.dt
         last = self._last.step.dq * (seconds / self._period)
-        at = None if settings.tip_limits is None else x + self._offset
+        at = None
+        if settings.tip_limits is not None:
+            at = x + self._offset
         step = control_step(settings, self._q, J, used, feed_forward, seconds, last, at)
         if self._memory is not None:
             self._offset = math.exp(-seconds / self._memory) * self._offset
