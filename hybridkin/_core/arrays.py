@@ -49,7 +49,8 @@ def as_tensor(
         raise ValueError(
             f"`{name}` must be a dense tensor that holds real numbers, got {got}."
         )
-    return value.detach() if value.dtype == torch.float32 else value.detach().double()
+    value = value.detach()
+    return value if value.dtype == torch.float32 else value.double()
 
 
 def real_array(value: Numbers | Transform, name: str) -> NDArray:
@@ -71,9 +72,12 @@ def real_array(value: Numbers | Transform, name: str) -> NDArray:
             kind = np.float32 if array.dtype == np.float32 else np.float64
             return np.require(array, kind, ["C", "W"])
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        kind = TypeError if type(error) is TypeError else ValueError
         need = f"`{name}` must be numeric, got {value!r:.200} ({error})."
-        raise (TypeError if type(error) is TypeError else ValueError)(need) from error
-    hint = " Complex data not supported." if array.dtype.kind == "c" else ""
+        raise kind(need) from error
+    hint = ""
+    if array.dtype.kind == "c":
+        hint = " Complex data not supported."
     raise ValueError(f"`{name}` must be numeric, got {value!r:.200}.{hint}")
 
 
@@ -92,10 +96,10 @@ def number(value: Any, name: str) -> float:
 
 def whole(value: object, name: str, least: int = 1, most: float = math.inf) -> int:
     """Return a caller's whole number between `least` and `most`."""
-    if not isinstance(value, (int, np.integer)) or not least <= value <= most:
-        need = f"at least {least}" if most == math.inf else f"{least} to {most}"
-        raise ValueError(f"`{name}` must be {need}, a whole number, got {value!r:.80}.")
-    return int(value)
+    if isinstance(value, (int, np.integer)) and least <= value <= most:
+        return int(value)
+    need = f"at least {least}" if most == math.inf else f"{least} to {most}"
+    raise ValueError(f"`{name}` must be {need}, a whole number, got {value!r:.80}.")
 
 
 def random_generator(
@@ -141,15 +145,18 @@ def check_shape(
     sizes = [*map(str, need)]
     axes = got
     if sizes[:1] == ["..."]:
-        sizes = sizes[1:]
+        del sizes[0]
         axes = got[max(0, len(got) - len(sizes)) :]
-    lengths: dict[str, int] = {}
     matches = len(sizes) == len(axes)
+    lengths: dict[str, int] = {}
     for size, length in zip(sizes, axes, strict=False):
-        expected = int(size) if size.isdigit() else lengths.setdefault(size, length)
-        matches &= length == expected
+        if size.isdigit():
+            lengths[size] = int(size)
+        matches &= length == lengths.setdefault(size, length)
     if not matches:
-        shape = ", ".join(map(str, need)) + "," * (len(need) == 1)
+        shape = ", ".join(map(str, need))
+        if len(need) == 1:
+            shape += ","
         reason = f"; {why}" if why else ""
         raise ValueError(f"`{name}` must have shape ({shape}), got {got}{reason}.")
 
@@ -166,7 +173,9 @@ def shaped(
     `length` replaces the first entry of `need`. NaN is allowed.
     """
     array = np.array(real_array(value, name), dtype=float)
-    check_shape(array, name, need if length is None else (length, *need[1:]), why)
+    if length is not None:
+        need = (length, *need[1:])
+    check_shape(array, name, need, why)
     return array
 
 
@@ -227,5 +236,8 @@ def give_back(
     results: Iterable[Tensor], lead: tuple[int, ...], as_numpy: bool
 ) -> list[Any]:
     """Return rows (N, ...) in the caller's batch shape and array type."""
-    shaped = [a.reshape((*lead, *a.shape[1:])) for a in results]
-    return [as_array(a) for a in shaped] if as_numpy else shaped
+    arrays = []
+    for rows in results:
+        array = rows.reshape((*lead, *rows.shape[1:]))
+        arrays.append(as_array(array) if as_numpy else array)
+    return arrays

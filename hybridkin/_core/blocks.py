@@ -25,9 +25,8 @@ def in_blocks(
         return function(q)  # which raises
     lead = q.shape[:-1]
     blocks = q.reshape(math.prod(lead), q.shape[-1]).split(size)
-    by_block = [function(rows) for rows in blocks]
     results = []
-    for parts in zip(*by_block, strict=True):
+    for parts in zip(*map(function, blocks), strict=True):
         # Flattened, because a tensor of many axes in transposed memory is slow to join.
         whole = torch.cat([part.flatten(1) for part in parts])
         results.append(whole.reshape(*lead, *parts[0].shape[1:]))

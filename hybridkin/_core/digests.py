@@ -15,13 +15,16 @@ def row_digests(q: ArrayLike, x: ArrayLike) -> NDArray[np.float64]:
     The numbers are integers below 2^53, so float64 arrays hold them exactly. Values are first
     rounded to micrometres; only the position of a pose is used.
     """
-    commands = np.atleast_2d(np.asarray(q, dtype=np.float64))
-    positions = np.atleast_2d(np.asarray(x, dtype=np.float64))[:, :3]
-    rounded = np.rint(np.hstack([commands, positions]) / _STEP)
+    positions = np.atleast_2d(x)[:, :3]
+    columns = np.hstack([np.atleast_2d(q), positions]).astype(np.float64)
     # Adding zero turns -0 into 0: the two are equal but have different bits.
-    cells = (rounded + 0.0).view(np.uint64)
+    rounded = np.rint(columns / _STEP) + 0.0
+    cells = rounded.view(np.uint64)
     digests = np.zeros(len(cells), dtype=np.uint64)
-    for column in cells.T:  # each round is one-to-one on 64 bits: multiply, then shift
-        digests = (digests ^ column) * _ODD
+    for column in cells.T:
+        # One-to-one on 64 bits: multiply, then shift.
+        digests ^= column
+        digests *= _ODD
         digests ^= digests >> np.uint64(32)
-    return (digests >> np.uint64(11)).astype(np.float64)
+    digests >>= np.uint64(11)
+    return digests.astype(np.float64)

@@ -29,12 +29,14 @@ class Directions(NamedTuple):
 
     def projection(self) -> tuple[NDArray, NDArray]:
         """Return M (n, n) and c (n,): q @ M + c is the part of q along the moved directions."""
-        M = (self.moved @ self.moved.T) * self.scale / self.scale[:, None]
+        along = self.moved @ self.moved.T
+        M = along * self.scale / self.scale[:, None]
         return M, self.mean - self.mean @ M
 
     def normals(self) -> NDArray:
         """Return orthonormal columns (n, n - k), normal to the plane in which the rows lie."""
-        return np.linalg.qr(self.still / self.scale[:, None])[0]
+        normals, _ = np.linalg.qr(self.still / self.scale[:, None])
+        return normals
 
 
 def moved_directions(X: NDArray) -> Directions:
@@ -49,10 +51,16 @@ def moved_directions(X: NDArray) -> Directions:
     half = 0.5 * np.ptp(X, axis=0)
     size = np.abs(X).max(axis=0)
     moves = half > _ROUNDING * size
-    scale = np.where(moves, half, max(half.max(), _POINT * size.max(), _POINT**2))
+    largest = max(half.max(), _POINT * size.max(), _POINT**2)
+    scale = np.where(moves, half, largest)
+
+    # Principal axes of the scaled rows, and their sums of squares.
     rows = np.where(moves, (X - mean) / scale, 0.0)
     squares, axes = np.linalg.eigh(rows.T @ rows)
-    rounding = len(X) / 12.0 * (axes.T**2 @ (_steps(X) / scale) ** 2)
+
+    # Numbers rounded to steps have a variance of a twelfth of the squared step.
+    step_squares = (_steps(X) / scale) ** 2
+    rounding = len(X) / 12.0 * (axes.T**2 @ step_squares)
     least = np.maximum(_AS_ROUNDED * rounding, _EXCITED**2 * squares[-1])
     excited = squares > least
     return Directions(mean, scale, axes[:, excited], axes[:, ~excited])
@@ -63,9 +71,12 @@ def _steps(X: NDArray) -> NDArray:
     steps = np.zeros(X.shape[1])
     for j, column in enumerate(X.T):
         gaps = np.diff(np.unique(column))
-        if len(gaps) > 1:
-            counts = gaps / gaps.min()
-            steps[j] = gaps.min() * (np.abs(counts - counts.round()) < _COUNTS).all()
+        if len(gaps) < 2:
+            continue
+        step = gaps.min()
+        counts = gaps / step
+        if (np.abs(counts - counts.round()) < _COUNTS).all():
+            steps[j] = step
     return steps
 
 
@@ -77,40 +88,49 @@ def few_terms(directions: NDArray) -> NDArray:
     (K, P) = directions.shape
     if K < 2:
         return directions
-    cost = np.concatenate([np.zeros(K), np.ones(P)])
-    eye = np.eye(P)
-    above = np.block([[directions.T, -eye], [-directions.T, -eye]])
+    # Unknowns: coefficients (K,) of the directions, and bounds (P,) of the absolute entries.
+    cost = np.repeat([0.0, 1.0], [K, P])
+    entries = np.hstack([directions.T, np.zeros((P, P))])
+    bounds = np.hstack([np.zeros((P, K)), np.eye(P)])
+    above = np.vstack([entries - bounds, -entries - bounds])
 
     def shortest(entry: NDArray) -> NDArray:
-        equal = np.concatenate([entry, np.zeros(P)])[None]
-        solution = linprog(
-            cost, above, np.zeros(2 * P), equal, [1.0], bounds=(None, None)
-        ).x
-        # if it fails, the nearest vector.
-        a = entry if solution is None else solution[:K]
-        return a / np.linalg.norm(a)
+        fixed = np.pad(entry, (0, P))[None]
+        zeros = np.zeros(2 * P)
+        solution = linprog(cost, above, zeros, fixed, [1.0], bounds=(None, None))
+        coefficients = entry  # the nearest vector, if there is no solution
+        if solution.x is not None:
+            coefficients = solution.x[:K]
+        return coefficients / np.linalg.norm(coefficients)
 
-    columns = directions.T[np.linalg.norm(directions, axis=0) > _INSIDE]
-    candidates = [shortest(entry) for entry in columns]
-    candidates.sort(
-        key=lambda a: np.abs(a @ directions).sum() / np.abs(a @ directions).max()
-    )
-    chosen: list[NDArray] = []
+    def length(coefficients: NDArray) -> float:
+        sizes = np.abs(coefficients @ directions)
+        return sizes.sum() / sizes.max()
+
+    determined = np.linalg.norm(directions, axis=0) > _INSIDE
+    candidates = [shortest(entry) for entry in directions.T[determined]]
+    candidates.sort(key=length)
+    chosen = np.empty((0, K))
     while len(chosen) < K:
-        taken = np.array(chosen).reshape(-1, K)
-        remaining = np.linalg.svd(taken)[2][len(chosen) :]
-        free = [a for a in candidates if np.linalg.norm(remaining @ a) > _INSIDE]
-        chosen.append(free[0] if free else shortest(remaining[0]))
-    return np.array(chosen) @ directions
+        remaining = np.linalg.svd(chosen)[2][len(chosen) :]
+        for candidate in candidates:
+            if np.linalg.norm(remaining @ candidate) > _INSIDE:
+                break
+        else:
+            candidate = shortest(remaining[0])
+        chosen = np.vstack([chosen, candidate])
+    return chosen @ directions
 
 
 def in_terms(directions: NDArray, names: Sequence[str]) -> str:
     """Return directions of q (n, k) in words, each by few of the named actuators."""
     sentences = []
     for move in few_terms(directions.T):
-        lead = np.argmax(np.abs(move) > 0.5 * np.abs(move).max())
+        sizes = np.abs(move)
+        lead = np.argmax(sizes > 0.5 * sizes.max())
+        parts = move / move[lead]
         words = []
-        for name, part in zip(names, move / move[lead], strict=True):
+        for name, part in zip(names, parts, strict=True):
             if abs(part) > _MENTIONED:
                 words.append(f"{part:+.2g} {name}")
         sentences.append(" ".join(words))

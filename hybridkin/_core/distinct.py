@@ -43,21 +43,30 @@ def distinct_rows(
     """
     columns = [as_array(X), as_array(y)]
     if groups is not None:
-        columns.append(np.unique(groups, return_inverse=True)[1])
+        _, motions = np.unique(groups, return_inverse=True)
+        columns.append(motions)
     rows = np.column_stack(columns).astype(np.float64)
     rows += 0.0  # -0.0 equals 0.0
-    times = np.ones(len(rows)) if weights is None else as_array(weights)
+    times = np.ones(len(rows))
+    if weights is not None:
+        times = as_array(weights)
+
+    # One key for each row that counts; equal rows have equal keys.
     if runs:
         counted = np.arange(len(rows))
-        keys = np.cumsum(np.append(True, (rows[1:] != rows[:-1]).any(axis=1)))
+        differs = (rows[1:] != rows[:-1]).any(axis=1)
+        keys = np.cumsum(np.append(True, differs))
     else:
         counted = np.flatnonzero(times)
         whole_row = np.dtype((np.void, rows.itemsize * rows.shape[1]))
         keys = rows[counted].view(whole_row)[:, 0]
+
+    # The different keys in order of first occurrence.
     _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
     order = np.argsort(first)
+    rank = np.argsort(order)
     place = np.full(len(rows), -1)
-    place[counted] = np.argsort(order)[inverse]
+    place[counted] = rank[inverse]
     counts = np.bincount(place[counted], weights=times[counted])
     first = counted[first[order]]
     if (counts == 1.0).all():
@@ -67,4 +76,5 @@ def distinct_rows(
 
 def at_place(values: NDArray, place: NDArray) -> NDArray:
     """Return values (K, ...) of the different rows for all rows (N, ...), NaN for weight 0."""
-    return np.append(values, np.full_like(values[:1], np.nan), axis=0)[place]
+    missing = np.full_like(values[:1], np.nan)
+    return np.append(values, missing, axis=0)[place]

@@ -44,14 +44,19 @@ def numbers(values: Numbers) -> str:
     if array.size > _MOST:
         return f"array of shape {array.shape}"
     rows = np.round(array, _ROUNDING) + 0.0  # no negative zeros
-    lines = rows.reshape(-1, rows.shape[-1]) if rows.ndim > 1 else [np.ravel(rows)]
-    return "\n".join(", ".join(f"{value:.4g}" for value in line) for line in lines)
+    n_columns = np.atleast_1d(rows).shape[-1]
+    lines = []
+    for line in rows.reshape(-1, n_columns):
+        lines.append(", ".join(f"{value:.4g}" for value in line))
+    return "\n".join(lines)
 
 
 def _folding(title: str, rows: Mapping[str, object], state: str = "") -> str:
-    body = "\n".join(
-        _row(name, value) for name, value in rows.items() if value is not None
-    )
+    lines = []
+    for name, value in rows.items():
+        if value is not None:
+            lines.append(_row(name, value))
+    body = "\n".join(lines)
     return (
         f"<details{state}><summary>{escape(title)}</summary>"
         f"<table><tbody>\n{body}\n</tbody></table></details>"

@@ -74,9 +74,10 @@ class Plan:
         self.n_inputs, self.n_outputs = self.lengths(self.root)
         self._code[: len(MOST)] = self.largest.values()
         self.code = np.array(self._code, dtype=np.int32)
+        # The numbers begin with a cache line; a group of zeros follows them.
         memory = np.zeros(self._length + 2 * HK_GROUP)
-        start = -memory.ctypes.data // 8 % HK_GROUP  # at the start of a cache line
-        self.data = memory[start : start + self._length + HK_GROUP]
+        first = -memory.ctypes.data // 8 % HK_GROUP
+        self.data = memory[first : first + self._length + HK_GROUP]
         self.data[:-HK_GROUP] = np.concatenate(self._data)
         self.places = [*self._place_of.values()]
         # do not pickle them twice
@@ -102,11 +103,15 @@ class Plan:
         places = [self.node_of(model) for model in models]
         if len(places) == 1:
             return places[0]
-        if any(self.kind(place) in ("stacked", "moved", "shifted") for place in places):
-            raise NoKernel("models side by side must not hold several or another one")
-        lengths = [self.lengths(place) for place in places]
-        m = sum(m for _, m in lengths)
-        return self.node("stacked", lengths[0][0], m, [], len(places), *places)
+        n = 0
+        n_outputs = 0
+        for place in places:
+            if self.kind(place) in ("stacked", "moved", "shifted"):
+                need = "models side by side must not hold several or another one"
+                raise NoKernel(need)
+            n, m = self.lengths(place)
+            n_outputs += m
+        return self.node("stacked", n, n_outputs, [], len(places), *places)
 
     def node(
         self,
@@ -135,16 +140,19 @@ class Plan:
         """
         self.limit("actuators", n)
         self.limit("outputs", m)
-        flat = [np.asarray(part, dtype=np.float64).ravel() for part in numbers]
-        key = (kind, n, m, *entries, *(part.tobytes() for part in flat))
+        parts = [np.empty(0), *map(np.ravel, numbers)]
+        flat = np.concatenate(parts, dtype=np.float64)
+        key = (kind, n, m, *entries, flat.tobytes())
         if key in self._place_of:
             return self._place_of[key]
-        place = self._place_of[key] = len(self._code)
+        place = len(self._code)
+        self._place_of[key] = place
         if aligned:
-            self._append(np.zeros(-(self._length + 2 * n + m + m * n) % HK_GROUP))
-        self._code += [1 + KINDS.index(kind), n, m, self._length, *map(int, entries)]
-        for part in flat:
-            self._append(part)
+            end = self._length + 2 * n + m + m * n
+            self._append(np.zeros(-end % HK_GROUP))
+        number = 1 + KINDS.index(kind)
+        self._code += [number, n, m, self._length, *map(int, entries)]
+        self._append(flat)
         return place
 
     def _append(self, numbers: NDArray) -> None:

@@ -11,10 +11,8 @@ from hybridkin._core.stumpff import stumpff
 
 def cross_matrix(vector: Tensor) -> Tensor:
     """Return the cross-product matrices (..., 3, 3) of vectors (..., 3)."""
-    x, y, z = vector.unbind(-1)
-    zero = torch.zeros_like(x)
-    entries = [zero, -z, y, z, zero, -x, -y, x, zero]
-    return torch.stack(entries, dim=-1).unflatten(-1, (3, 3))
+    axes = identity(3, vector).expand(*vector.shape, 3)
+    return torch.linalg.cross(vector[..., None], axes, dim=-2)  # column by column
 
 
 def rotation(phi: Tensor) -> tuple[Tensor, Tensor]:
@@ -24,10 +22,13 @@ def rotation(phi: Tensor) -> tuple[Tensor, Tensor]:
     See Barfoot, State Estimation for Robotics (2017), section 7.1.
     """
     K = cross_matrix(phi)
+    K_squared = K @ K
     eye = identity(3, phi)
-    functions = stumpff(phi.square().sum(-1)[..., None, None])
-    f, g, c3 = functions.f, functions.g, functions.c3
-    return eye + f * K + g * K @ K, eye + g * K + c3 * K @ K
+    angle_squared = phi.square().sum(-1)[..., None, None]
+    _, f, g, c3, _ = stumpff(angle_squared)
+    turned = eye + f * K + g * K_squared
+    left_jacobian = eye + g * K + c3 * K_squared
+    return turned, left_jacobian
 
 
 def nearest_rotation(moments: Tensor) -> tuple[Tensor, Tensor]:
@@ -41,9 +42,12 @@ def nearest_rotation(moments: Tensor) -> tuple[Tensor, Tensor]:
     Umeyama, IEEE PAMI 13 (1991): least squares over rotations without mirror images.
     """
     left, stretch, right = torch.linalg.svd(moments)
+    # The least stretched axis is reversed where the product would be a mirror image.
     sign = torch.ones_like(stretch)
     sign[..., 2] = torch.linalg.det(left @ right).sign()
-    return (left * sign[..., None, :]) @ right, (stretch * sign).sum(-1)
+    nearest = (left * sign[..., None, :]) @ right
+    trace = (stretch * sign).sum(-1)
+    return nearest, trace
 
 
 def rigid_motion(
@@ -55,13 +59,16 @@ def rigid_motion(
     """
     if weights is None:
         weights = points.new_ones(len(points))
-    weights = (weights / weights.sum())[:, None]
-    center = (weights * points).sum(0)
-    target_center = (weights * targets).sum(0)
-    moments = (weights * (targets - target_center)).mT @ (points - center)
+    weights = weights / weights.sum()
+    center = weights @ points
+    target_center = weights @ targets
+    weighted_targets = weights[:, None] * (targets - target_center)
+    moments = weighted_targets.mT @ (points - center)
+    turned, _ = nearest_rotation(moments)
+
     motion = identity(4, points)
-    motion[:3, :3] = nearest_rotation(moments)[0]
-    motion[:3, 3] = target_center - motion[:3, :3] @ center
+    motion[:3, :3] = turned
+    motion[:3, 3] = target_center - turned @ center
     return motion
 
 
@@ -72,20 +79,26 @@ def rotation_vector(R: Tensor) -> Tensor:
     4 v v' = R + R' + (1 - tr R) 1. The largest of its four components is never small; the row of
     these products with it is divided by its norm. Then phi = 2 atan2(|v|, w) v / |v|.
     """
+    # The products 4 (w, v) (w, v)'.
     trace = R.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
     skew = R - R.mT
-    vee = torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], dim=-1)
-    column = vee[..., None]
-    squares = R + R.mT + (1.0 - trace) * identity(3, R)
-    first = torch.cat([1.0 + trace, column.mT], dim=-1)
-    products = torch.cat([first, torch.cat([column, squares], dim=-1)], dim=-2)
-    largest = products.diagonal(dim1=-2, dim2=-1).argmax(-1)[..., None, None]
-    quaternion = products.take_along_dim(largest, dim=-2)[..., 0, :]
-    quaternion = nn.functional.normalize(quaternion, dim=-1)
-    quaternion = torch.where(quaternion[..., :1] < 0.0, -quaternion, quaternion)
-    w, v = quaternion.split([1, 3], dim=-1)
+    v_products = R + R.mT + (1.0 - trace) * identity(3, R)
+    wv_products = skew[..., [2, 0, 1], [1, 2, 0]][..., None]
+    w_row = torch.cat([1.0 + trace, wv_products.mT], dim=-1)
+    v_rows = torch.cat([wv_products, v_products], dim=-1)
+    products = torch.cat([w_row, v_rows], dim=-2)
+
+    # The row of the largest component, with w >= 0.
+    squares = products.diagonal(dim1=-2, dim2=-1)
+    largest = squares.argmax(-1)[..., None, None]
+    row = products.take_along_dim(largest, dim=-2)[..., 0, :]
+    row = torch.where(row[..., :1] < 0.0, -row, row)
+    w, v = nn.functional.normalize(row, dim=-1).split([1, 3], dim=-1)
+
+    # Near zero the series of 2 asin(|v|) / |v|.
     square = v.square().sum(-1, keepdim=True)
     tiny = square < 1e-12
     size = torch.where(tiny, 1.0, square).sqrt()
-    ratio = torch.where(tiny, 2.0 + square / 3.0, 2.0 * torch.atan2(size, w) / size)
-    return ratio * v
+    near = 2.0 + square / 3.0
+    far = 2.0 * torch.atan2(size, w) / size
+    return torch.where(tiny, near, far) * v

@@ -8,14 +8,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-_SERIES_END = (
-    1.0  # [rad^2]; above it the trigonometric forms lose no digits by cancellation
-)
+# [rad^2]; above it the trigonometric forms lose no digits by cancellation
+_SERIES_END = 1.0
 # Coefficients of c3 and c4 by powers of s, highest first; float32 needs fewer.
 _DEGREE = {torch.float64: 7, torch.float32: 4}
-_SERIES = [
-    [(-1.0) ** j / math.factorial(2 * j + k) for k in (3, 4)] for j in range(7, -1, -1)
-]
+_SERIES = []
+for _j in range(7, -1, -1):
+    _sign = (-1.0) ** _j
+    _SERIES.append([_sign / math.factorial(2 * _j + k) for k in (3, 4)])
 
 
 class Stumpff(NamedTuple):
@@ -51,9 +51,8 @@ def stumpff(s: Tensor) -> Stumpff:
     """
     # c3 and c4 together need one multiply-add per power, which is fast for small batches too.
     # Not s.new_tensor: before torch 2.5 it fails in functional transforms.
-    powers = torch.tensor(
-        _SERIES[-1 - _DEGREE.get(s.dtype, 7) :], dtype=s.dtype, device=s.device
-    )
+    series = _SERIES[-1 - _DEGREE.get(s.dtype, 7) :]
+    powers = torch.tensor(series, dtype=s.dtype, device=s.device)
     powers = powers.reshape(-1, 2, *(1,) * s.ndim).unbind()
     near = s.clamp(max=_SERIES_END)
     both = powers[0]

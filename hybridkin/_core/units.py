@@ -26,7 +26,7 @@ def span_message(
     name: str, tips: Tensor, reach: float, spans: float = _SPANS
 ) -> str | None:
     """Return a warning if tips (N, 3) span more than `spans` times the reach of the robot."""
-    span = float((tips.amax(dim=0) - tips.amin(dim=0)).max())
+    span = _span(tips)
     if span <= spans * reach:
         return None
     return (
@@ -39,16 +39,20 @@ def motion_message(
     name: str, tips: Tensor, predicted: Tensor, reach: float
 ) -> str | None:
     """Return a warning if tips (N, 3) span 20 times what a model predicts, and two reaches."""
-    moved = float((predicted.amax(dim=0) - predicted.amin(dim=0)).detach().max())
-    return span_message(name, tips, reach, min(_SPANS, max(2.0, 20.0 * moved / reach)))
+    moved = 20.0 * _span(predicted) / reach
+    return span_message(name, tips, reach, min(_SPANS, max(2.0, moved)))
+
+
+def _span(tips: Tensor) -> float:
+    """Return the largest side of the box around tips (N, 3) [m]."""
+    sides = tips.amax(dim=0) - tips.amin(dim=0)
+    return float(sides.detach().max())
 
 
 def millimetres_message(name: str, value: Tensor, limit: float) -> str | None:
     """Return a warning if values are too large to be metres."""
-    advice = (
-        ", which looks like millimetres; hybridkin works in metres: divide by 1000."
-    )
-    return _too_large(name, value, limit, advice)
+    looks = ", which looks like millimetres; hybridkin works in metres: divide by 1000."
+    return _too_large(name, value, limit, looks)
 
 
 def warn_millimetres(name: str, value: Tensor, limit: float) -> None:
@@ -60,12 +64,13 @@ def warn_millimetres(name: str, value: Tensor, limit: float) -> None:
 
 def degrees_message(name: str, turns: Tensor, factor: float = 1.0) -> str | None:
     """Return a warning if joint angles are too large to be radians."""
-    advice = (
+    looks = (
         " on a revolute joint, which looks like degrees; hybridkin works in radians."
     )
-    return _too_large(name, turns, factor * _TURNS, advice)
+    return _too_large(name, turns, factor * _TURNS, looks)
 
 
-def _too_large(name: str, value: Tensor, limit: float, what: str) -> str | None:
-    largest = float(value.max()) if value.numel() else 0.0
-    return None if largest <= limit else f"`{name}` reaches {largest:.4g}{what}"
+def _too_large(name: str, value: Tensor, limit: float, looks: str) -> str | None:
+    if not (value > limit).any():
+        return None
+    return f"`{name}` reaches {float(value.max()):.4g}{looks}"

@@ -49,7 +49,8 @@ class Segments(NamedTuple):
 def segments_of(arcs: Tensor, offsets: Tensor) -> Segments:
     """Return the segments with arcs (3 S, ...), all lengths, x- then y-bendings, and offsets."""
     length, x, y = arcs.chunk(3)
-    return Segments(length, x, y, *stumpff(fma(x * x, y, y)), offsets)
+    functions = stumpff(fma(x * x, y, y))
+    return Segments(length, x, y, *functions, offsets)
 
 
 def _in_start_frame(v: Vector, segment: Segments, length: Tensor | float) -> Vector:
@@ -57,17 +58,16 @@ def _in_start_frame(v: Vector, segment: Segments, length: Tensor | float) -> Vec
     x, y, z = v
     along = length - fma(segment.x * x, segment.y, y)  # e
     across = fma(segment.g * along, segment.f, z)  # m
-    return (
-        fma(x, segment.x, across),
-        fma(y, segment.y, across),
-        fma(segment.f * along, segment.c, z),
-    )
+    start_x = fma(x, segment.x, across)
+    start_y = fma(y, segment.y, across)
+    start_z = fma(segment.f * along, segment.c, z)
+    return start_x, start_y, start_z
 
 
 def _tips(segments: list[Segments], beside: Vector) -> list[Vector]:
     """Return the tip in the start frame of every segment, and in the frame at the end."""
     zero = torch.zeros_like(segments[0].length)
-    tip: Vector = [zero + part for part in beside]
+    tip: Vector = [zero + component for component in beside]
     tips = [tip]
     for segment in reversed(segments):
         x, y, z = tip
@@ -81,7 +81,8 @@ def tip(segments: Segments, beside: Vector) -> Tensor:
 
     `beside` is its position (3, ...) in the frame after the last offset [m].
     """
-    return torch.stack([*_tips(segments.each(), beside)[0]])
+    in_base, *_ = _tips(segments.each(), beside)
+    return torch.stack([*in_base])
 
 
 class WorkOfGravity:
@@ -100,27 +101,31 @@ class WorkOfGravity:
         self._after = after[:, None]
         self._each = segments.each()
         self._down = down
-        zero = torch.zeros_like(segments.length[0])
-        moment: Vector = [zero, zero, zero]
-        moments = []
+
+        # Moments of the weights of the arcs themselves, at their centres.
         half = self._half(segments)
-        centres = torch.stack([half.g * half.x, half.g * half.y, half.f]) * half.length
+        direction = torch.stack([half.g * half.x, half.g * half.y, half.f])
+        centres = (half.length * direction).unbind(1)
+
+        # Then from the last arc to the base.
+        moment = torch.zeros_like(centres[0])
+        moments = []
         for k in range(len(self._each) - 1, -1, -1):
+            segment = self._each[k]
             x, y, z = moment
-            at_end = (x, y, z + after[k] * self._each[k].offset)
-            moments.append(torch.stack([*at_end]))
-            length = after[k] * self._each[k].length
-            moved = _in_start_frame(at_end, self._each[k], length)
-            moment = [a + b for a, b in zip(moved, centres[:, k], strict=True)]
+            at_end = torch.stack([x, y, z + after[k] * segment.offset])
+            moments.append(at_end)
+            length = after[k] * segment.length
+            moved = _in_start_frame(at_end.unbind(), segment, length)
+            moment = torch.stack([*moved]) + centres[k]
         self._moments = torch.stack(moments[::-1], dim=1)  # (3, A, N)
-        self.value = torch.tensordot(down, torch.stack([*moment]), 1)
+        self.value = torch.tensordot(down, moment, 1)
 
     def _half(self, segments: Segments) -> Segments:
         """Return the first halves of the arcs, with lengths times the weights of the arcs."""
-        x = 0.5 * segments.x
-        y = 0.5 * segments.y
-        length = 0.5 * segments.length * self._weights
-        return Segments(length, x, y, *stumpff(fma(x * x, y, y)), segments.offset)
+        length = self._weights * segments.length
+        halves = 0.5 * torch.cat([length, segments.x, segments.y])
+        return segments_of(halves, segments.offset)
 
     def _local_columns(self, segments: Segments) -> Tensor:
         """Return derivatives (3, 3, A, N) of moments in start frames, by l, b_x, b_y, as vectors.
@@ -128,20 +133,18 @@ class WorkOfGravity:
         The moments in the end frames stay the same.
         """
         heavy = segments._replace(length=self._after * segments.length)
-        later = torch.stack(_columns(self._moments.unbind(), heavy)).unflatten(
-            0, (3, 3)
-        )
+        later = _vectors(_columns(self._moments.unbind(), heavy))
         half = self._half(segments)
         zero = torch.zeros_like(half.x)
-        centre = torch.stack(_columns((zero, zero, zero), half)).unflatten(0, (3, 3))
-        by_length = self._after * later[0] + 0.5 * self._weights * centre[0]
-        by_bending = later[1:] + 0.5 * centre[1:]
-        return torch.cat([by_length[None], by_bending])
+        centre = 0.5 * _vectors(_columns((zero, zero, zero), half))
+        by_length = self._after * later[:1] + self._weights * centre[:1]
+        by_bending = later[1:] + centre[1:]
+        return torch.cat([by_length, by_bending])
 
     def _downs(self) -> Tensor:
         """Return the direction of gravity in the start frames of the arcs, (3, A, N)."""
         zero = torch.zeros_like(self._each[0].length)
-        down: Vector = [zero + part for part in self._down]
+        down: Vector = [zero + component for component in self._down]
         downs = []
         for segment in self._each:
             downs.append(torch.stack([*down]))
@@ -157,25 +160,23 @@ class WorkOfGravity:
     def hessian(self) -> Tensor:
         """Return the second derivative (3 A, 3 A, N) by the arcs."""
         downs = self._downs()
-        columns = self._local_columns(self.segments).transpose(
-            0, 1
-        )  # (3 vector, 3, A, N)
-        n_arcs = len(self._each)
-        turned = columns[:, :, :0]  # of later arcs, in the end frame of the present one
+        columns = self._local_columns(self.segments)
+        columns = columns.transpose(0, 1)  # (3 vector, 3, A, N)
+
+        # Of each arc with the later ones: the bending turns their moments.
+        later = columns[:, :, :0]  # in the end frame of the present arc
         rows = []
-        for k in range(n_arcs - 1, -1, -1):
+        for k in range(len(self._each) - 1, -1, -1):
             segment = self._each[k]
-            turning = _columns(
-                turned.unbind(), segment._replace(length=0.0 * segment.length)
-            )
-            by_bending = torch.stack(turning[3:]).unflatten(0, (2, 3))
+            weightless = segment._replace(length=torch.zeros_like(segment.length))
+            by_bending = _vectors(_columns(later.unbind(), weightless)[3:])
             by_later = torch.einsum("jciln,cn->jiln", by_bending, downs[:, k])
             rows.append(nn.functional.pad(by_later, (0, 0, k + 1, 0, 0, 0, 1, 0)))
-            moved = torch.stack([*_in_start_frame(turned.unbind(), segment, 0.0)])
-            turned = torch.cat([columns[:, :, k : k + 1], moved], dim=2)
-        upper = torch.stack(rows[::-1], dim=1).transpose(1, 2)  # (3, 3, A, A, N)
-        upper = upper.transpose(1, 2).flatten(2, 3).flatten(0, 1)
-        within = self._within(downs).permute(0, 1, 3, 2).diag_embed()  # (3, 3, N, A, A)
+            later = _with_later(columns[:, :, k : k + 1], later, segment)
+        upper = torch.stack(rows[::-1], dim=1)  # (3, A, 3, A, N)
+        upper = upper.flatten(2, 3).flatten(0, 1)
+
+        within = self._within(downs).transpose(2, 3).diag_embed()  # (3, 3, N, A, A)
         within = within.permute(0, 3, 1, 4, 2).flatten(2, 3).flatten(0, 1)
         return upper + upper.transpose(0, 1) + within
 
@@ -207,20 +208,31 @@ def tip_and_columns(
     3 S columns of angular velocity, `rigid` adds S columns for the offsets.
     """
     each = segments.each()
-    tips = _tips(each, beside)
-    x, y, z = (torch.stack(parts) for parts in zip(*tips[1:], strict=True))
+    in_base, *at_ends = _tips(each, beside)
+    x, y, z = map(torch.stack, zip(*at_ends, strict=True))
     entries = _columns((x, y, z + segments.offset), segments)
     if angular:
         entries += _spins(segments)
     if rigid:  # the tangents
         entries += [segments.f * segments.x, segments.f * segments.y, segments.c]
+
     # All columns in the start frames of their own segments, then turned by all earlier segments.
-    columns = torch.stack(entries).unflatten(0, (-1, 3)).transpose(0, 1)
+    columns = _vectors(entries).transpose(0, 1)
     turned = columns[:, :, -1:]
     for k in range(len(each) - 2, -1, -1):
-        later = torch.stack([*_in_start_frame(turned.unbind(), each[k], 0.0)])
-        turned = torch.cat([columns[:, :, k : k + 1], later], dim=2)
-    return torch.stack([*tips[0]]), turned.flatten(1, 2)
+        turned = _with_later(columns[:, :, k : k + 1], turned, each[k])
+    return torch.stack([*in_base]), turned.flatten(1, 2)
+
+
+def _vectors(entries: list[Tensor]) -> Tensor:
+    """Return vectors (K, 3, ...), given as x, y, z one after the other."""
+    return torch.stack(entries).unflatten(0, (-1, 3))
+
+
+def _with_later(columns: Tensor, later: Tensor, segment: Segments) -> Tensor:
+    """Return columns of a segment, and those of all later ones turned into its start frame."""
+    turned = _in_start_frame(later.unbind(), segment, 0.0)
+    return torch.cat([columns, torch.stack([*turned])], dim=2)
 
 
 def _columns(tail: Vector, segments: Segments) -> list[Tensor]:
@@ -241,10 +253,9 @@ def _columns(tail: Vector, segments: Segments) -> list[Tensor]:
     N = fms(slope_f * along, f, z)
     X = fms(M * bx, g, x)
     Y = fms(M * by, g, y)
-    by_length = [g * bx, g * by, f]
     by_bx = [fma(across, bx, X), by * X, fms(N * bx, f, x)]
     by_by = [bx * Y, fma(across, by, Y), fms(N * by, f, y)]
-    return by_length + by_bx + by_by
+    return [g * bx, g * by, f, *by_bx, *by_by]
 
 
 def _spins(segments: Segments) -> list[Tensor]:
@@ -254,8 +265,9 @@ def _spins(segments: Segments) -> list[Tensor]:
     """
     _, x, y, _, _, g, c3, *_ = segments
     zero = torch.zeros_like(x)
-    by_bx = [-c3 * x * y, 1.0 - c3 * y * y, -g * y]
-    by_by = [c3 * x * x - 1.0, c3 * x * y, g * x]
+    xy = c3 * x * y
+    by_bx = [-xy, 1.0 - c3 * y * y, -g * y]
+    by_by = [c3 * x * x - 1.0, xy, g * x]
     return [zero, zero, zero, *by_bx, *by_by]
 
 
@@ -264,12 +276,14 @@ def transforms(length: Tensor, bending: Tensor, offsets: Tensor) -> Tensor:
     c, f, g, _, _ = stumpff(bending.square().sum(-1))
     x, y = bending.unbind(-1)
     zero = torch.zeros_like(x)
-    one = torch.ones_like(x)
     across = length * g + offsets * f
-    x_row = [1.0 - g * x * x, -g * x * y, f * x, across * x]
-    y_row = [-g * x * y, 1.0 - g * y * y, f * y, across * y]
-    z_row = [-f * x, -f * y, c, length * f + offsets * c]
-    entries = x_row + y_row + z_row + [zero, zero, zero, one]
+    along = length * f + offsets * c
+    xy = -g * x * y
+    x_row = [1.0 - g * x * x, xy, f * x, across * x]
+    y_row = [xy, 1.0 - g * y * y, f * y, across * y]
+    z_row = [-f * x, -f * y, c, along]
+    last_row = [zero, zero, zero, torch.ones_like(x)]
+    entries = [*x_row, *y_row, *z_row, *last_row]
     return torch.stack(entries, dim=-1).unflatten(-1, (4, 4))
 
 
@@ -291,16 +305,17 @@ def turned_by_first(arcs: Tensor, slope: Tensor) -> tuple[Tensor, Tensor]:
     """
     length, x, y = arcs.chunk(3)
     d_length, dx, dy = slope.expand(-1, -1, arcs.shape[1]).chunk(3)
-    c = length[0].cos()
-    s = length[0].sin()
+    angle, *lengths = length
+    d_angle, *d_lengths = d_length
+    c = angle.cos()
+    s = angle.sin()
     turned_x = c * x - s * y
     turned_y = s * x + c * y
-    d_angle = d_length[0]
     d_turned_x = c * dx - s * dy - turned_y[:, None] * d_angle
     d_turned_y = s * dx + c * dy + turned_x[:, None] * d_angle
-    lengths = torch.cat([torch.zeros_like(length[:1]), length[1:]])
-    d_lengths = torch.cat([torch.zeros_like(d_length[:1]), d_length[1:]])
-    return (
-        torch.cat([lengths, turned_x, turned_y]),
-        torch.cat([d_lengths, d_turned_x, d_turned_y]),
-    )
+
+    no_length = torch.zeros_like(angle)
+    turned = torch.stack([no_length, *lengths, *turned_x, *turned_y])
+    unchanged = torch.zeros_like(d_angle)
+    d_turned = torch.stack([unchanged, *d_lengths, *d_turned_x, *d_turned_y])
+    return turned, d_turned

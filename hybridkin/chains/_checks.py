@@ -11,12 +11,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hybridkin._core.arrays import Numbers, Transform, real_array, shaped
+from hybridkin._core.arrays import (
+    LARGEST,
+    Numbers,
+    Transform,
+    identity,
+    real_array,
+    shaped,
+)
 from hybridkin._core.units import warn_millimetres
 
-_MOST_UNLIKE = (
-    1000.0  # ratio of radii; more leave too few digits with the routing "base"
-)
+# ratio of radii; more leave too few digits with the routing "base"
+_MOST_UNLIKE = 1000.0
 _TURNS = 4.0 * math.pi  # [rad]; the angle of a tendon is never larger
 
 
@@ -53,6 +59,15 @@ def filled(
     return tensor.expand(shape).clone()
 
 
+def stiffness(value: Numbers, name: str, dtype: torch.dtype, size: int) -> Tensor:
+    """Return one positive stiffness per segment, shape (S,)."""
+    tensor = filled(value, name, dtype, (size,))
+    if not (tensor > 1.0 / LARGEST).all():
+        need = f"must be positive, over {1.0 / LARGEST:g}"
+        raise ValueError(f"`{name}` {need}, got {tensor.tolist()}.")
+    return tensor
+
+
 def arc_geometry(
     radii: Numbers,
     lengths: Any,
@@ -74,15 +89,14 @@ def arc_geometry(
     S = radii.numel()
     counts = actuator_counts(n_actuators, S)
     warn_millimetres("radii", radii, 1.0)
-    each = gains
     if not _is_nested(gains) and np.shape(gains) == (S,):
-        each = np.repeat(real_array(gains, "gains"), counts)
+        gains = np.repeat(real_array(gains, "gains"), counts)
     geometry = {
         "radii": radii,
         "angles": flat_angles(angles, counts, dtype),
         "offsets": filled(offsets, "offsets", dtype, (S,)),
         "rest_bends": filled(rest_bends, "rest_bends", dtype, (S, 2)),
-        "gains": filled(each, "gains", dtype, (sum(counts),)),
+        "gains": filled(gains, "gains", dtype, (sum(counts),)),
         "base": pose(base, "base", dtype),
     }
     extensible = (lengths is None,) * S
@@ -115,7 +129,8 @@ def numeric(
     else:
         array = shaped(value, name, need, length)
     tensor = torch.tensor(array, dtype=dtype, device="cpu")
-    if (not torch.isfinite(tensor).all() and finite) or torch.isnan(tensor).any():
+    valid = torch.isfinite(tensor) if finite else ~torch.isnan(tensor)
+    if not valid.all():
         raise ValueError(f"`{name}` must be finite, got {tensor.tolist()}.")
     return tensor
 
@@ -165,17 +180,18 @@ def flat_angles(
 ) -> Tensor:
     """Return the angles of all actuators, segment by segment, shape (n,)."""
     if angles is None:
-        rows = [2.0 * math.pi * np.arange(n) / n for n in counts]
+        by_segment = [2.0 * math.pi * np.arange(n) / n for n in counts]
     elif _is_nested(angles):
-        rows = angles
+        by_segment = angles
     else:
         values = numeric(angles, "angles", dtype)
-        rows = values if values.ndim == 2 else [values] * len(counts)
-    rows = [numeric(row, "angles", dtype) for row in rows]
-    if tuple(row.numel() for row in rows) != counts:
+        by_segment = values if values.ndim == 2 else [values] * len(counts)
+    rows = [numeric(row, "angles", dtype) for row in by_segment]
+    sizes = [row.numel() for row in rows]
+    if sizes != [*counts]:
         raise ValueError(
-            f"`angles` must hold {list(counts)} angles for the segments, got "
-            f"{[row.numel() for row in rows]}; give shape (n,), (S, n) or one list per segment."
+            f"`angles` must hold {[*counts]} angles for the segments, got {sizes}; give shape "
+            "(n,), (S, n) or one list per segment."
         )
     flat = torch.cat(rows)
     largest = float(flat.abs().max())
@@ -200,10 +216,8 @@ def pose(value: Numbers | Transform | None, name: str, dtype: torch.dtype) -> Te
             f"`{name}` must be one pose of shape (4, 4), got {tuple(matrix.shape)}."
         )
     rotation = matrix[:3, :3]
-    eye = torch.eye(3, dtype=dtype, device=matrix.device)
-    if (rotation.mT @ rotation - eye).abs().max() > 1e-4 or torch.linalg.det(
-        rotation
-    ) < 0:
+    not_orthonormal = rotation.mT @ rotation - identity(3, matrix)
+    if not_orthonormal.abs().max() > 1e-4 or torch.linalg.det(rotation) < 0:
         raise ValueError(
             f"`{name}` must hold a rotation in its upper left 3 x 3 block (orthonormal, "
             f"right-handed), got {rotation.tolist()}."
@@ -213,8 +227,9 @@ def pose(value: Numbers | Transform | None, name: str, dtype: torch.dtype) -> Te
 
 def rigid_pose(value: Numbers, name: str) -> Tensor:
     """Return a checked pose whose rotation is made orthonormal to rounding."""
-    matrix = pose(value, name, torch.float64)
-    u, _, vh = torch.linalg.svd(matrix[:3, :3])
-    matrix[:3, :3] = u @ vh
-    matrix[3] = matrix.new_tensor([0.0, 0.0, 0.0, 1.0])
+    measured = pose(value, name, torch.float64)
+    left, _, right = torch.linalg.svd(measured[:3, :3])
+    matrix = identity(4, measured)
+    matrix[:3, :3] = left @ right
+    matrix[:3, 3] = measured[:3, 3]
     return matrix

@@ -16,13 +16,16 @@ from hybridkin._core.rotations import cross_matrix
 
 def joint_motions(origins: Tensor, axes: Tensor, slides: Tensor) -> Tensor:
     """Return B_0, B_1, B_2 of every joint, including its origin, shape (n, 3, 4, 4)."""
+    turning_axes = torch.where(slides[:, None], 0.0, axes)
+    sliding_axes = axes - turning_axes
     # Rodrigues: the rotation is 1 + K^2 + sin q K - cos q K^2; K is 0 for a prismatic joint.
-    K = cross_matrix(torch.where(slides[:, None], 0.0, axes))
+    K = cross_matrix(turning_axes)
+    K_squared = K @ K
     motions = origins.new_zeros(len(axes), 3, 4, 4)
-    motions[:, 0, :3, :3] = identity(3, axes) + K @ K
+    motions[:, 0, :3, :3] = identity(3, axes) + K_squared
     motions[:, 1, :3, :3] = K
-    motions[:, 2, :3, :3] = -K @ K
-    motions[:, 1, :3, 3] = torch.where(slides[:, None], axes, 0.0)
+    motions[:, 2, :3, :3] = -K_squared
+    motions[:, 1, :3, 3] = sliding_axes
     motions[:, 0, 3, 3] = 1.0
     return origins[:, None] @ motions
 
@@ -40,11 +43,17 @@ def carried_tip(
     Carrying one point from the last joint to the base is many times faster than `moving_frames`.
     """
     point = end[:, None].expand(4, len(u1))
-    by_joint = zip(motions.flatten(1, 2), u1.T, u2.T, strict=True)
-    for motion, of_u1, of_u2 in reversed([*by_joint]):
-        still, by_u1, by_u2 = (motion @ point).split(4)
-        point = torch.addcmul(torch.addcmul(still, of_u1, by_u1), of_u2, by_u2)
+    joints = zip(motions.flatten(1, 2), u1.T, u2.T, strict=True)
+    for motion, u1_of_joint, u2_of_joint in reversed([*joints]):
+        point = _moved(motion, point, u1_of_joint, u2_of_joint)
     return base[:3] @ point
+
+
+def _moved(motion: Tensor, columns: Tensor, u1: Tensor, u2: Tensor) -> Tensor:
+    """Return columns (4, N) moved by one joint with B_0, B_1, B_2 stacked in `motion` (12, 4)."""
+    still, by_u1, by_u2 = (motion @ columns).split(4)
+    moved = torch.addcmul(still, u1, by_u1)
+    return torch.addcmul(moved, u2, by_u2)
 
 
 def moving_frames(u1: Tensor, u2: Tensor, motions: Tensor, base: Tensor) -> Tensor:
@@ -58,9 +67,9 @@ def moving_frames(u1: Tensor, u2: Tensor, motions: Tensor, base: Tensor) -> Tens
     u1 = u1.T.repeat(1, 3)
     u2 = u2.T.repeat(1, 3)
     frames = [frame]
-    for motion, of_u1, of_u2 in zip(motions.mT.flatten(1, 2), u1, u2, strict=True):
-        still, by_u1, by_u2 = (motion @ frame).split(4)
-        frame = torch.addcmul(torch.addcmul(still, of_u1, by_u1), of_u2, by_u2)
+    joints = zip(motions.mT.flatten(1, 2), u1, u2, strict=True)
+    for motion, u1_of_joint, u2_of_joint in joints:
+        frame = _moved(motion, frame, u1_of_joint, u2_of_joint)
         frames.append(frame)
     return torch.stack(frames).unflatten(-1, (3, n_rows))
 

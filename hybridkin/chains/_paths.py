@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 
+import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from hybridkin._core.arrays import one_of
+from hybridkin._core.arrays import identity, one_of
 
 _DETERMINED = 1e-6  # smallest relative reading that determines a direction of bending
 
@@ -24,19 +24,21 @@ def path_starts(
     segments = range(len(counts))
     if routing == "segment":
         return (*segments,)
-    after_stage = [0]
+    first = 0
+    starts = []
     kinds = set()
     for k in segments:
-        is_stage = extensible[k] and counts[k] == 1
-        after_stage.append(is_stage * (k + 1))
-        if not is_stage:
+        starts.append(first)
+        if extensible[k] and counts[k] == 1:  # a stage
+            first = k + 1
+        else:
             kinds.add(extensible[k])
     if len(kinds) > 1:
         raise ValueError(
             "`routing` must be 'segment' if tendons would run through extensible segments of "
             "several actuators, or the reverse, got 'base'; their lengths would not be defined."
         )
-    return tuple(itertools.accumulate(after_stage[:-1], max))
+    return tuple(starts)
 
 
 def reading_matrix(
@@ -56,12 +58,12 @@ def bend_matrix(
     radii: Tensor, angles: Tensor, counts: Sequence[int], starts: Sequence[int]
 ) -> Tensor:
     """Return the columns (..., n, 2 S) of the bendings of the `reading_matrix`."""
-    segment = [k for k, count in enumerate(counts) for _ in range(count)]
+    segment = np.repeat(np.arange(len(counts)), counts)
     radius = radii[..., segment]
+    x = radius * angles.cos()
+    y = radius * angles.sin()
     spans = _spans(counts, starts).to(radii)
-    x = -(radius * angles.cos())[..., None] * spans
-    y = -(radius * angles.sin())[..., None] * spans
-    return torch.cat([x, y], dim=-1)
+    return torch.cat([-x[..., None] * spans, -y[..., None] * spans], dim=-1)
 
 
 def _spans(counts: Sequence[int], starts: Sequence[int]) -> Tensor:
@@ -79,8 +81,10 @@ def bend_readings(angles: Tensor, extensible: bool) -> Tensor:
 
     Rows are x and y. Without the mean if the segment is extensible: that is a change of its length.
     """
-    at = torch.stack([angles.cos(), angles.sin()])
-    return at - at.mean(dim=1, keepdim=True) if extensible else at
+    readings = torch.stack([angles.cos(), angles.sin()])
+    if extensible:
+        return readings - readings.mean(dim=1, keepdim=True)
+    return readings
 
 
 def bend_counts(
@@ -95,9 +99,11 @@ def bend_counts(
         if stretches and len(of_segment) == 1:
             bends.append(0)
             continue
-        x, y = bend_readings(of_segment, stretches)
-        most, least = _principal(x, y)
-        planar = least <= 64.0 * torch.finfo(x.dtype).eps * most
+        # The largest and the smallest reading of a bending of 1 rad in any direction.
+        readings = bend_readings(of_segment, stretches)
+        singular_values = torch.linalg.svdvals(nn.functional.pad(readings, (0, 1)))
+        most, least = singular_values.tolist()
+        planar = least <= 64.0 * torch.finfo(readings.dtype).eps * most
         if most < _DETERMINED or not (planar or least > _DETERMINED * most):
             raise ValueError(
                 "`angles` must determine the bending of every segment, got "
@@ -106,12 +112,6 @@ def bend_counts(
             )
         bends.append(1 if planar else 2)
     return tuple(bends)
-
-
-def _principal(x: Tensor, y: Tensor) -> tuple[float, float]:
-    """Return the largest and the smallest reading of a bending of 1 rad in any direction."""
-    singular = torch.linalg.svdvals(torch.stack([x, y])).tolist()
-    return singular[0], singular[1] if len(singular) > 1 else 0.0
 
 
 def free_arcs(
@@ -127,12 +127,13 @@ def free_arcs(
         if n_bends == 1:
             # The plane at the angle psi in which the actuators read most.
             x, y = bend_readings(of_segment, stretches)
-            psi = 0.5 * torch.atan2(2.0 * (x * y).sum(), (x * x - y * y).sum())
+            product = 2.0 * (x * y).sum()
+            difference = (x * x - y * y).sum()
+            psi = 0.5 * torch.atan2(product, difference)
             direction = torch.stack([psi.cos(), psi.sin()])
             bending = torch.outer(direction, direction)
         else:
-            plane = torch.eye(2, dtype=of_segment.dtype, device=of_segment.device)
-            bending = 0.5 * n_bends * plane
+            bending = 0.5 * n_bends * identity(2, of_segment)
         length = float(stretches) * of_segment.new_ones(1, 1)
         blocks.append(torch.block_diag(length, bending))
     # From segment by segment to all lengths, all x- and all y-bendings.

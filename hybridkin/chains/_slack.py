@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor, nn
+from torch.autograd.function import FunctionCtx
 
 from hybridkin._core.arrays import identity
 from hybridkin._core.kernel_numbers import HK_MOST_TURNS, HK_WHOLE_STEPS
@@ -60,17 +61,24 @@ def responses_of(taut: Tensor, elasticity: Elasticity) -> Responses:
     readings, units, stiffness, rest, zeros, gains = elasticity
     pulling = readings.mT * taut[:, None]  # (M, 3 S, n)
     hessian = torch.diag(stiffness) + pulling @ readings
+
+    # Generalised forces: by q, constant, and one of each kind for the compliance. A product with
+    # the inverse of the Hessian would lose digits of a soft backbone.
     by_q = pulling * gains
     constant = stiffness * rest - pulling @ zeros
     unit_forces = identity(len(stiffness), readings).expand(len(taut), -1, -1)
-    # Solved for the forces: a product with the inverse loses digits of a soft backbone.
     forces = torch.cat([by_q, constant[..., None], unit_forces], dim=-1)
-    scaled = units[:, None] * hessian * units
-    solution = torch.linalg.solve_ex(scaled, units[:, None] * forces).result
-    solution = units[:, None] * solution
-    shape, compliance = solution.split([len(gains) + 1, len(stiffness)], dim=-1)
+
+    # Solved in the units of the shape.
+    column_units = units[:, None]
+    scaled = column_units * hessian * units
+    solution, _ = torch.linalg.solve_ex(scaled, column_units * forces)
+    responses = column_units * solution
+    shape, compliance = responses.split([len(gains) + 1, len(stiffness)], dim=-1)
+
     commanded = torch.cat([torch.diag(gains), -zeros[:, None]], dim=-1)
-    return Responses(shape, readings @ shape - commanded, compliance)
+    stretch = readings @ shape - commanded
+    return Responses(shape, stretch, compliance)
 
 
 def extended(rows: Tensor) -> Tensor:
@@ -80,12 +88,14 @@ def extended(rows: Tensor) -> Tensor:
 
 def applied(maps: Tensor, vectors: Tensor) -> Tensor:
     """Return linear maps (N, m, n) of vectors (N, n)."""
-    return torch.matmul(maps, vectors[..., None])[..., 0]
+    products = maps @ vectors[..., None]
+    return products[..., 0]
 
 
 def as_mask(codes: Tensor, n: int) -> Tensor:
     """Return sets, given as the bits of integers (N,), as a mask (N, n)."""
-    return ((codes[:, None] >> torch.arange(n, device=codes.device)) & 1) > 0
+    places = torch.arange(n, device=codes.device)
+    return (codes[:, None] >> places) & 1 > 0
 
 
 def find_in_table(rows: Tensor, table: Tensor) -> Tensor:
@@ -98,10 +108,11 @@ def find_by_solving(rows: Tensor, *elasticity: Tensor) -> Tensor:
     n = rows.shape[1]
 
     def maps_of(codes: Tensor) -> Tensor:
-        return responses_of(as_mask(codes, n), Elasticity(*elasticity)).stretch
+        taut = as_mask(codes, n)
+        return responses_of(taut, Elasticity(*elasticity)).stretch
 
-    full = maps_of(torch.tensor([2**n - 1], device=rows.device))[0]
-    return _pivoted(maps_of, full, extended(rows))
+    all_taut = torch.tensor([2**n - 1], device=rows.device)
+    return _pivoted(maps_of, maps_of(all_taut)[0], extended(rows))
 
 
 def _pivoted(maps_of: Callable[[Tensor], Tensor], full: Tensor, x: Tensor) -> Tensor:
@@ -113,15 +124,14 @@ def _pivoted(maps_of: Callable[[Tensor], Tensor], full: Tensor, x: Tensor) -> Te
     n = x.shape[1] - 1
     bits = 2 ** torch.arange(n, device=x.device)
     places = torch.arange(len(x), device=x.device)  # of the rows that still change
-    guess = ((full @ x.T >= 0) * bits[:, None]).sum(0)
+    guess = ((x @ full.T >= 0) * bits).sum(-1)
     codes = guess.clone()
     for step in range(HK_WHOLE_STEPS + 2 ** min(n, HK_MOST_TURNS)):
         maps = maps_of(guess)
         stretch = applied(maps, x)
         taut = ((stretch >= 0) * bits).sum(-1)
-        if (
-            step >= HK_WHOLE_STEPS
-        ):  # the first wrong tendon alone, ignoring rounding errors
+        if step >= HK_WHOLE_STEPS:
+            # The first wrong tendon alone, ignoring rounding errors.
             rounding = 4.0 * torch.finfo(x.dtype).eps * applied(maps.abs(), x.abs())
             certain = ((stretch.abs() > rounding) * bits).sum(-1)
             wrong = (taut ^ guess) & certain
@@ -136,6 +146,12 @@ def _pivoted(maps_of: Callable[[Tensor], Tensor], full: Tensor, x: Tensor) -> Te
     return codes
 
 
+class VmapInfo(Protocol):
+    """What torch tells the vmap of a function."""
+
+    batch_size: int
+
+
 class WithoutDerivative(torch.autograd.Function):
     """The result of a search by rows, for every torch transform; its derivative is zero."""
 
@@ -144,20 +160,26 @@ class WithoutDerivative(torch.autograd.Function):
         return find(rows, *parts)
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+    def setup_context(
+        ctx: FunctionCtx, inputs: tuple[object, ...], output: Tensor
+    ) -> None:
         ctx.mark_non_differentiable(output)
 
     @staticmethod
-    def backward(ctx: Any, *grads: Any) -> Any:
-        return None
+    def backward(ctx: FunctionCtx, *grads: Tensor) -> None:
+        """Return no derivative."""
 
     @staticmethod
-    def jvp(ctx: Any, *tangents: Any) -> Any:
-        return None
+    def jvp(ctx: FunctionCtx, *tangents: Tensor) -> None:
+        """Return no derivative."""
 
     @staticmethod
-    def vmap(info: Any, in_dims: tuple[Any, ...], *args: Any) -> tuple[Tensor, int]:
-        find, *tensors = args
+    def vmap(
+        info: VmapInfo,
+        in_dims: tuple[int | None, ...],
+        find: Callable[..., Tensor],
+        *tensors: Tensor,
+    ) -> tuple[Tensor, int]:
         results = []
         for k in range(info.batch_size):
             parts = []

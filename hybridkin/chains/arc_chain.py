@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hybridkin._core.arrays import as_array, identity, whole
-from hybridkin._core.blocks import check_vectors, in_blocks
+from hybridkin._core.blocks import in_blocks
 from hybridkin._core.plan import NoKernel, Plan
 from hybridkin._core.plausible import PlausibleRows
 from hybridkin._core.stored import Restore, Stored
@@ -55,11 +56,13 @@ def frame_numbers(plan: Plan, stored: Stored, reach: float) -> tuple[NDArray, ND
     if x or y:
         raise NoKernel("a marker beside the backbone has no kernel")
     plan.limit("segments", len(offsets))
-    m = math.ceil(tip_at)
-    parts = np.append(np.ones(m - 1), tip_at - m + 1)
-    rigid = offsets[:m] * (parts == 1)
+    parts = np.ones(math.ceil(tip_at))
+    parts[-1] += tip_at - len(parts)
+    rigid = offsets[: len(parts)] * (parts == 1)
     rigid[-1] += z
-    return np.concatenate([base[:3, :3].ravel(), base[:3, 3], [reach], rigid]), parts
+    turn = base[:3, :3].ravel()
+    position = base[:3, 3]
+    return np.concatenate([turn, position, [reach], rigid]), parts
 
 
 def each_marker(stored: Stored) -> list[Stored]:
@@ -158,12 +161,23 @@ class ArcChain(MarkedChain):
 
     def metres(self, q: Tensor) -> Tensor:
         """Return q (..., n) in metres: lengths, or changes of length."""
-        check_vectors(q, self.n_actuators, "q", self._why_shape())
+        self._check_shape(q)
         return self.gains.to(q) * (q - self.rest.to(q))
 
-    def _checked(self, routing: str, **arguments: Any) -> dict[str, Tensor]:
+    @property
+    def _free_gain(self) -> tuple[str, ...]:
+        """The gain as a parameter that a calibration fits by default, if q is not in metres."""
+        return () if self.in_metres else ("gain",)
+
+    def _checked(
+        self, routing: str, *, without_lengths: bool = True, **arguments: Any
+    ) -> dict[str, Tensor]:
         """Set the structure of the chain, and return the `arc_geometry` of the arguments."""
         counts, self.extensible, geometry = arc_geometry(**arguments)
+        if any(self.extensible) and not without_lengths:
+            raise ValueError(
+                "`lengths` must hold the backbone length of every segment, got None."
+            )
         self.actuators_per_segment = counts
         self.starts = path_starts(routing, counts, self.extensible)
         self.n_segments = len(counts)
@@ -189,25 +203,23 @@ class ArcChain(MarkedChain):
         Tensor of shape (..., 3)
             Tip position in the measuring frame [m].
         """
-        return in_blocks(self._forward, q, 8192)[0]
+        (x,) = self._by_rows(self._tips_of_rows, q, 8192)
+        return x
 
     def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return the tip (..., 3) [m] and its Jacobian (..., 3, n_actuators) [-] in one pass."""
-        check_vectors(q, self.n_actuators, "q", self._why_shape())
-        x, J = in_blocks(self._forward_and_jacobian, q)
+        x, J = self._by_rows(self._tips_and_jacobians, q)
         return x, J
 
-    def _forward(self, q: Tensor) -> tuple[Tensor]:
-        arcs = self.up_to_markers(self._arcs(q))
-        return (self._x_of(arcs).reshape(*q.shape[:-1], self.n_outputs),)
+    def _tips_of_rows(self, rows: Tensor) -> tuple[Tensor]:
+        arcs = self._arcs_of_rows(rows)
+        return (self._x_of(self.up_to_markers(arcs)),)
 
-    def _forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        arcs, slope = self._arcs_and_slope(self._rows(q))
+    def _tips_and_jacobians(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        arcs, slope = self._arcs_and_slope(rows)
         x, columns = self._x_and_columns(self.up_to_markers(arcs))
         J = self._along(self.by_arcs(columns), slope)
-        x = self._in_measuring_frame(x)
-        lead = q.shape[:-1]
-        return x.reshape(*lead, *x.shape[1:]), J.reshape(*lead, *J.shape[1:])
+        return self._in_measuring_frame(x), J
 
     def pose_jacobian(self, q: Tensor) -> Tensor:
         """Return the tip's linear [-] and angular [rad/m] Jacobian, shape (..., 6, n_actuators).
@@ -223,7 +235,8 @@ class ArcChain(MarkedChain):
         both = torch.cat([self.by_arcs(linear), self.by_arcs(angular)], dim=2)
         J = self._along(both, slope)
         if self.stage is not None:  # the stage turns the tip's frame too
-            J[:, 3:, 0] = (self.gains[0] * self.base[:3, 2]).to(q)
+            spin = self.gains[0] * self.base[:3, 2]
+            J[:, 3:, 0] = spin.to(q)
         return J.reshape(*q.shape[:-1], 6, self.n_actuators)
 
     def geometry_jacobian(self, q: Tensor, tangents: Mapping[str, Tensor]) -> Tensor:
@@ -251,16 +264,13 @@ class ArcChain(MarkedChain):
         tensor([0., 0., 1.], dtype=torch.float64)
         """
         self._check_tangents(tangents)
-        check_vectors(q, self.n_actuators, "q", self._why_shape())
-        tangents = {name: value.to(q) for name, value in tangents.items()}
+        changes = {name: value.to(q) for name, value in tangents.items()}
+        (J,) = self._by_rows(partial(self._along_geometry, tangents=changes), q)
+        return J
 
-        def along(q: Tensor) -> tuple[Tensor]:
-            J = self._along_geometry(self._rows(q), tangents)
-            return (J.reshape(*q.shape[:-1], *J.shape[1:]),)
-
-        return in_blocks(along, q)[0]
-
-    def _along_geometry(self, rows: Tensor, tangents: Mapping[str, Tensor]) -> Tensor:
+    def _along_geometry(
+        self, rows: Tensor, tangents: Mapping[str, Tensor]
+    ) -> tuple[Tensor]:
         """Return the derivative (N, 3 K, P) of x along P changes of the geometry."""
         arcs, change = self._arcs_and_change(rows, tangents)
         arcs = self.up_to_markers(arcs)
@@ -272,10 +282,10 @@ class ArcChain(MarkedChain):
             by_offsets = self._turned(self.by_offsets(by_offsets)).contiguous()
             J = J + by_offsets @ tangents["offsets"].T
         if "base" in tangents:
-            base = tangents["base"]
-            turned = torch.einsum("pij,jkn->nkip", base[:, :3, :3], x)
-            J = J + (turned + base[:, :3, 3].T).flatten(1, 2)
-        return J
+            turn, move = tangents["base"][:, :3].split([3, 1], dim=2)
+            turned = torch.einsum("pij,jkn->nkip", turn, x)
+            J = J + (turned + move[..., 0].T).flatten(1, 2)
+        return (J,)
 
     def arcs(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return the arc of every segment.
@@ -293,7 +303,7 @@ class ArcChain(MarkedChain):
             Bending vectors [rad]: the norm is the bend angle, the direction is that of the bend.
             A rotation stage turns them too.
         """
-        return self._leading(self._arcs(q), q)
+        return self._leading(self._arcs_of_rows(self._rows(q)), q)
 
     def poses(self, q: Tensor) -> Tensor:
         """Return the pose of the base and of the end of every segment, after its offset.
@@ -312,11 +322,13 @@ class ArcChain(MarkedChain):
 
     def pose(self, q: Tensor) -> Tensor:
         """Return the tip's pose in the measuring frame, shape (..., 4, 4)."""
-        arcs = self._leading(self.up_to_tip(self._arcs(q)), q)
+        arcs = self.up_to_tip(self._arcs_of_rows(self._rows(q)))
+        length, bending = self._leading(arcs, q)
         offsets = self.offsets_to_markers(self.arc_offsets)[:, -1]
+        poses = self._poses(length, bending, offsets, q)
         beside = identity(4, q)
         beside[:3, 3] = self._beside(q)[:, -1, 0]
-        return self._poses(*arcs, offsets, q)[..., -1, :, :] @ beside
+        return poses[..., -1, :, :] @ beside
 
     def pose_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return `pose(q)` and `pose_jacobian(q)`."""
@@ -333,16 +345,16 @@ class ArcChain(MarkedChain):
         # An arc of length l and bending b moves the end by l c, where c is its derivative with
         # respect to the length, and changes the transverse axes by -b c.
         by_length = moves[:, :S]
-        points = (segments.length * by_length + segments.offset * tangents).cumsum(1)
+        steps = segments.length * by_length + segments.offset * tangents
         x_axis, y_axis, _ = identity(3, arcs)[..., None, None]
-        x_axis = x_axis - (segments.x * by_length).cumsum(1)
-        y_axis = y_axis - (segments.y * by_length).cumsum(1)
+        x_axes = x_axis - (segments.x * by_length).cumsum(1)
+        y_axes = y_axis - (segments.y * by_length).cumsum(1)
         return Frames(
-            torch.stack([x_axis, y_axis, tangents]),
-            points,
-            moves.unflatten(1, (3, S)),
-            spins.unflatten(1, (3, S)),
-            slope,
+            axes=torch.stack([x_axes, y_axes, tangents]),
+            points=steps.cumsum(1),
+            moves=moves.unflatten(1, (3, S)),
+            spins=spins.unflatten(1, (3, S)),
+            slope=slope,
         )
 
     def backbone(self, q: Tensor, n_points: int = 20) -> Tensor:
@@ -365,21 +377,26 @@ class ArcChain(MarkedChain):
         poses = self._poses(length, bending, self.offsets)
         # A part of an arc is an arc of that part of its length and of its bending.
         part = torch.arange(1, n_points + 1, dtype=q.dtype, device=q.device) / n_points
-        steps = transforms(
-            part * length[..., None], part[:, None] * bending[..., None, :], 0.0 * part
-        )
-        points = (poses[..., :-1, None, :, :] @ steps)[..., :3, 3]
-        ends = poses[..., 1:, None, :3, 3]  # after the offsets
-        points = torch.cat([points[..., :-1, :], ends], dim=-2).flatten(-3, -2)
-        return torch.cat([poses[..., :1, :3, 3], points], dim=-2)
+        lengths = part * length[..., None]
+        bendings = part[:, None] * bending[..., None, :]
+        steps = transforms(lengths, bendings, torch.zeros_like(part))
+        starts = poses[..., :-1, None, :, :]
+        points = (starts @ steps)[..., :3, 3]
+        ends = poses[..., 1:, :3, 3]  # after the offsets
+        points[..., -1, :] = ends
+        origin = poses[..., :1, :3, 3]
+        return torch.cat([origin, points.flatten(-3, -2)], dim=-2)
 
     def extra_repr(self) -> str:
         """Return the summary shown by repr()."""
-        where = "" if self.tip_at == self.n_segments else f", tip at {self.tip_at:g}"
+        words = [f"{self.n_segments} segments", f"{self.n_actuators} actuators"]
         if len(self.markers) > 1:
-            where = f", markers at {', '.join(f'{at:g}' for at, *_ in self.markers)}"
-        size = f"{self.n_segments} segments, {self.n_actuators} actuators"
-        return f"{size}{where}, routing {self.routing!r}"
+            places = [f"{at:g}" for at, *_ in self.markers]
+            words.append(f"markers at {', '.join(places)}")
+        elif self.tip_at != self.n_segments:
+            words.append(f"tip at {self.tip_at:g}")
+        words.append(f"routing {self.routing!r}")
+        return ", ".join(words)
 
     def unit_messages(self, q: Tensor, name: str, factor: float = 1.0) -> list[str]:
         """Return a warning if lengths exceed 10 m, or length changes 4 backbone lengths."""
@@ -387,12 +404,12 @@ class ArcChain(MarkedChain):
             name = f"{name}` times `gains"
         # Also test q itself, without zeros: `q` may hold speeds, or limits that are absent.
         gains = self.gains.to(q)
-        (metres,) = in_blocks(
-            lambda rows: (
-                torch.minimum((gains * rows).abs(), self.metres(rows).abs()),
-            ),
-            q,
-        )
+
+        def size(rows: Tensor) -> tuple[Tensor]:
+            metres = self.metres(rows).abs()
+            return (torch.minimum((gains * rows).abs(), metres),)
+
+        (metres,) = in_blocks(size, q)
         beyond = metres > factor * self._largest_metres.to(q)
         beyond[..., : self.stage is not None] = False  # an angle
         message = millimetres_message(name, metres[beyond], 0.0)
@@ -446,9 +463,10 @@ class ArcChain(MarkedChain):
         radii = self.radii.to(changes["radii"])
         angles = self.angles.to(radii)
         paths = self.actuators_per_segment, self.starts
-        along_angles = bend_matrix(radii, angles + 0.5 * math.pi, *paths)
         along_radii = bend_matrix(changes["radii"], angles, *paths)
-        return along_radii + along_angles * changes["angles"][..., None]
+        by_angle = bend_matrix(radii, angles + 0.5 * math.pi, *paths)
+        along_angles = by_angle * changes["angles"][..., None]
+        return along_radii + along_angles
 
     def coordinates(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return the arcs (N, 3 m) up to the tip and d arcs / dq, (3 m, n) or (N, 3 m, n).
@@ -460,7 +478,9 @@ class ArcChain(MarkedChain):
         if len(self.markers) == 1:
             arcs = self.up_to_tip(arcs)
             slope = self.up_to_tip(slope)
-        return arcs.mT, slope if slope.ndim == 2 else slope.permute(2, 0, 1)
+        if slope.ndim == 3:
+            slope = slope.permute(2, 0, 1)
+        return arcs.mT, slope
 
     def from_coordinates(self, z: Tensor) -> Tensor:
         """Return the tip (N, 3), or all markers (N, 3 K), at `coordinates` (N, C)."""
@@ -478,15 +498,17 @@ class ArcChain(MarkedChain):
         return z[:, None] if len(self.markers) == 1 else self.up_to_markers(z)
 
     def _rows(self, q: Tensor) -> Tensor:
-        check_vectors(q, self.n_actuators, "q", self._why_shape())
+        self._check_shape(q)
         return q.reshape(-1, self.n_actuators)
 
     def _why_shape(self) -> str:
-        per_segment = " + ".join(str(n) for n in self.actuators_per_segment)
+        per_segment = " + ".join(map(str, self.actuators_per_segment))
         return f"this chain has {self.n_segments} segments of {per_segment} actuators"
 
-    def _arcs(self, q: Tensor) -> Tensor:
-        return self._arcs_and_slope(self._rows(q))[0]
+    def _arcs_of_rows(self, rows: Tensor) -> Tensor:
+        """Return the arcs (3 S, N) of rows (N, n)."""
+        arcs, _ = self._arcs_and_slope(rows)
+        return arcs
 
     def _segments(self, arcs: Tensor) -> Segments:
         """Return the segments (m, K, N) of arcs (3 m, K, N) up to the markers."""
@@ -512,14 +534,16 @@ class ArcChain(MarkedChain):
         """Return the poses of the base and after all arcs; with q, turned by the stage."""
         steps = transforms(length, bending, offsets.to(length))
         base = self.base.to(length).expand(*length.shape[:-1], 4, 4)
-        poses = itertools.accumulate(steps.unbind(-3), torch.matmul, initial=base)
-        poses = torch.stack([*poses], dim=-3)
-        turned = None if self.stage is None else q
-        return poses if turned is None else rolled(poses, self.metres(turned)[..., :1])
+        frames = itertools.accumulate(steps.unbind(-3), torch.matmul, initial=base)
+        poses = torch.stack([*frames], dim=-3)
+        if self.stage is None or q is None:
+            return poses
+        return rolled(poses, self.metres(q)[..., :1])
 
     def _x_of(self, arcs: Tensor) -> Tensor:
         """Return x (N, 3 K) at arcs (3 m, K, N) up to the markers."""
-        return self._in_measuring_frame(tip(self._segments(arcs), self._beside(arcs)))
+        points = tip(self._segments(arcs), self._beside(arcs))
+        return self._in_measuring_frame(points)
 
     def _x_and_columns(
         self, arcs: Tensor, rigid: bool = False
@@ -530,7 +554,8 @@ class ArcChain(MarkedChain):
     def _in_measuring_frame(self, points: Tensor) -> Tensor:
         """Return points (3, K, N) of the base frame in the measuring frame, (N, 3 K)."""
         base = self.base.to(points)
-        placed = torch.tensordot(base[:3, :3], points, 1) + base[:3, 3, None, None]
+        turned = torch.tensordot(base[:3, :3], points, 1)
+        placed = turned + base[:3, 3, None, None]
         return placed.permute(2, 1, 0).flatten(1)
 
     def _along(self, columns: Tensor, slope: Tensor) -> Tensor:
@@ -542,19 +567,21 @@ class ArcChain(MarkedChain):
 
     def _turned(self, columns: Tensor) -> Tensor:
         """Return derivatives (3, C, K, N) of points in the base frame as (N, 3 K, C), measured."""
-        base = self.base.to(columns)[:3, :3]
-        return torch.tensordot(base, columns, 1).permute(3, 2, 0, 1).flatten(1, 2)
+        turn = self.base.to(columns)[:3, :3]
+        turned = torch.tensordot(turn, columns, 1)
+        return turned.permute(3, 2, 0, 1).flatten(1, 2)
 
     @classmethod
     def _arguments(cls, stored: Stored) -> dict[str, Any]:
         """Return the constructor's arguments, except dtype, from a description."""
-        optional = () if "lengths" in stored.arrays else ("lengths",)
-        arguments: dict[str, Any] = {
-            name: stored.array(name) for name in cls._entries if name not in optional
-        }
+        arguments: dict[str, Any] = {}
+        for name in cls._entries:
+            if name != "lengths" or name in stored.arrays:
+                arguments[name] = stored.array(name)
         counts = stored.list_of(int, "actuators_per_segment")
+        ends = np.cumsum(counts)
         arguments["n_actuators"] = counts
-        arguments["angles"] = np.split(arguments["angles"], np.cumsum(counts)[:-1])
+        arguments["angles"] = np.split(arguments["angles"], ends[:-1])
         arguments["routing"] = stored.value("routing", str)
         return arguments
 

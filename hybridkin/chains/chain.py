@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from hybridkin._core.arrays import check_shape, countable
-from hybridkin._core.blocks import check_tensor, check_vectors
+from hybridkin._core.blocks import check_tensor, check_vectors, in_blocks
 from hybridkin._core.html import numbers
 from hybridkin._core.model import PoseModel
 from hybridkin._core.plausible import PlausibleRows
@@ -101,11 +101,13 @@ class Chain(PoseModel):
             check_shape(value, name, current[name].shape)
         chain = type(self).__new__(type(self))
         nn.Module.__init__(chain)
-        chain.__dict__.update({name: self.__dict__[name] for name in self._structure})
+        for name in self._structure:
+            chain.__dict__[name] = self.__dict__[name]
+        buffers = self._buffers | geometry
         if set(geometry) <= {"base"}:  # no other buffer depends on it
-            chain._buffers.update({**self._buffers, **geometry})
+            chain._buffers.update(buffers)
         else:
-            chain._set_geometry({**self._buffers, **geometry})
+            chain._set_geometry(buffers)
         return chain
 
     def _set_geometry(self, geometry: Mapping[str, Tensor | None]) -> None:
@@ -123,7 +125,7 @@ class Chain(PoseModel):
             P changes of entries of `geometry()`, stacked; other entries do not change.
         """
         self._check_tangents(tangents)
-        check_vectors(q, self.n_actuators, "q", self._why_shape())
+        self._check_shape(q)
         return self._slope_of(lambda chain: chain(q), tangents)
 
     def _slope_of(
@@ -138,7 +140,8 @@ class Chain(PoseModel):
                 entry = geometry[name]
                 change = torch.tensordot(steps.to(entry), tangent.to(entry), 1)
                 entries[name] = entry + change
-            return function(self.with_geometry(**entries))
+            chain = self.with_geometry(**entries)
+            return function(chain)
 
         first = next(iter(tangents.values()))
         return torch.func.jacfwd(moved)(first.new_zeros(len(first)))
@@ -185,7 +188,7 @@ class Chain(PoseModel):
             For a wrong shape, for NaN or infinite entries, and for absolute actuator lengths that
             are not positive.
         """
-        check_vectors(q, self.n_actuators, name, self._why_shape())
+        self._check_shape(q, name)
         rows = q.detach().reshape(-1, self.n_actuators)
         bad = ~countable(rows).all(dim=1)
         if bad.any():
@@ -205,14 +208,30 @@ class Chain(PoseModel):
         """Return why q must have its shape, for messages."""
         return f"this robot has {self.n_actuators} actuators"
 
+    def _check_shape(self, q: Tensor, name: str = "q") -> None:
+        """Raise if q does not have the shape (..., n_actuators)."""
+        check_vectors(q, self.n_actuators, name, self._why_shape())
+
+    def _by_rows(
+        self,
+        function: Callable[[Tensor], tuple[Tensor, ...]],
+        q: Tensor,
+        size: int = 4096,
+    ) -> tuple[Tensor, ...]:
+        """Return the tensors (..., K) of a function of rows (N, n) at q (..., n), by blocks."""
+        self._check_shape(q)
+        return in_blocks(function, q, size)
+
     def _check_rows(self, rows: Tensor, name: str) -> None:
         """Raise if finite rows (N, n) cannot be a log of this robot."""
 
     def far_messages(self, x: Tensor, name: str) -> list[str]:
         """Return a warning if tips span more than 50 times the robot's size."""
-        points = torch.cat([self.base[:3, 3].detach().to(x)[None], x.reshape(-1, 3)])
-        points = points[torch.isfinite(points).all(-1)]
-        message = span_message(name, points, float(self.reach.detach()), _FAR)
+        origin = self.base[:3, 3].detach().to(x)
+        points = torch.cat([origin[None], x.reshape(-1, 3)])
+        finite = points[torch.isfinite(points).all(-1)]
+        reach = float(self.reach.detach())
+        message = span_message(name, finite, reach, _FAR)
         return [] if message is None else [message]
 
     def misses(self, x: Tensor, largest: Tensor) -> Tensor:

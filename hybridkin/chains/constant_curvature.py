@@ -189,9 +189,8 @@ class ConstantCurvatureChain(ArcChain):
         by_segment = geometry["angles"].split(self.actuators_per_segment)
         self.bends = bend_counts(by_segment, self.extensible)
         self.stage = stage
-        named = isinstance(stage, str) and stage == "rotation"
-        turns = named and self.bends[0] == 0
-        if stage is not None and not turns:
+        is_rotation = isinstance(stage, str) and stage == "rotation"
+        if stage is not None and not (is_rotation and self.bends[0] == 0):
             raise ValueError(
                 '`stage` must be None or "rotation"; "rotation" needs a first segment with one '
                 f"actuator and without a length, got {stage!r}."
@@ -201,10 +200,9 @@ class ConstantCurvatureChain(ArcChain):
     @property
     def default_parameters(self) -> tuple[str, ...]:
         """Names of the parameters that a calibration fits by default."""
-        gain = () if self.in_metres else ("gain",)
         if self.lengths is None:
-            return ("radii", *gain, "base")
-        return ("radii", "turns", "rest_bends", "lengths", *gain, "base")
+            return ("radii", *self._free_gain, "base")
+        return ("radii", "turns", "rest_bends", "lengths", *self._free_gain, "base")
 
     @property
     def rest(self) -> Tensor:

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
+from operator import is_
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from hybridkin._core.arrays import LARGEST, Numbers, Transform
+from hybridkin._core.arrays import Numbers, Transform
 from hybridkin._core.plan import Plan
 from hybridkin._core.stored import Layout, Stored
 from hybridkin.chains import _slack
-from hybridkin.chains._checks import filled, float_dtype
+from hybridkin.chains._checks import filled, float_dtype, stiffness
 from hybridkin.chains.arc_chain import (
     STRUCTURE,
     ArcChain,
@@ -86,8 +87,7 @@ class _Table(NamedTuple):
 
     def holds(self, shaping: list[Tensor], state: list[object]) -> bool:
         """Return whether the geometry is still the same."""
-        same = [a is b for a, b in zip(self.shaping, shaping, strict=True)]
-        return all(same) and self.state == state
+        return self.state == state and all(map(is_, self.shaping, shaping))
 
 
 class ElasticTendonChain(ArcChain):
@@ -198,6 +198,7 @@ class ElasticTendonChain(ArcChain):
         dtype = float_dtype(dtype)
         geometry = self._checked(
             routing,
+            without_lengths=False,
             radii=radii,
             lengths=lengths,
             n_actuators=n_actuators,
@@ -208,28 +209,26 @@ class ElasticTendonChain(ArcChain):
             base=base,
             dtype=dtype,
         )
-        if any(self.extensible):
-            raise ValueError(
-                "`lengths` must hold the backbone length of every segment, got None."
-            )
         if self.n_actuators > _slack.MOST:
             raise ValueError(
                 f"`n_actuators` must be at most {_slack.MOST} in all, got {self.n_actuators}."
             )
         if bending_stiffness is None:
             bending_stiffness = 0.01 * geometry["radii"] ** 2
-        stiffness = {
-            "bending_stiffness": bending_stiffness,
-            "axial_stiffness": 10.0 if axial_stiffness is None else axial_stiffness,
+        if axial_stiffness is None:
+            axial_stiffness = 10.0
+        S = self.n_segments
+        geometry |= {
+            "bending_stiffness": stiffness(
+                bending_stiffness, "bending_stiffness", dtype, S
+            ),
+            "axial_stiffness": stiffness(axial_stiffness, "axial_stiffness", dtype, S),
+            "tendon_zeros": filled(
+                tendon_zeros, "tendon_zeros", dtype, (self.n_actuators,)
+            ),
         }
-        for name, value in stiffness.items():
-            geometry[name] = filled(value, name, dtype, (self.n_segments,))
-            if not (geometry[name] > 1.0 / LARGEST).all():
-                need = f"must be positive, over {1.0 / LARGEST:g}"
-                raise ValueError(f"`{name}` {need}, got {geometry[name].tolist()}.")
-        zeros = filled(tendon_zeros, "tendon_zeros", dtype, (self.n_actuators,))
         self._table: _Table | None = None
-        self._set_geometry({**geometry, "tendon_zeros": zeros})
+        self._set_geometry(geometry)
 
     @classmethod
     def from_chain(
@@ -280,8 +279,7 @@ class ElasticTendonChain(ArcChain):
         """Names of the parameters that a calibration fits by default."""
         geometry = ("radii", "turns", "rest_bends", "lengths", "tool", "base")
         tendons = ("bending_stiffness", "axial_stiffness", "tendon_zeros")
-        gain = () if self.in_metres else ("gain",)
-        return (*geometry, *tendons, *gain)
+        return (*geometry, *tendons, *self._free_gain)
 
     @property
     def pulls(self) -> Tensor:

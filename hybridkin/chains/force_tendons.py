@@ -8,11 +8,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from hybridkin._core.arrays import LARGEST, Numbers, Transform, identity, whole
-from hybridkin._core.blocks import check_vectors
+from hybridkin._core.arrays import Numbers, Transform, identity, whole
 from hybridkin._core.stored import Layout, Restore, Stored
 from hybridkin.chains._arcs import WorkOfGravity, segments_of
-from hybridkin.chains._checks import filled, float_dtype, numeric
+from hybridkin.chains._checks import filled, float_dtype, numeric, stiffness
 from hybridkin.chains._slack import WithoutDerivative, applied
 from hybridkin.chains.arc_chain import STRUCTURE, ArcChain
 from hybridkin.chains.chain import Chain
@@ -39,12 +38,6 @@ class _Statics(NamedTuple):
     offsets: Tensor  # (A,), rigid length after each arc [m]
     down: Tensor  # (3,), direction of gravity in the frame of the base
 
-    def elastic_energy(self, arcs: Tensor, forces: Tensor) -> Tensor:
-        """Return the energy (N,) [J] of the body and the tendons with forces (N, n)."""
-        change = arcs - self.rest[:, None]
-        elastic = 0.5 * (self.stiffness[:, None] * change.square()).sum(0)
-        return elastic + (forces.mT * (self.readings @ change)).sum(0)
-
     def gravity(self, arcs: Tensor) -> WorkOfGravity:
         """Return the work of gravity and its derivatives."""
         segments = segments_of(arcs, self.offsets[:, None])
@@ -60,7 +53,8 @@ class _Statics(NamedTuple):
     def imbalance(self, arcs: Tensor, forces: Tensor) -> Tensor:
         """Return the derivative (3 A, N) of the energy by the arcs: zero at rest."""
         elastic = self.stiffness[:, None] * (arcs - self.rest[:, None])
-        return elastic + self.readings.mT @ forces.mT - self.gravity(arcs).gradient()
+        tendons = self.readings.mT @ forces.mT
+        return elastic + tendons - self.gravity(arcs).gradient()
 
     def hessian(self, arcs: Tensor) -> Tensor:
         """Return the second derivative (N, 3 A, 3 A) of the energy by the arcs."""
@@ -74,32 +68,37 @@ class _Statics(NamedTuple):
         is repeated with more damping. Each coordinate is scaled by the root of its stiffness.
         """
         unit = self.stiffness.rsqrt()
+        column_unit = unit[:, None]
         eye = identity(len(unit), forces)
         arcs = self.rest[:, None].expand(-1, len(forces)).clone()
         energy = self.energy(arcs, forces)
         damping = torch.zeros_like(energy)
         for _ in range(_MOST_STEPS):
-            imbalance = (unit[:, None] * self.imbalance(arcs, forces)).mT
-            hessian = unit[:, None] * self.hessian(arcs) * unit
+            # The damped Newton step; none where the damped Hessian is not positive.
+            imbalance = (column_unit * self.imbalance(arcs, forces)).mT
+            hessian = column_unit * self.hessian(arcs) * unit
             damped = hessian + damping[:, None, None] * eye
             factor, failed = torch.linalg.cholesky_ex(damped)
             factor = torch.where(failed[:, None, None] > 0, eye, factor)
-            step = -torch.cholesky_solve(imbalance[..., None], factor)[..., 0]
-            moved = arcs + unit[:, None] * step.mT
+            descent = torch.cholesky_solve(imbalance[..., None], factor)[..., 0]
+
+            # Accepted if it lowers the energy, or is near the end.
+            moved = arcs - column_unit * descent.mT
             moved_energy = self.energy(moved, forces)
-            size = step.abs().amax(1)
+            size = descent.abs().amax(1)
             lower = moved_energy <= energy + _ROUNDING * energy.abs()
             accepted = (failed == 0) & (lower | (size < 1e3 * _CONVERGED))
             arcs = torch.where(accepted, moved, arcs)
             energy = torch.where(accepted, moved_energy, energy)
+
             more = (10.0 * damping).clamp(min=0.1)
             less = torch.where(damping > 1e-3, 0.1 * damping, 0.0)
             damping = torch.where(accepted, less, more)
             if (accepted & (size < _CONVERGED)).all():
                 break
-        hessian = unit[:, None] * self.hessian(arcs) * unit
-        inverse = torch.linalg.solve_ex(hessian, eye.expand_as(hessian)).result
-        return arcs, unit[:, None] * inverse * unit
+        hessian = column_unit * self.hessian(arcs) * unit
+        inverse, _ = torch.linalg.solve_ex(hessian, eye.expand_as(hessian))
+        return arcs, column_unit * inverse * unit
 
 
 class ForceTendonChain(ArcChain):
@@ -233,6 +232,7 @@ class ForceTendonChain(ArcChain):
         dtype = float_dtype(dtype)
         geometry = self._checked(
             routing,
+            without_lengths=False,
             radii=radii,
             lengths=lengths,
             n_actuators=n_actuators,
@@ -243,35 +243,29 @@ class ForceTendonChain(ArcChain):
             base=base,
             dtype=dtype,
         )
-        if any(self.extensible):
+        S = self.n_segments
+        weights = filled(weight, "weight", dtype, (S,))
+        if not (weights >= 0.0).all():
             raise ValueError(
-                "`lengths` must hold the length of every segment, got None."
+                f"`weight` must not be negative [N/m], got {weights.tolist()}."
             )
-        properties = {
-            "bending_stiffness": bending_stiffness,
-            "axial_stiffness": axial_stiffness,
-            "weight": weight,
-            "taper": taper,
-        }
-        for name, value in properties.items():
-            geometry[name] = filled(value, name, dtype, (self.n_segments,))
-        for name in ("bending_stiffness", "axial_stiffness"):
-            if not (geometry[name] > 1.0 / LARGEST).all():
-                need = f"must be positive, over {1.0 / LARGEST:g}"
-                raise ValueError(f"`{name}` {need}, got {geometry[name].tolist()}.")
-        if not (geometry["weight"] >= 0.0).all():
-            raise ValueError(
-                f"`weight` must not be negative [N/m], got {geometry['weight'].tolist()}."
-            )
-        taper_left = geometry["taper"]
-        if not ((taper_left >= 0.0) & (taper_left < 1.0)).all():
-            raise ValueError(f"`taper` must lie in [0, 1), got {taper_left.tolist()}.")
+        tapers = filled(taper, "taper", dtype, (S,))
+        if not ((tapers >= 0.0) & (tapers < 1.0)).all():
+            raise ValueError(f"`taper` must lie in [0, 1), got {tapers.tolist()}.")
         down = numeric(gravity, "gravity", need="n", length=3)
         if not down.norm() > 0.0:
             raise ValueError(f"`gravity` must be a direction, got {down.tolist()}.")
         self.gravity = tuple((down / down.norm()).tolist())
         self.arcs_per_segment = whole(arcs, "arcs", most=_MOST_ARCS)
-        geometry["marker_offsets"] = geometry["base"].new_zeros(1, 3)
+        geometry |= {
+            "bending_stiffness": stiffness(
+                bending_stiffness, "bending_stiffness", dtype, S
+            ),
+            "axial_stiffness": stiffness(axial_stiffness, "axial_stiffness", dtype, S),
+            "weight": weights,
+            "taper": tapers,
+            "marker_offsets": geometry["base"].new_zeros(1, 3),
+        }
         self._set_geometry(geometry)
 
     @property
@@ -297,11 +291,9 @@ class ForceTendonChain(ArcChain):
 
     def tips(self) -> list[ForceTendonChain]:
         """Return one chain per marker, each mapping q (..., n) to x (..., 3)."""
+        offsets = self.marker_offsets.tolist()
         tips = []
-        for (at, *_), offset in zip(
-            self.markers, self.marker_offsets.tolist(), strict=True
-        ):
-            x, y, z = offset
+        for (at, *_), (x, y, z) in zip(self.markers, offsets, strict=True):
             tips.append(self._marked([(at, x, y, z)]))
         return tips
 
@@ -311,7 +303,7 @@ class ForceTendonChain(ArcChain):
 
     def forces(self, q: Tensor) -> Tensor:
         """Return the tendon forces (..., n) [N] at q (..., n); they are not negative."""
-        check_vectors(q, self.n_actuators, "q", self._why_shape())
+        self._check_shape(q)
         return (self.gains.to(q) * q).clamp(min=0.0)
 
     def metres(self, q: Tensor) -> Tensor:
@@ -356,40 +348,41 @@ class ForceTendonChain(ArcChain):
         return self.marker_offsets.to(like).mT[..., None]
 
     def _check_rows(self, rows: Tensor, name: str) -> None:
-        negative = (rows * self.gains.detach().to(rows) < 0.0).any(dim=1)
-        if negative.any():
+        forces = rows * self.gains.detach().to(rows)
+        n_negative = int((forces < 0.0).any(dim=1).sum())
+        if n_negative:
             raise ValueError(
                 f"`{name}` must hold tendon forces that pull, gains * q >= 0, got "
-                f"{int(negative.sum())} of {len(rows)} rows with a negative one."
+                f"{n_negative} of {len(rows)} rows with a negative one."
             )
 
     def _statics(self) -> _Statics:
         """Return the energy of shapes, in float64."""
-        geometry = {name: value.double() for name, value in self.geometry().items()}
-        base = geometry["base"]
         k = self.arcs_per_segment
-        at = (torch.arange(k, dtype=base.dtype, device=base.device) + 0.5) / k
-        outer = (
-            1.0 - geometry["taper"][:, None] * at
-        )  # outer radius over that at the start
-        length = geometry["lengths"][:, None] / k
-        bending = (geometry["bending_stiffness"][:, None] * outer**4 / length).flatten()
-        axial = (geometry["axial_stiffness"][:, None] * outer**2 / length).flatten()
-        weights = geometry["weight"][:, None] * outer**2 * length
-        rest_bends = geometry["rest_bends"].mT.flatten().repeat_interleave(k) / k
-        down = torch.tensor(self.gravity, dtype=base.dtype, device=base.device)
+        base = self.base.double()
+
+        # Outer radius in the middle of each arc over that at the start of the segment, (S, k).
+        at = (torch.arange(k).to(base) + 0.5) / k
+        outer = 1.0 - self.taper.double()[:, None] * at
+
+        length = self.lengths.double()[:, None].expand(-1, k) / k
+        weights = self.weight.double()[:, None] * outer**2 * length
+        axial = self.axial_stiffness.double()[:, None] * outer**2 / length
+        bending = self.bending_stiffness.double()[:, None] * outer**4 / length
+        rest_x, rest_y = self.rest_bends.double()[..., None].expand(-1, -1, k).unbind(1)
+        rest = torch.stack([length, rest_x / k, rest_y / k])
         readings = self._readings().to(base).unflatten(-1, (3, -1))
+        down = torch.tensor(self.gravity, dtype=base.dtype, device=base.device)
         return _Statics(
-            stiffness=torch.cat([axial, bending, bending]),
-            rest=torch.cat([length.expand(-1, k).flatten(), rest_bends]),
+            stiffness=torch.stack([axial, bending, bending]).flatten(),
+            rest=rest.flatten(),
             readings=readings.repeat_interleave(k, dim=-1).flatten(1),
             weights=weights.flatten(),
             offsets=self.arc_offsets.to(base),
             down=base[:3, :3].mT @ down,
         )
 
-    def _arcs(self, q: Tensor) -> Tensor:
-        rows = self._rows(q)
+    def _arcs_of_rows(self, rows: Tensor) -> Tensor:
         return self._at_rest(rows.double()).to(rows)
 
     def _arcs_and_slope(self, rows: Tensor) -> tuple[Tensor, Tensor]:
@@ -397,9 +390,10 @@ class ForceTendonChain(ArcChain):
         arcs = self._at_rest(q)
         statics = self._statics()
         gains = self.gains.to(q)
-        by_force = torch.linalg.solve_ex(statics.hessian(arcs), -statics.readings.mT)
+        hessian = statics.hessian(arcs)
+        by_force, _ = torch.linalg.solve_ex(hessian, -statics.readings.mT)
         pulls = (gains * q >= 0.0) * gains
-        slope = by_force.result * pulls[:, None]
+        slope = by_force * pulls[:, None]
         return arcs.to(rows), slope.permute(1, 2, 0).to(rows)
 
     def _at_rest(self, q: Tensor) -> Tensor:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from os import PathLike
 from typing import TYPE_CHECKING
 
@@ -11,7 +11,6 @@ import torch
 from torch import Tensor, nn
 
 from hybridkin._core.arrays import Numbers, Transform
-from hybridkin._core.blocks import check_vectors, in_blocks
 from hybridkin._core.plan import NoKernel, Plan
 from hybridkin._core.stored import Layout, Restore, Stored
 from hybridkin._core.units import degrees_message, millimetres_message, warn_millimetres
@@ -61,10 +60,11 @@ def _write_plan(plan: Plan, stored: Stored) -> int:
     numbers = []
     origins = stored.derived["origins_at_zero"]
     for origin, axis in zip(origins, stored.array("axes"), strict=True):
-        side = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
+        farthest = np.eye(3)[np.abs(axis).argmin()]
+        side = np.cross(axis, farthest)
         side = side / np.linalg.norm(side)
         turn = np.eye(4)  # turns the joint's axis to z
-        turn[:3, :3] = np.stack([side, np.cross(axis, side), axis], 1)
+        turn[:3, :3] = np.column_stack([side, np.cross(axis, side), axis])
         frame = before @ origin @ turn
         numbers += [frame[:3, :3], frame[:3, 3]]
         before = turn.T
@@ -74,9 +74,8 @@ def _write_plan(plan: Plan, stored: Stored) -> int:
     coupled = not np.array_equal(couplings, np.eye(n_joints))
     if coupled:
         numbers.append(couplings)
-    return plan.node(
-        "rigid", couplings.shape[1], 3, numbers, n_joints, coupled, *slides
-    )
+    n = couplings.shape[1]
+    return plan.node("rigid", n, 3, numbers, n_joints, coupled, *slides)
 
 
 class RigidChain(Chain):
@@ -179,17 +178,20 @@ class RigidChain(Chain):
         if couplings is None:
             couplings = np.eye(n_joints)
         couplings = numeric(couplings, "couplings", need="nm", length=n_joints)
-        self.n_actuators = n = couplings.shape[1]
+        n = couplings.shape[1]
+        self.n_actuators = n
         self.kinds = _strings(kinds, "kinds", ["revolute"] * n_joints)
         self.names = _strings(names, "names", [f"joint_{k + 1}" for k in range(n)])
         if not set(self.kinds) <= set(_KINDS):
             raise ValueError(f"`kinds` must be among {_KINDS}, got {self.kinds}.")
         slides = [kind == "prismatic" for kind in self.kinds]
+        if tip is None:
+            tip = np.eye(4)
         geometry = {
             "origins": origins,
             "axes": axes,
             **joint_limits(n, q_min, q_max, dq_max),
-            "tip": rigid_pose(np.eye(4) if tip is None else tip, "tip"),
+            "tip": rigid_pose(tip, "tip"),
             "tool": numeric(tool, "tool", need="3"),
             "base": pose(base, "base", torch.float64),
             "joint_zeros": filled(joint_zeros, "joint_zeros", torch.float64, (n,)),
@@ -389,12 +391,13 @@ class RigidChain(Chain):
     def from_stored(cls, stored: Stored, restore: Restore) -> RigidChain:
         """Return the arm built from a description."""
         settings = {key: stored.list_of(str, key) for key in cls.layout.settings}
-        arrays = {
-            name: stored.array(name, finite=not name.startswith(("q_", "dq_")))
-            for name in cls.layout.arrays
-            if name in stored.arrays
-        }
-        return cls(**arrays, **settings, dtype=torch.from_numpy(arrays["base"]).dtype)
+        arrays = {}
+        for name in cls.layout.arrays:
+            if name in stored.arrays:
+                is_limit = name in ("q_min", "q_max", "dq_max")
+                arrays[name] = stored.array(name, finite=not is_limit)
+        dtype = torch.from_numpy(arrays["base"]).dtype
+        return cls(**arrays, **settings, dtype=dtype)
 
     def geometry(self) -> dict[str, Tensor]:
         """Return the geometry by name.
@@ -410,17 +413,17 @@ class RigidChain(Chain):
         for name, value in buffers.items():
             self.register_buffer(name, value)
         if links is not None:
-            column = nn.functional.pad(links, (0, 1), value=1.0)[..., None]
-            self.origins = torch.cat([self.origins[..., :3], column], dim=-1)
+            self.origins = _with_positions(self.origins, links)
         motions = joint_motions(self.origins, self.axes, self.slides)
-        u1, u2 = joint_coefficients(-self.couplings @ self.joint_zeros, self.slides)
-        still, by_u1, by_u2 = motions.unbind(1)
-        at_zero = still + u1[:, None, None] * by_u1 + u2[:, None, None] * by_u2
-        tool = self.tip @ nn.functional.pad(self.tool, (0, 1), value=1.0)
-        end = torch.cat([self.tip[:, :3], tool[:, None]], dim=1)
         self.register_buffer("motions", motions)
-        self.register_buffer("origins_at_zero", at_zero)
-        self.register_buffer("end", end)
+
+        # The frames of the joints at q = 0, and the tip in that of the last joint.
+        z = -self.couplings @ self.joint_zeros
+        u1, u2 = joint_coefficients(z[:, None, None], self.slides[:, None, None])
+        still, by_u1, by_u2 = motions.unbind(1)
+        self.register_buffer("origins_at_zero", still + u1 * by_u1 + u2 * by_u2)
+        tool = self.tip[:3, :3] @ self.tool + self.tip[:3, 3]
+        self.register_buffer("end", _with_positions(self.tip, tool))
 
     @property
     def default_parameters(self) -> tuple[str, ...]:
@@ -438,8 +441,8 @@ class RigidChain(Chain):
         farthest = torch.maximum(self.q_min.abs(), self.q_max.abs())
         farthest = torch.where(torch.isfinite(farthest), farthest, 0.0)
         links = self.origins[:, :3, 3].norm(dim=1).sum()
-        ends = self.tip[:3, 3].norm() + self.tool.norm()
-        reach = links + self._strokes(farthest) + ends
+        end_link = self.tip[:3, 3].norm() + self.tool.norm()
+        reach = links + self._strokes(farthest) + end_link
         return torch.where(reach > 0, reach, 1.0)
 
     def longest(self, largest: Tensor) -> Tensor:
@@ -453,8 +456,8 @@ class RigidChain(Chain):
     @property
     def turns(self) -> Tensor:
         """Which actuators are angles with a period of one turn, shape (n,), bool."""
-        still = torch.where(self.slides[:, None], 0.0, self.couplings.round())
-        return (self.couplings == still).all(0)
+        whole_turns = torch.where(self.slides[:, None], 0.0, self.couplings.round())
+        return (self.couplings == whole_turns).all(0)
 
     @property
     def units(self) -> list[str]:
@@ -465,7 +468,8 @@ class RigidChain(Chain):
     def coordinates(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return joint positions from the origins at rows q (N, n), and dz/dq (n_joints, n)."""
         couplings = self.couplings.to(q)
-        return (q - self.joint_zeros.to(q)) @ couplings.mT, couplings
+        moved = q - self.joint_zeros.to(q)
+        return moved @ couplings.mT, couplings
 
     def from_coordinates(self, z: Tensor) -> Tensor:
         """Return the tip (N, 3) at joint positions z (N, n_joints)."""
@@ -491,14 +495,19 @@ class RigidChain(Chain):
         Tensor of shape (..., 3)
             Tip position in the measuring frame [m].
         """
-        return self._by_rows(lambda z: (self.from_coordinates(z),), q)[0]
+        (x,) = self._by_rows(
+            lambda rows: (self.from_coordinates(self._joints(rows)),), q
+        )
+        return x
 
     def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return the tip (..., 3) [m] and its Jacobian dx/dq (..., 3, n) in one pass.
 
         In closed form, in [m/rad] for revolute joints and [-] for prismatic ones.
         """
-        x, J = self._by_rows(self.from_coordinates_and_jacobian, q)
+        x, J = self._by_rows(
+            lambda rows: self.from_coordinates_and_jacobian(self._joints(rows)), q
+        )
         return x, J @ self.couplings.to(q)
 
     def pose_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
@@ -506,7 +515,8 @@ class RigidChain(Chain):
         pose, J = self._by_rows(self._pose_and_columns, q)
         return pose, J @ self.couplings.to(q)
 
-    def _pose_and_columns(self, z: Tensor) -> tuple[Tensor, Tensor]:
+    def _pose_and_columns(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        z = self._joints(rows)
         frames = self._frames(z)
         _, linear, axes = self._columns(frames)
         angular = torch.where(self.slides.to(z.device)[:, None, None], 0.0, axes)
@@ -528,9 +538,15 @@ class RigidChain(Chain):
             Homogeneous transforms into the measuring frame; the last one is that of the tip: the
             end link's frame, shifted to the tool.
         """
-        frames = self._by_rows(lambda z: (as_poses(self._frames(z)),), q)[0]
-        tip = frames[..., -1:, :, :] @ self.end.to(q)
-        return torch.cat([frames[..., :-1, :, :], tip], dim=-3)
+        *links, last = self._joint_poses(q).unbind(-3)
+        return torch.stack([*links, last @ self.end.to(q)], dim=-3)
+
+    def _joint_poses(self, q: Tensor) -> Tensor:
+        """Return the poses (..., n_joints + 1, 4, 4) of the base and of all joints' frames."""
+        (poses,) = self._by_rows(
+            lambda rows: (as_poses(self._frames(self._joints(rows))),), q
+        )
+        return poses
 
     def pose(self, q: Tensor) -> Tensor:
         """Return the tip's pose in the measuring frame, shape (..., 4, 4)."""
@@ -553,21 +569,20 @@ class RigidChain(Chain):
         """
         if n_points < 1:
             raise ValueError(f"`n_points` must be at least 1, got {n_points}.")
-        frames = self._by_rows(lambda z: (as_poses(self._frames(z)),), q)[0]
-        corners = torch.cat([frames[..., :3, 3], self(q)[..., None, :]], dim=-2)
+        joints = self._joint_poses(q)[..., :3, 3]
+        corners = torch.cat([joints, self(q)[..., None, :]], dim=-2)
         start = corners[..., :-1, None, :]
         end = corners[..., 1:, None, :]
-        fractions = torch.linspace(
-            0.0, 1.0, n_points + 1, dtype=q.dtype, device=q.device
-        )
-        points = torch.lerp(start, end, fractions[1:, None]).flatten(-3, -2)
-        return torch.cat([corners[..., :1, :], points], dim=-2)
+        places = torch.arange(1, n_points + 1, dtype=q.dtype, device=q.device)
+        points = torch.lerp(start, end, places[:, None] / n_points)
+        return torch.cat([corners[..., :1, :], points.flatten(-3, -2)], dim=-2)
 
     def unit_messages(self, q: Tensor, name: str, factor: float = 1.0) -> list[str]:
         """Return warnings if joints turn by more than two turns, or slide too far."""
         turns = torch.tensor([unit == "rad" for unit in self.units], device=q.device)
-        turned = degrees_message(name, q[:, turns].abs(), factor)
-        slid = millimetres_message(name, q[:, ~turns].abs(), factor * _FAR)
+        sizes = q.abs()
+        turned = degrees_message(name, sizes[:, turns], factor)
+        slid = millimetres_message(name, sizes[:, ~turns], factor * _FAR)
         return [message for message in (turned, slid) if message is not None]
 
     def extra_repr(self) -> str:
@@ -577,12 +592,10 @@ class RigidChain(Chain):
     def _why_shape(self) -> str:
         return f"this arm has {self.n_actuators} moving joints"
 
-    def _by_rows(
-        self, function: Callable[[Tensor], tuple[Tensor, ...]], q: Tensor
-    ) -> tuple[Tensor, ...]:
-        """Return a function of joint positions (N, n_joints) at q (..., n)."""
-        check_vectors(q, self.n_actuators, "q", self._why_shape())
-        return in_blocks(lambda rows: function(self.coordinates(rows)[0]), q)
+    def _joints(self, rows: Tensor) -> Tensor:
+        """Return the joint positions (N, n_joints) from the origins at rows q (N, n)."""
+        z, _ = self.coordinates(rows)
+        return z
 
     def _frames(self, z: Tensor) -> Tensor:
         """Return the `moving_frames` at joint positions (N, n_joints), (n_joints + 1, 4, 3, N)."""
@@ -598,8 +611,14 @@ class RigidChain(Chain):
         axes = (self.axes.to(frames)[..., None, None] * frames[1:, :3]).sum(1)
         turning = torch.linalg.cross(axes, tip - frames[1:, 3], dim=1)
         slides = self.slides.to(frames.device)[:, None, None]
-        # NaN in a row of NaN.
-        return tip, torch.where(slides, axes + (tip - tip), turning), axes
+        sliding = axes + (tip - tip)  # NaN in a row of NaN
+        return tip, torch.where(slides, sliding, turning), axes
+
+
+def _with_positions(poses: Tensor, positions: Tensor) -> Tensor:
+    """Return poses (..., 4, 4) with other positions (..., 3)."""
+    column = nn.functional.pad(positions, (0, 1), value=1.0)
+    return torch.cat([poses[..., :3], column[..., None]], dim=-1)
 
 
 def _strings(

@@ -53,7 +53,7 @@ def test_a_light_beam_sags_like_a_cantilever():
 def test_the_shape_has_least_energy():
     body = chain()
     statics = body._statics()
-    arcs = body._arcs(forces())
+    arcs = body._arcs_of_rows(forces())
     assert_close(statics.imbalance(arcs, forces()), torch.zeros_like(arcs), rtol=0, atol=1e-12)
     energy = statics.energy(arcs, forces())
     random = torch.Generator().manual_seed(1)
