@@ -9,9 +9,15 @@ from sklearn.utils import gen_batches
 from hybridkin.learning._ridge import moments
 
 _BLOCK_ELEMENTS = 2_000_000  # 16 MB of float64 per temporary
-_PAIRED = (
-    4  # rows whose products with all rows before are computed at once, in the cache
-)
+# Rows whose products with all rows before are computed at once, in the cache.
+_PAIRED = 4
+
+
+def left_out(elm, stats, X, y, weights, fit_intercept):
+    """Return the `LeftOut` for these rows, see there for the parameters."""
+    few_rows = len(X) <= len(elm.output_weights)
+    kind = _OfFewRows if few_rows else _OfManyRows
+    return kind(elm, stats, X, y, weights, fit_intercept)
 
 
 class LeftOut:
@@ -19,9 +25,8 @@ class LeftOut:
 
     All rows have the residuals ``r = y - Phi W = P y`` with ``P = 1 - Phi A^-1 Phi'`` and
     ``A = Phi' Phi + alpha 1``. The errors on rows S of a fit without S are ``P_SS^-1 r_S``; no
-    refit is needed. In the eigenbasis of ``Phi' Phi``, with coordinates Z, ``P = 1 - Z D Z'`` with
-    a diagonal D. If there are fewer rows than features, Z is the eigenbasis of ``Phi Phi'`` and
-    ``P = Z D Z'``, without cancellation. Rows are multiplied by the root of their weight.
+    refit is needed. Subclasses choose coordinates Z in which ``P = P_0 + Z D Z'``, with a diagonal
+    D. Rows are multiplied by the root of their weight.
 
     Parameters
     ----------
@@ -45,31 +50,48 @@ class LeftOut:
 
     def __init__(self, elm, stats, X, y, weights, fit_intercept):
         n_features = len(elm.output_weights)
+        mean, G, C, _ = moments(stats, n_features, fit_intercept)
         self._elm = elm
         self._X = X
         self._intercept = fit_intercept
-        mean, G, C, _ = moments(stats, n_features, fit_intercept)
         self._n = stats.n
         self._center = mean[:n_features]
         self._root = np.sqrt(weights)
         self._y = (y - mean[n_features:]) * self._root[:, None]
-        self._wide = len(X) <= n_features
-        if self._wide:
-            phi = self._features(np.arange(len(X)))
-            gram = phi @ phi.T
-            if fit_intercept:  # the direction of the mean, without residual, comes last
-                gram += (
-                    (1 + np.trace(gram)) * np.outer(self._root, self._root) / self._n
-                )
-            eigenvalues, self._basis = linalg.eigh(gram)
-            if fit_intercept:
-                eigenvalues = eigenvalues[:-1]
-                self._basis = self._basis[:, :-1]
-            self._Zy = self._basis.T @ self._y
-        else:
-            eigenvalues, self._basis = linalg.eigh(G)
-            self._Zy = self._basis.T @ C
+        eigenvalues, self._basis, self._Zy = self._decomposed(G, C)
         self.eigenvalues = np.maximum(eigenvalues, 0.0)
+
+    def _decomposed(self, G, C):
+        """Return the eigenvalues, their eigenvectors and Z' y."""
+        raise NotImplementedError
+
+    def _d(self, alphas):
+        """Return the diagonals of D, (n_alphas, n_eigenvalues)."""
+        raise NotImplementedError
+
+    def _z(self, rows):
+        """Return Z of some rows."""
+        raise NotImplementedError
+
+    def _constant(self, rows):
+        """Return P_0 of some rows."""
+        raise NotImplementedError
+
+    def _constant_diagonal(self, rows):
+        """Return the diagonal of P_0 of some rows."""
+        raise NotImplementedError
+
+    def _residuals(self, Z, D, rows):
+        """Return the residuals r (n_alphas, n_rows, n_outputs) of a fit to all rows."""
+        raise NotImplementedError
+
+    def _is_refitted(self, out) -> bool:
+        """Return whether the errors of a split come from `_refitted`."""
+        return False
+
+    def _refitted(self, out, asked, alphas):
+        """Return the errors of one split from sums over the remaining rows."""
+        raise NotImplementedError
 
     def alone(self, alphas):
         """Yield blocks of rows and their errors (n_alphas, n_rows, n_outputs), each held out alone.
@@ -83,11 +105,10 @@ class LeftOut:
         for batch in gen_batches(len(self._X), self._rows_at_a_time(len(alphas))):
             rows = np.arange(batch.start, batch.stop)
             Z = self._z(rows)
-            root = self._root[rows]
-            p = D @ (Z * Z).T
-            if not self._wide:
-                p += 1.0 - (root**2 / self._n if self._intercept else 0.0)
-            yield rows, self._residuals(Z, D, rows) / p[:, :, None] / root[:, None]
+            diagonal = D @ (Z * Z).T
+            diagonal += self._constant_diagonal(rows)
+            errors = self._residuals(Z, D, rows) / diagonal[:, :, None]
+            yield rows, errors / self._root[rows, None]
 
     def together(self, splits, alphas):
         """Yield the asked rows of each split, and their errors (n_alphas, n_asked, n_outputs).
@@ -101,53 +122,47 @@ class LeftOut:
         """
         D = self._d(alphas)
         for part in self._in_parts(splits, self._rows_at_a_time(len(alphas))):
-            rows = np.concatenate([out for out, _ in part])
-            if not self._wide and len(rows) > len(self._center) and len(part) == 1:
-                out, held_out = part[0]
-                yield held_out, self._refitted(out, held_out, alphas)
+            out, asked = part[0]
+            if self._is_refitted(out):
+                yield asked, self._refitted(out, asked, alphas)
                 continue
+            rows = np.concatenate([out for out, _ in part])
             Z = self._z(rows)
             residuals = self._residuals(Z, D, rows)
             start = 0
-            for out, held_out in part:
+            for out, asked in part:
                 stop = start + len(out)
                 errors = self._solved(Z[start:stop], D, residuals[:, start:stop], out)
-                yield (
-                    held_out,
-                    errors[:, np.searchsorted(out, held_out)]
-                    / self._root[held_out, None],
-                )
+                of_asked = errors[:, np.searchsorted(out, asked)]
+                yield asked, of_asked / self._root[asked, None]
                 start = stop
 
     def _in_parts(self, splits, n_rows):
         """Yield lists of splits that together hold out at most `n_rows` rows, or a single one.
 
-        A split of more rows than features is single, see `_refitted`.
+        A split that is refitted is single.
         """
         part = []
         size = 0
         for split in splits:
             count = len(split[0])
-            single = not self._wide and count > len(self._center)
-            if part and (single or size + count > n_rows):
+            if self._is_refitted(split[0]):
+                count = n_rows
+            if part and size + count > n_rows:
                 yield part
                 part = []
                 size = 0
             part.append(split)
-            size = n_rows if single else size + count
+            size += count
         if part:
             yield part
 
     def _solved(self, Z, D, residuals, out):
         """Return P_SS^-1 r_S (n_alphas, n_out, n_outputs) for the rows S."""
-        fixed = np.zeros((len(out), len(out)))
-        if not self._wide:
-            fixed += np.eye(len(out))
-            if self._intercept:
-                fixed -= np.outer(self._root[out], self._root[out]) / self._n
+        constant = self._constant(out)
         errors = np.empty(residuals.shape)
         for k, lower in enumerate(_products(Z, D)):
-            lower += fixed
+            lower += constant
             # Its transpose is in the order of LAPACK.
             _, errors[k], failed = dposv(lower.T, residuals[k])
             if failed:  # by singular values: P may have none left
@@ -156,55 +171,118 @@ class LeftOut:
         return errors
 
     def _rows_at_a_time(self, n_alphas):
-        return max(
-            1, _BLOCK_ELEMENTS // (len(self._center) + n_alphas * self._y.shape[1])
-        )
-
-    def _d(self, alphas):
-        numerator = alphas[:, None] if self._wide else -1.0
-        return numerator / np.add.outer(alphas, self.eigenvalues)
-
-    def _z(self, rows):
-        return self._basis[rows] if self._wide else self._features(rows) @ self._basis
+        numbers_of_row = len(self._center) + n_alphas * self._y.shape[1]
+        return max(1, _BLOCK_ELEMENTS // numbers_of_row)
 
     def _features(self, rows):
         q = torch.from_numpy(self._X[rows].astype(np.float64))
         with torch.no_grad():
-            phi = self._elm.features(q.to(self._elm.input_center.device)).numpy(
-                force=True
-            )
-        return (phi - self._center) * self._root[rows, None]
+            phi = self._elm.features(q.to(self._elm.input_center.device))
+        return (phi.numpy(force=True) - self._center) * self._root[rows, None]
+
+    def _projected(self, Z, D):
+        """Return Z D Z' y for every penalty (n_alphas, n_rows, n_outputs)."""
+        by_alpha = D.T[:, :, None] * self._Zy[:, None]
+        products = Z @ by_alpha.reshape(Z.shape[1], -1)
+        return products.reshape(len(Z), len(D), -1).swapaxes(0, 1)
+
+
+class _OfFewRows(LeftOut):
+    """At most as many rows as features: Z is the eigenbasis of ``Phi Phi'``, and P_0 is zero.
+
+    Nothing cancels in ``P = Z D Z'`` with ``D = alpha / (eigenvalues + alpha)``.
+    """
+
+    def _decomposed(self, G, C):
+        phi = self._features(np.arange(len(self._X)))
+        gram = phi @ phi.T
+        if self._intercept:  # the direction of the mean, without residual, comes last
+            mean_direction = np.outer(self._root, self._root) / self._n
+            gram += (1 + np.trace(gram)) * mean_direction
+        eigenvalues, basis = linalg.eigh(gram)
+        if self._intercept:
+            eigenvalues = eigenvalues[:-1]
+            basis = basis[:, :-1]
+        return eigenvalues, basis, basis.T @ self._y
+
+    def _d(self, alphas):
+        return alphas[:, None] / np.add.outer(alphas, self.eigenvalues)
+
+    def _z(self, rows):
+        return self._basis[rows]
+
+    def _constant(self, rows):
+        return 0.0
+
+    _constant_diagonal = _constant
 
     def _residuals(self, Z, D, rows):
-        """Return the residuals r (n_alphas, n_rows, n_outputs) of a fit to all rows."""
-        by_alpha = (D.T[:, :, None] * self._Zy[:, None]).reshape(Z.shape[1], -1)
-        r = (Z @ by_alpha).reshape(len(Z), len(D), -1).swapaxes(0, 1)
-        return r if self._wide else self._y[rows] + r
+        return self._projected(Z, D)
+
+
+class _OfManyRows(LeftOut):
+    """More rows than features: Z are coordinates of phi in the eigenbasis of ``Phi' Phi``.
+
+    ``P_0 = 1``, without the direction of the mean if there is an intercept, and
+    ``D = -1 / (eigenvalues + alpha)``.
+    """
+
+    def _decomposed(self, G, C):
+        eigenvalues, basis = linalg.eigh(G)
+        return eigenvalues, basis, basis.T @ C
+
+    def _d(self, alphas):
+        return -1.0 / np.add.outer(alphas, self.eigenvalues)
+
+    def _z(self, rows):
+        return self._features(rows) @ self._basis
+
+    def _constant(self, rows):
+        constant = np.eye(len(rows))
+        if self._intercept:
+            constant -= np.outer(self._root[rows], self._root[rows]) / self._n
+        return constant
+
+    def _constant_diagonal(self, rows):
+        if self._intercept:
+            return 1.0 - self._root[rows] ** 2 / self._n
+        return 1.0
+
+    def _residuals(self, Z, D, rows):
+        return self._y[rows] + self._projected(Z, D)
+
+    def _is_refitted(self, out) -> bool:
+        """Return whether sums over the remaining rows are faster than P_SS."""
+        return len(out) > len(self._center)
 
     def _refitted(self, out, asked, alphas):
-        """Return the errors of one split from sums over the remaining rows; faster for large S."""
         n_features = len(self._center)
+        # Sums of squares and products of [Z, y], in the eigenbasis, less those of the rows out.
         scatter = np.diag(np.append(self.eigenvalues, np.zeros(self._y.shape[1])))
         scatter[:n_features, n_features:] = self._Zy
         total = np.zeros(len(scatter))
         weight = self._n
         for batch in gen_batches(len(out), self._rows_at_a_time(0)):
             rows = out[batch]
+            root = self._root[rows]
             z = np.hstack([self._z(rows), self._y[rows]])
             scatter -= z.T @ z
-            total -= self._root[rows] @ z
-            weight -= np.sum(self._root[rows] ** 2)
+            total -= root @ z
+            weight -= np.sum(root**2)
         mean = total / weight * self._intercept
         scatter -= weight * np.outer(mean, mean)
+        # Ridge regression on the remaining rows.
         eigenvalues, V = linalg.eigh(scatter[:n_features, :n_features])
         shrunk = 1.0 / np.add.outer(alphas, np.maximum(eigenvalues, 0.0))
-        W = V @ (shrunk[:, :, None] * (V.T @ scatter[:n_features, n_features:]))
+        moment = V.T @ scatter[:n_features, n_features:]
+        W = V @ (shrunk[:, :, None] * moment)
         errors = np.empty((len(alphas), len(asked), self._y.shape[1]))
         for batch in gen_batches(len(asked), self._rows_at_a_time(len(alphas))):
-            root = self._root[asked[batch], None]
-            z = self._z(asked[batch]) / root
-            y = self._y[asked[batch]] / root
-            errors[:, batch] = y - mean[n_features:] - (z - mean[:n_features]) @ W
+            rows = asked[batch]
+            root = self._root[rows, None]
+            z = self._z(rows) / root - mean[:n_features]
+            y = self._y[rows] / root - mean[n_features:]
+            errors[:, batch] = y - z @ W
         return errors
 
 

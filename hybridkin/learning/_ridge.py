@@ -92,18 +92,26 @@ def ridge(G, C, alpha):
     root = np.sqrt(A.diagonal())[:, None]
     root[root == 0] = 1.0
     scaled = A / root / root.T
-    L, info = dpotrf(scaled, lower=True)
-    if info == 0 and dpocon(L, np.abs(scaled).sum(0).max(), uplo="L")[0] > eps:
+    L, failed = dpotrf(scaled, lower=True)
+    reciprocal_condition = 0.0
+    if not failed:
+        norm = np.abs(scaled).sum(0).max()
+        reciprocal_condition, _ = dpocon(L, norm, uplo="L")
+    if reciprocal_condition > eps:
         W = linalg.cho_solve((L, True), C / root) / root
-        R = dtrtri(L, lower=True)[0].T / root
-        return W, R, len(G) - alpha * np.sum(R * R), "cholesky"
+        inverse, _ = dtrtri(L, lower=True)
+        R = inverse.T / root
+        dof = len(G) - alpha * np.sum(R * R)
+        return W, R, dof, "cholesky"
     eigenvalues, V = linalg.eigh(G)
     shifted = eigenvalues + alpha
     cutoff = max(eps * shifted[-1], np.finfo(np.float64).tiny)
     regular = shifted > cutoff
-    W = V[:, regular] @ ((V[:, regular].T @ C) / shifted[regular, None])
+    axes = V[:, regular]
+    W = axes @ ((axes.T @ C) / shifted[regular, None])
     R = V / np.sqrt(np.maximum(shifted, cutoff))
-    return W, R, np.sum(eigenvalues[regular] / shifted[regular]), "eigh"
+    dof = np.sum(eigenvalues[regular] / shifted[regular])
+    return W, R, dof, "eigh"
 
 
 @np.errstate(over="ignore", invalid="ignore")
@@ -156,6 +164,6 @@ def fit_readout(stats, n_features, alpha, fit_intercept):
         "intercept": mean[n_features:] - mu @ W,
         "leverage_center": mu,
         "leverage_factor": R,
-        "leverage_offset": np.float64(1 / n if fit_intercept else 0),
+        "leverage_offset": np.float64(fit_intercept / n),
     }
     return readout, noise, max(solvers)  # "eigh" if any

@@ -113,11 +113,12 @@ class FittedNetwork(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """Return the prediction and, if `jacobian`, its derivative."""
         check_is_fitted(self, "module_")
         program = program_of(self.module_)
-        if program is None:
-            both = ELM.forward_and_jacobian if jacobian else lambda elm, q: (elm(q),)
-            return self._map(X, both)
-        X = check_inputs(self, X)
-        return self._shaped(X, program.evaluate(X, jacobian)[: 1 + jacobian])
+        if program is not None:
+            X = check_inputs(self, X)
+            return self._shaped(X, program.evaluate(X, jacobian)[: 1 + jacobian])
+        if jacobian:
+            return self._map(X, ELM.forward_and_jacobian)
+        return self._map(X, lambda elm, q: (elm(q),))
 
     def _map(self, X, function):
         """Return the arrays of `function(module, q)`, computed in blocks of rows."""
@@ -127,16 +128,17 @@ class FittedNetwork(MultiOutputMixin, RegressorMixin, BaseEstimator):
         size = BLOCK_ELEMENTS // max(elm.output_weights.shape[0], elm.tangent.shape[1])
         with torch.no_grad():
             q = copied(X, elm.input_center.device, np.float64)
-            parts = in_blocks(
-                partial(function, elm), q, int(self.block_size or max(1, size))
-            )
+            block_size = int(self.block_size or max(1, size))
+            parts = in_blocks(partial(function, elm), q, block_size)
         return self._shaped(X, [part.cpu().numpy() for part in parts])
 
     def _shaped(self, X, arrays):
         """Return arrays in the dtype of X; for a one-dimensional y without the output axis."""
         with np.errstate(over="ignore"):  # overflow of float32
             outputs = [array.astype(X.dtype, copy=False) for array in arrays]
-        return tuple(a[:, 0] if self._y_ndim == 1 < a.ndim else a for a in outputs)
+        if self._y_ndim == 1:
+            outputs = [array[:, 0] if array.ndim > 1 else array for array in outputs]
+        return tuple(outputs)
 
 
 class ELMRegressor(FittedNetwork):

@@ -21,7 +21,7 @@ from hybridkin._core.arrays import LARGEST, labels
 from hybridkin._core.distinct import at_place, distinct_rows
 from hybridkin._core.stored import plain
 from hybridkin._core.turns import TURNS
-from hybridkin.learning._left_out import LeftOut
+from hybridkin.learning._left_out import LeftOut, left_out
 from hybridkin.learning._ridge import gather
 from hybridkin.learning.elm import ELMRegressor, FittedNetwork
 from hybridkin.learning.hidden_layer import check_rows, device_named, draw_layer
@@ -268,7 +268,9 @@ class _Search:
         self.X = X
         self.targets = targets
         self.sample_weight = sample_weight
-        self.weights = np.ones(len(X)) if sample_weight is None else sample_weight
+        self.weights = sample_weight
+        if sample_weight is None:
+            self.weights = np.ones(len(X))
         self.splits = splits
         self.alphas = alphas
         self.tried: list[_Candidate] = []
@@ -286,29 +288,29 @@ class _Search:
         elm = elm.to(device_named(candidate.device))
         rows = self.X, self.targets, self.sample_weight
         stats = gather(None, elm, *rows, candidate.block_size)
-        left_out = LeftOut(
+        held_out = left_out(
             elm, stats, self.X, self.targets, self.weights, candidate.fit_intercept
         )
         if isinstance(self.alphas, str):
-            alphas = _AUTO_ALPHAS * (left_out.eigenvalues[-1] or 1.0)
+            alphas = _AUTO_ALPHAS * (held_out.eigenvalues[-1] or 1.0)
         else:
             alphas = _positive(self.alphas, "alphas")
         total = np.zeros((len(alphas), self.targets.shape[1]))
         weight = 0.0
-        for held_out, errors in self._errors(left_out, alphas):
-            w = self.weights[held_out]
+        for rows_out, errors in self._errors(held_out, alphas):
+            w = self.weights[rows_out]
             total += np.einsum("r, lrm -> lm", w, errors * errors)
             weight += w.sum()
         mse = np.where(np.isfinite(total), total / weight, np.inf).mean(axis=1)
         params = {**params, "alpha": float(alphas[mse.argmin()])}
         score = float(mse.min())
-        self.tried.append(_Candidate(params, relevance, alphas, mse, score, left_out))
+        self.tried.append(_Candidate(params, relevance, alphas, mse, score, held_out))
 
-    def _errors(self, left_out, alphas):
+    def _errors(self, held_out, alphas):
         """Yield held-out rows and their errors (n_alphas, n_rows, n_outputs)."""
         if self.splits is None:
-            return left_out.alone(alphas)
-        return left_out.together(self.splits, alphas)
+            return held_out.alone(alphas)
+        return held_out.together(self.splits, alphas)
 
     def held_out_errors(self, candidate):
         """Return target minus prediction of every row, held out; a mean over splits, or NaN."""
@@ -376,9 +378,8 @@ def _relevance(best, search):
         total = total + np.tensordot(weights, J, 1)
         squares = squares + np.tensordot(weights, J * J, 1)
     weight = search.weights.sum()
-    spread = np.sqrt(
-        np.maximum(squares / weight - (total / weight) ** 2, 0.0).sum(axis=0)
-    )
+    variance = squares / weight - (total / weight) ** 2
+    spread = np.sqrt(np.maximum(variance, 0.0).sum(axis=0))
     relevance = np.maximum(spread / (spread.max() or 1.0), _LEAST_RELEVANCE)
     half = scale / relevance
     return relevance, np.array([center - half, center + half])
@@ -419,7 +420,8 @@ def _splits(cv, groups, n_rows, place):
         tested = np.zeros(n_rows + 1, dtype=bool)
         trained[place[train]] = True
         tested[place[test]] = True
-        held_out = np.flatnonzero((~trained | tested)[:-1])
+        out = ~trained | tested
+        held_out = np.flatnonzero(out[:-1])
         asked = np.flatnonzero(tested[:-1])
         if len(asked):
             splits.append((held_out, asked))
@@ -428,12 +430,12 @@ def _splits(cv, groups, n_rows, place):
 
 def _positive(values, name, integer=False):
     array = np.atleast_1d(np.asarray(values))
-    kind = np.integer if integer else np.number
+    kind = np.number
+    need = f"positive numbers, over {1.0 / LARGEST:g}"
+    if integer:
+        kind = np.integer
+        need = "positive integers"
     fits = array.ndim == 1 and array.size and np.issubdtype(array.dtype, kind)
     if not fits or not (np.isfinite(array) & (array > 1.0 / LARGEST)).all():
-        if integer:
-            need = "positive integers"
-        else:
-            need = f"positive numbers, over {1.0 / LARGEST:g}"
         raise ValueError(f"`{name}` must be one or more {need}, got {values!r}.")
     return array

@@ -76,9 +76,9 @@ def lever_numbers(plan, offset, center, factor):
     ends = range(n_features, 0, -HK_GROUP)[::-1]
     columns = np.split(padded, len(ends), axis=1)
     numbers = [offset, center, np.zeros(-(1 + n_features) % HK_GROUP)]
-    for block, end in zip(columns, ends, strict=True):
-        numbers.append(block if full else block[:end])
-    return full, numbers
+    if not full:
+        columns = [block[:end] for block, end in zip(columns, ends, strict=True)]
+    return full, numbers + columns
 
 
 def write_network(plan, stored, leverage=False):
@@ -142,9 +142,12 @@ class ELM(LeverageModule):
             "input_bias": "h",
             "input_center": "n",
             "input_scale": "n",
-        }
-        | {"output_weights": "fm", "intercept": "m", "leverage_offset": ""}
-        | {"leverage_center": "f", "leverage_factor": "ff"},
+            "output_weights": "fm",
+            "intercept": "m",
+            "leverage_offset": "",
+            "leverage_center": "f",
+            "leverage_factor": "ff",
+        },
         {"activation": str},
         write_plan=write_network,
     )
@@ -194,7 +197,9 @@ class ELM(LeverageModule):
             out[:, n_hidden:] = u
 
     def _features(self, u, s):
-        return torch.cat((s, u), -1) if len(self.output_weights) > s.shape[-1] else s
+        if len(self.output_weights) > s.shape[-1]:
+            return torch.cat((s, u), -1)
+        return s
 
     def _readout(self, u, s):
         weights = self.output_weights.to(s)
@@ -203,9 +208,11 @@ class ELM(LeverageModule):
 
     def _slope(self, a, s):
         slope = ACTIVATIONS[self.activation][1](a, s)
-        J = (self.tangent.to(s) @ slope.T).T.unflatten(-1, (len(self.intercept), -1))
-        if len(self.output_weights) > s.shape[-1]:
-            J = J + (self.output_weights[s.shape[-1] :].T / self.input_scale).to(s)
+        columns = (self.tangent.to(s) @ slope.T).T
+        J = columns.unflatten(-1, (len(self.intercept), -1))
+        direct = self.output_weights[s.shape[-1] :]
+        if len(direct):
+            J = J + (direct.T / self.input_scale).to(s)
         return J
 
     def features(self, q):
@@ -220,9 +227,11 @@ class ELM(LeverageModule):
 
     def forward_and_jacobian(self, q):
         """Return ``forward(q)`` and ``jacobian(q)`` from one evaluation of the hidden layer."""
-        x, J = self._in_blocks(
-            q, lambda u, a, s: (self._readout(u, s), self._slope(a, s))
-        )
+
+        def rows(u, a, s):
+            return self._readout(u, s), self._slope(a, s)
+
+        x, J = self._in_blocks(q, rows)
         return x, J
 
     def forward_jacobian_and_leverage(self, q):

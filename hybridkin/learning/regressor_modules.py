@@ -59,21 +59,19 @@ def error_module(regressor: Regressor, q: Tensor) -> ForwardModel:
         offset, slope = _affine(steps.pop(0))
         center = center + scale * offset
         scale = scale * slope
-    readout = steps[-1]
-    if len(steps) == 1 and isinstance(readout, _LINEAR):
+    *before, readout = steps
+    if isinstance(readout, _LINEAR):
         coef, intercept = _line(readout)
-        return AffineModule(coef / scale, intercept - coef / scale @ center)
-    if len(steps) == 1 and type(readout) is KernelRidge and readout.kernel == "rbf":
+        if not before:
+            coef = coef / scale
+            return AffineModule(coef, intercept - coef @ center)
+        if len(before) == 1 and isinstance(before[0], PolynomialFeatures):
+            # The intercept is a monomial.
+            powers = np.pad(before[0].powers_, ((1, 0), (0, 0)))
+            weights = np.vstack([intercept, coef.T])
+            return PolynomialModule(powers, weights, center, scale)
+    if not before and type(readout) is KernelRidge and readout.kernel == "rbf":
         return _kernel_module(readout, center, scale)
-    if (
-        len(steps) == 2
-        and isinstance(steps[0], PolynomialFeatures)
-        and isinstance(readout, _LINEAR)
-    ):
-        coef, intercept = _line(readout)
-        # The intercept is a monomial.
-        powers = np.pad(steps[0].powers_, ((1, 0), (0, 0)))
-        return PolynomialModule(powers, np.vstack([intercept, coef.T]), center, scale)
     return RegressorModule(regressor, q)
 
 
@@ -93,8 +91,12 @@ def _affine(scaler: Any) -> tuple[NDArray, NDArray]:
     """Return center and scale of a fitted scaler, u = (q - center) / scale."""
     if hasattr(scaler, "min_"):  # a MinMaxScaler
         return -scaler.min_ / scaler.scale_, 1.0 / scaler.scale_
-    center = scaler.mean_ if scaler.with_mean else np.array(0.0)
-    scale = scaler.scale_ if scaler.with_std else np.array(1.0)
+    center = np.zeros(scaler.n_features_in_)
+    scale = np.ones(scaler.n_features_in_)
+    if scaler.with_mean:
+        center = scaler.mean_
+    if scaler.with_std:
+        scale = scaler.scale_
     return center, scale
 
 
@@ -116,13 +118,11 @@ def _register(module: nn.Module, **arrays: ArrayLike) -> None:
 
 def _write_affine(plan: Plan, stored: Stored) -> int:
     coef = stored.array("coef")
-    bias = stored.array("bias")
     m, n = coef.shape
-    readout = bias, coef, np.zeros((m, 0))
-    hidden = np.zeros((0, n)), np.zeros(0)
-    return write_units(
-        plan, "affine", "sin", (np.zeros(n), np.ones(n)), readout, hidden
-    )
+    scaling = np.zeros(n), np.ones(n)
+    readout = stored.array("bias"), coef, np.zeros((m, 0))
+    no_units = np.zeros((0, n)), np.zeros(0)
+    return write_units(plan, "affine", "sin", scaling, readout, no_units)
 
 
 class AffineModule(ForwardModel):
@@ -204,24 +204,20 @@ class PolynomialModule(ForwardModel):
             raise ValueError(f"'powers' must hold whole numbers below {_MOST_POWER}")
         self.n_actuators = exponents.shape[1]
         self.n_outputs = coef.shape[1]
-        k, j = np.nonzero(exponents)  # monomial k has a derivative along input j
+        # Monomial k has a derivative along input j: another monomial.
+        k, j = np.nonzero(exponents)
         lower = exponents[k] - np.eye(self.n_actuators)[j]
         both = np.vstack([exponents, lower])
-        distinct, where = np.unique(both, axis=0, return_inverse=True)
-        places, below = np.split(where.reshape(-1), [len(exponents)])
+        distinct, place = np.unique(both, axis=0, return_inverse=True)
+        of_monomial, of_slope = np.split(place.reshape(-1), [len(exponents)])
+        # The readouts of the polynomial and of its Jacobian.
         values = np.zeros((len(distinct), self.n_outputs))
-        slope = np.zeros((len(distinct), self.n_actuators, self.n_outputs))
-        np.add.at(values, places, coef)
-        np.add.at(slope, (below, j), exponents[k, j][:, None] * coef[k])
-        slope = (slope.swapaxes(1, 2) / np.asarray(scale)).reshape(len(distinct), -1)
-        _register(
-            self,
-            powers=distinct,
-            readout=values,
-            center=center,
-            scale=scale,
-            slope=slope,
-        )
+        np.add.at(values, of_monomial, coef)
+        slopes = np.zeros((len(distinct), self.n_actuators, self.n_outputs))
+        np.add.at(slopes, (of_slope, j), exponents[k, j][:, None] * coef[k])
+        by_output = slopes.swapaxes(1, 2) / np.asarray(scale)
+        _register(self, powers=distinct, readout=values, center=center, scale=scale)
+        _register(self, slope=by_output.reshape(len(distinct), -1))
 
     def forward(self, q: Tensor) -> Tensor:
         """Return the polynomial, shape (..., m)."""
@@ -302,18 +298,19 @@ class KernelModule(ForwardModel):
 
     def forward(self, q: Tensor) -> Tensor:
         """Return the sum, shape (..., m)."""
-        weights = self.weights.to(q)
-        bias = self.bias.to(q)
-        return in_blocks(
-            lambda q: (self._kernel(q)[1] @ weights + bias,), q, self._block
-        )[0]
+        return in_blocks(self._forward, q, self._block)[0]
 
     def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return the sum (..., m) and its Jacobian (..., m, n) from one kernel matrix."""
         x, J = in_blocks(self._forward_and_jacobian, q, self._block)
         return x, J
 
+    def _forward(self, q: Tensor) -> tuple[Tensor]:
+        _, kernel = self._kernel(q)
+        return (kernel @ self.weights.to(q) + self.bias.to(q),)
+
     def _kernel(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return u (N, n) and the Gaussians (N, R) of all training rows."""
         u = (q - self.center.to(q)) / self.scale.to(q)
         rows = self.rows.to(q)
         squares = u.square().sum(-1, keepdim=True) + rows.square().sum(-1)
@@ -340,9 +337,8 @@ class RegressorModule(ForwardModel):
         super().__init__()
         self.regressor = regressor
         width = (q.amax(0) - q.amin(0)).numpy()
-        self._step = np.finfo(np.float64).eps ** (1 / 3) * np.where(
-            width > 0, width, 1.0
-        )
+        width[width == 0.0] = 1.0
+        self._step = np.finfo(np.float64).eps ** (1 / 3) * width
         self.n_actuators = q.shape[1]
         self.n_outputs = self.evaluate(q[:1]).shape[1]
 
@@ -356,22 +352,24 @@ class RegressorModule(ForwardModel):
 
     def differences(self, q: Tensor) -> Tensor:
         """Return dx/dq without a graph, shape (..., m, n)."""
-        at = q.detach().cpu().double()
+        center = q.detach().cpu().double()
         steps = torch.from_numpy(np.diag(self._step))
-        changes = [
-            self.evaluate(at + step) - self.evaluate(at - step) for step in steps
-        ]
-        return (torch.stack(changes, dim=-1) / (2 * steps.diag())).to(q)
+        changes = []
+        for step in steps:
+            after = self.evaluate(center + step)
+            before = self.evaluate(center - step)
+            changes.append(after - before)
+        slopes = torch.stack(changes, dim=-1) / (2 * steps.diag())
+        return slopes.to(q)
 
     def evaluate(self, q: Tensor) -> Tensor:
         """Return the prediction without a graph, shape (..., m).
 
         Trees compute in float32, so numbers that it cannot hold are replaced by its largest.
         """
-        rows = q.detach().cpu().double().clamp(-_LARGEST, _LARGEST).numpy()
-        x = copied(
-            self.regressor.predict(rows.reshape(-1, q.shape[-1])), q.device, np.float64
-        )
+        clamped = q.detach().cpu().double().clamp(-_LARGEST, _LARGEST)
+        rows = clamped.reshape(-1, q.shape[-1]).numpy()
+        x = copied(self.regressor.predict(rows), q.device, np.float64)
         return x.to(q).reshape(*q.shape[:-1], -1)
 
 

@@ -25,7 +25,7 @@ from hybridkin.hybrid.estimator import HybridForwardModel
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.elm_cv import ELMRegressorCV
 from hybridkin.learning.hidden_layer import device_named
-from hybridkin.saving._file import packed, read, unpacked, write
+from hybridkin.saving._file import Header, packed, read, unpacked, write
 
 _DAMAGE = (
     ArithmeticError,
@@ -39,7 +39,7 @@ Model = ForwardModel | ELMRegressor | ELMRegressorCV | HybridForwardModel
 
 
 def save_model(
-    model: Model, path: str | Path, *, training: Mapping[str, Any] | None = None
+    model: Model, path: str | Path, *, training: Mapping[str, object] | None = None
 ) -> None:
     """Write a chain or a fitted model to one file.
 
@@ -85,8 +85,8 @@ def save_model(
     versions["scikit-learn"] = sklearn.__version__
     now = float(os.environ.get("SOURCE_DATE_EPOCH", time.time()))
     created = datetime.fromtimestamp(now, timezone.utc).date().isoformat()
-    header: dict[str, Any] = {"versions": versions, "created": created}
-    results: dict[str, Any] = {}
+    header: Header = {"versions": versions, "created": created}
+    results: Header = {}
     if isinstance(model, HybridForwardModel):
         stored = stored_hybrid(model)
         results = training_of(model)
@@ -152,7 +152,7 @@ def load_model(path: str | Path, *, device: str | torch.device | None = None) ->
         raise ValueError(f"{path} is damaged: {reason}.") from error
 
 
-def model_header(path: str | Path) -> dict[str, Any]:
+def model_header(path: str | Path) -> Header:
     """Return the header of a saved model without loading the model.
 
     Parameters
@@ -189,7 +189,7 @@ def model_header(path: str | Path) -> dict[str, Any]:
     return read(as_path(path))[0]
 
 
-def _checked(training: Mapping[str, Any] | None) -> dict[str, Any]:
+def _checked(training: Mapping[str, object] | None) -> Header:
     try:
         notes = plain(dict(training or {}))
         json.dumps(notes)
@@ -202,11 +202,12 @@ def _checked(training: Mapping[str, Any] | None) -> dict[str, Any]:
 def _units(model: object, output: str = "position") -> dict[str, str | list[str]]:
     if not isinstance(model, Chain):
         return {"q": "as in training", "x": "as in training"}
-    x = "m" if output == "position" else ["m"] * 3 + ["rad"] * 3
-    return {"q": model.units, "x": x}
+    if output == "position":
+        return {"q": model.units, "x": "m"}
+    return {"q": model.units, "x": ["m"] * 3 + ["rad"] * 3}
 
 
-def _domain(model: HybridForwardModel) -> dict[str, Any]:
+def _domain(model: HybridForwardModel) -> Header:
     """Return the guard and the range of the training rows."""
     low, high = model.training_range_
     return {"guard": model.guard, "q_low": plain(low), "q_high": plain(high)}

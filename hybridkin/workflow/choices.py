@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any
 
+from hybridkin.hybrid.cv_results import CvResults
 from hybridkin.hybrid.estimator import HybridForwardModel
 from hybridkin.learning.elm_cv import ELMRegressorCV
 from hybridkin.workflow.model import play_widths
@@ -23,10 +22,12 @@ def choice_in_words(model: HybridForwardModel) -> str:
         )
     if not isinstance(model.error_model, str):
         return "a network for each marker"
-    return "no correction" if model.error_model == "drop" else model.error_model
+    if model.error_model == "drop":
+        return "no correction"
+    return model.error_model
 
 
-def _weights(results: Mapping[str, Any]) -> dict[str, float]:
+def _weights(results: CvResults) -> dict[str, float]:
     """Return the weights of the chosen error models, largest first."""
     chosen = {}
     for name, weight in results["weights"].items():
@@ -35,7 +36,7 @@ def _weights(results: Mapping[str, Any]) -> dict[str, float]:
     return dict(sorted(chosen.items(), key=lambda item: -item[1]))
 
 
-def _auto_in_short(model: HybridForwardModel, results: Mapping[str, Any]) -> str:
+def _auto_in_short(model: HybridForwardModel, results: CvResults) -> str:
     """Return the parts, the calibrated parameters and the backlash that "auto" chose."""
     weights = _weights(results)
     words = next(iter(weights))
@@ -45,7 +46,9 @@ def _auto_in_short(model: HybridForwardModel, results: Mapping[str, Any]) -> str
     if len(results["mechanical_model"]) > 1:
         words += f" on {results['parameters']}"
     play = play_widths(model)
-    return words if play is None else f"{words}, backlash {millimetres(max(play))}"
+    if play is not None:
+        words += f", backlash {millimetres(max(play))}"
+    return words
 
 
 def auto_in_words(model: HybridForwardModel) -> list[str]:

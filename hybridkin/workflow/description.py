@@ -10,6 +10,7 @@ from typing import Any
 from torch import Tensor
 
 from hybridkin.chains.robots import Limits, LogFormat
+from hybridkin.hybrid.cv_results import CvResults
 from hybridkin.workflow.errors import HeldOutErrors
 from hybridkin.workflow.model import LoadedModel, play_widths
 from hybridkin.workflow.report import Report, listed, millimetres
@@ -51,7 +52,7 @@ class Description:
     kind: str
     n_actuators: int
     geometry: Mapping[str, Tensor]
-    auto: Mapping[str, Any] | None
+    auto: CvResults | None
     play: list[float] | None
     domain: Limits | None
     log_format: LogFormat

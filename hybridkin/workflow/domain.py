@@ -152,15 +152,17 @@ class Domain:
         """
         trained = self.loaded.trained_range
         limits = self.limits
-        spanned = limits if trained is None else trained
+        spanned = trained or limits
         middle = 0.5 * (np.asarray(spanned.q_min) + np.asarray(spanned.q_max))
         middle = self.rest + (middle - self.rest) @ self.bending
         candidates = [middle]
         if self.tendons is not None:
-            candidates = [self.rest, middle] if trained is None else [middle, self.rest]
+            candidates.append(self.rest)
+            if trained is None:
+                candidates.reverse()
         hybrid = self.loaded.hybrid
-        tested = None if hybrid is None else hybrid.fitted_module_.tested
-        if hybrid is not None and tested is not None:
+        if hybrid is not None and hybrid.fitted_module_.tested is not None:
+            tested = hybrid.fitted_module_.tested
             rows = as_array(tested.rows) - hybrid.change_.shift
             far = np.linalg.norm(rows - candidates[0], axis=1)
             candidates.append(rows[far.argmin()])
@@ -225,13 +227,15 @@ class Domain:
     ) -> InverseKinematics:
         """Return inverse kinematics within the limits; default of `q_pref`: `preferred`."""
         limits = self.limits
+        if q_pref is None:
+            q_pref = self.preferred
         return InverseKinematics(
             self.loaded.module,
             q_min=limits.q_min,
             q_max=limits.q_max,
             dq_max=limits.dq_max,
             ddq_max=limits.ddq_max,
-            q_pref=self.preferred if q_pref is None else q_pref,
+            q_pref=q_pref,
             dt=dt,
         )
 

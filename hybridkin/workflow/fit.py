@@ -7,7 +7,6 @@ import warnings
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -218,5 +217,5 @@ def _add_model(
         report.file("robot.toml", partial(shutil.copyfile, robot.path))
 
 
-def _save(path: Path, model: HybridForwardModel, training: dict[str, Any]) -> None:
+def _save(path: Path, model: HybridForwardModel, training: dict[str, object]) -> None:
     save_model(model, path, training=training)

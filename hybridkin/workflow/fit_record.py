@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 import hybridkin
 from hybridkin.datasets import LogReport
+from hybridkin.hybrid.cv_results import CvResults
 from hybridkin.workflow.calibrated import Calibration
 from hybridkin.workflow.compare import (
     AUTO,
@@ -118,14 +118,14 @@ class FitRecord(Training):
     log_check: LogReport
     worst: Sequence[MotionErrors]
     markers: Sequence[Errors]
-    auto: Mapping[str, Any] | None
+    auto: CvResults | None
     words: Sequence[str]
     tried: Mapping[str, Mapping[str, float]]
     calibrated: str
     calibration: Calibration | None
 
 
-def training_notes(record: FitRecord) -> dict[str, Any]:
+def training_notes(record: FitRecord) -> dict[str, object]:
     """Return the notes that the model file keeps."""
     notes = asdict(record)
     return {field.name: notes[field.name] for field in fields(Training)}
@@ -190,7 +190,7 @@ def write_model(report: Report[FitRecord]) -> None:
         record.calibration.write(report)
 
 
-def _write_tried(report: Report[Any], record: FitRecord) -> None:
+def _write_tried(report: Report, record: FitRecord) -> None:
     """Add the sets of parameters that were tried."""
     report.text(
         "## What is calibrated",
@@ -234,7 +234,7 @@ def errors_of_markers(errors: NDArray) -> list[Errors]:
     return [Errors.of(column[~np.isnan(column)]) for column in errors.T]
 
 
-def write_markers(report: Report[Any], markers: Sequence[Errors], what: str) -> None:
+def write_markers(report: Report, markers: Sequence[Errors], what: str) -> None:
     """Add the errors of several markers, one by one."""
     if markers:
         report.text(
@@ -244,7 +244,7 @@ def write_markers(report: Report[Any], markers: Sequence[Errors], what: str) -> 
         report.errors(entries, ("rows", "mean", "p95", "max"))
 
 
-def add_error_figures(report: Report[Any], errors: Mapping[str, NDArray]) -> None:
+def add_error_figures(report: Report, errors: Mapping[str, NDArray]) -> None:
     """Add the distributions of the errors (N,) on held-out motions by model."""
     figure, ax = hybridkin.plots.new_figure(8.0, 1.5 + 0.32 * len(errors))
     hybridkin.plots.ErrorBoxDisplay(errors).plot(ax, unit="mm")
@@ -255,9 +255,7 @@ def add_error_figures(report: Report[Any], errors: Mapping[str, NDArray]) -> Non
     add_histogram(report, first_and_last, "Tip errors on held-out motions.")
 
 
-def add_histogram(
-    report: Report[Any], errors: Mapping[str, NDArray], caption: str
-) -> None:
+def add_histogram(report: Report, errors: Mapping[str, NDArray], caption: str) -> None:
     """Add a histogram of errors (N,) by model."""
     figure, ax = hybridkin.plots.new_figure(5.5, 3.8)
     hybridkin.plots.ErrorHistogramDisplay(errors).plot(ax, unit="mm")

@@ -6,7 +6,6 @@ import fnmatch
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -176,7 +175,7 @@ def read_log(
     return measured
 
 
-def write_check(report: Report[Any], check: LogReport) -> None:
+def write_check(report: Report, check: LogReport) -> None:
     """Add the findings of the check of a log to a report."""
     report.text(f"## The log\n\nThe check of the log found {check.summary()}.")
     for f in check.findings:

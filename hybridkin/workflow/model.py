@@ -58,7 +58,9 @@ class LoadedModel:
     @property
     def hybrid(self) -> HybridForwardModel | None:
         """The model if it is a hybrid, else None."""
-        return self.model if isinstance(self.model, HybridForwardModel) else None
+        if isinstance(self.model, HybridForwardModel):
+            return self.model
+        return None
 
     @property
     def chain(self) -> Chain | None:
@@ -66,7 +68,9 @@ class LoadedModel:
         mechanical = self.model
         if self.hybrid is not None:
             mechanical = self.hybrid.mechanical_model_
-        return mechanical if isinstance(mechanical, Chain) else None
+        if isinstance(mechanical, Chain):
+            return mechanical
+        return None
 
     @property
     def module(self) -> ForwardModel:
@@ -93,12 +97,16 @@ class LoadedModel:
     @property
     def play(self) -> PlayOperator | None:
         """The backlash of the actuators, None without."""
-        return None if self.hybrid is None else self.hybrid.play_
+        if self.hybrid is None:
+            return None
+        return self.hybrid.play_
 
     @property
     def half_play(self) -> NDArray | float:
         """Half the width of the backlash, in the unit of q; 0 without."""
-        return 0.0 if self.play is None else 0.5 * self.play.width
+        if self.play is None:
+            return 0.0
+        return 0.5 * self.play.width
 
     def effective(self, q: NDArray, groups: NDArray | None = None) -> NDArray:
         """Return the motion of the actuators (N, n) for commands q of one motion, or of groups."""
@@ -110,7 +118,10 @@ class LoadedModel:
 
     def commands(self, q: NDArray) -> NDArray:
         """Return the commands (N, n) that move the actuators along q (N, n), row after row."""
-        return q if self.play is None else self.play.command(q)[0]
+        if self.play is None:
+            return q
+        commands, _ = self.play.command(q)
+        return commands
 
     def predict(self, q: NDArray, groups: NDArray | None = None) -> NDArray:
         """Return tips (N, 3) [m], or all markers; `groups`, the motions, matter with backlash."""
@@ -158,15 +169,20 @@ class LoadedModel:
     @property
     def held_out(self) -> HeldOutErrors | None:
         """Errors of the fit on held-out motions, where the file has them."""
-        entry = self.training.get("held_out", {}).get(self.training.get("saved"))
-        return None if entry is None else HeldOutErrors.read(entry)
+        held_out = self.training.get("held_out", {})
+        entry = held_out.get(self.training.get("saved"))
+        if entry is None:
+            return None
+        return HeldOutErrors.read(entry)
 
     @property
     def kind(self) -> str:
         """What the model is, as the fit calls it: "hybrid, ELM", "mechanical, nominal", ..."""
         kind = "hybrid"
         if self.hybrid is None:
-            kind = "data-driven" if self.chain is None else "mechanical, nominal"
+            kind = "data-driven"
+            if self.chain is not None:
+                kind = "mechanical, nominal"
         return self.training.get("saved", kind)
 
     def promised_errors(self, q: NDArray) -> ExpectedErrors | None:
@@ -213,8 +229,10 @@ class LoadedModel:
         if self.description is not None and self.description.log is not None:
             return self.description.log
         names = tuple(f"q{i + 1}" for i in range(self.n_actuators))
-        in_metres = not isinstance(self.chain, ArcChain) or self.chain.in_metres
-        return robots.LogFormat(names, ("x", "y", "z"), "m" if in_metres else "1")
+        unit = "m"
+        if isinstance(self.chain, ArcChain) and not self.chain.in_metres:
+            unit = "1"
+        return robots.LogFormat(names, ("x", "y", "z"), unit)
 
 
 def play_widths(model: HybridForwardModel | None) -> list[float] | None:

@@ -235,8 +235,9 @@ def _start(domain: Domain, start: ArrayLike | str) -> NDArray | None:
         if start == "path":
             return None
         if start == "rest":
-            at_zero = domain.tendons or ((low <= 0) & (high >= 0)).all()
-            return domain.rest if at_zero else domain.preferred
+            if domain.tendons or ((low <= 0) & (high >= 0)).all():
+                return domain.rest
+            return domain.preferred
         raise ValueError(f'`start` must be "rest", "path" or numbers, got {start!r}.')
     q = np.array(start, dtype=float)
     middle = 0.5 * (low + high)
@@ -334,8 +335,11 @@ def read_track(path: str | Path, log_format: LogFormat) -> Log:
         )
     with open(file, encoding="utf-8-sig", newline="") as lines:
         header = [name.strip() for name in next(csv.reader(lines), [])]
-    time = log_format.time if log_format.time in header else None
-    columns = replace(log_format, groups=None, time=TIME if TIME in header else time)
+    time = None
+    for name in (TIME, log_format.time):
+        if time is None and name in header:
+            time = name
+    columns = replace(log_format, groups=None, time=time)
     if {*TARGET} <= {*header}:
         columns = replace(columns, x=TARGET, groups="status")
     return load_log(file, **columns.reading)

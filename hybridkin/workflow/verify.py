@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -77,7 +76,7 @@ class Verification:
     cause: str | None
     range: float | None
 
-    def _write(self, report: Report[Any]) -> None:
+    def _write(self, report: Report) -> None:
         """Add the record to a report, in words."""
         path = self.parts["path"]
         promise = "The model promised no error"
@@ -176,6 +175,9 @@ def verify_track(
         kept = bool(parts["path"].mean <= _KEPT * parts["path"].promised)
     causes = _explained(loaded, motion, rows, x)
     likely = max(causes, key=causes.__getitem__)
+    cause = None
+    if not kept and causes[likely] > _LIKELY:
+        cause = likely
     record = Verification(
         model=str(loaded.path),
         track=str(track),
@@ -183,7 +185,7 @@ def verify_track(
         parts=parts,
         kept=kept,
         causes=causes,
-        cause=likely if not kept and causes[likely] > _LIKELY else None,
+        cause=cause,
         range=_share_of_range(loaded, q),
     )
     title = f"{loaded.name}: {Path(track).name} against {Path(log.source).name}"
@@ -314,5 +316,6 @@ def _as_inside(loaded: LoadedModel, q: NDArray, residual: NDArray) -> float:
     inside = loaded.domain_distance(q) <= 1.0
     if inside.any():
         return len(q) * squares[inside].mean()
-    held_out = loaded.held_out
-    return squares.sum() if held_out is None else len(q) * held_out.mean**2
+    if loaded.held_out is None:
+        return squares.sum()
+    return len(q) * loaded.held_out.mean**2
