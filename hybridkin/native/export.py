@@ -8,14 +8,16 @@ import re
 import shutil
 import subprocess
 import tempfile
+from collections.abc import Mapping
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from hybridkin._core.files import write_files
 from hybridkin._core.kernel_numbers import IK_LIMITED, c_header
@@ -46,6 +48,12 @@ _MOST_STACK = 56 * 1024  # bytes to compute in; small arrays come on top
 # steps per run of the test; memory in periods
 _STEPS = 4
 _MEMORY = 5.0
+_STEP_PARTS = {
+    "STEP_H": "step.h",
+    "STEP_C": "step.c",
+    "TICKS": "ticks.c",
+    "STEP_README": "step.md",
+}
 _ABOUT_POSES = (
     "desired pose now, a homogeneous (4, 4) matrix, row by row [m]; one that holds no rotation "
     "counts as NaN;"
@@ -66,12 +74,46 @@ _OPERATIONS = {
 }
 
 
+Entries: TypeAlias = dict[str, object]  # what templates are filled with
+
+
+class _Task(Protocol):
+    has_rotation: bool
+    shape: tuple[int, ...]
+
+    @property
+    def steered(self) -> tuple[ForwardModel, ...]: ...
+    def evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]: ...
+    def positions(self, x: Tensor) -> Tensor: ...
+
+
+class _Settings(Protocol):
+    @property
+    def task(self) -> _Task: ...
+
+
+class _Tracker(Protocol):
+    @property
+    def x(self) -> NDArray | Tensor: ...
+    @property
+    def sigma_min(self) -> float: ...
+    @property
+    def damping(self) -> float: ...
+    def step(
+        self, x_target: Tensor, dx: Tensor, *, x_measured: Tensor | None
+    ) -> NDArray | Tensor: ...
+
+
 @runtime_checkable
 class _Controller(Protocol):
-    settings: Any
+    """Inverse kinematics, with a step to write."""
 
+    @property
+    def settings(self) -> _Settings: ...
     def stored(self) -> Stored: ...
-    def tracker(self, q0: object, *, memory: float | None = None) -> Any: ...
+    def tracker(
+        self, q0: NDArray | Tensor, *, memory: float | None = None
+    ) -> _Tracker: ...
 
 
 def export_c(
@@ -131,10 +173,8 @@ def export_c(
             )
     measured = _measured(f"{name}.c", texts)
     texts["README.md"] = filled("README.md", {**project.entries, "MEASURED": measured})
-    write_files(
-        folder,
-        {file: partial(Path.write_text, data=text) for file, text in texts.items()},
-    )
+    writers = {file: partial(Path.write_text, data=t) for file, t in texts.items()}
+    write_files(folder, writers)
     return paths
 
 
@@ -158,7 +198,7 @@ class CProject(NamedTuple):
     controller: _Controller | None
     plan: Plan
     home: NDArray
-    entries: dict[str, Any]
+    entries: Entries
     texts: dict[str, str]
 
     @property
@@ -169,8 +209,8 @@ class CProject(NamedTuple):
     @property
     def gains(self) -> tuple[float, float, float]:
         """Gain (negative: 1 / period), beta [1/s] and period [s] of a step."""
-        n = self.plan.n_inputs
-        (gain, beta, dt) = self.plan.data[self.plan.begin(self.plan.root) + 6 * n :][:3]
+        rates = self.plan.begin(self.plan.root) + 6 * self.plan.n_inputs
+        gain, beta, dt = self.plan.data[rates : rates + 3]
         return float(gain), float(beta), float(dt)
 
 
@@ -205,22 +245,19 @@ def c_project(
         f"{name}_test.c": "check.c",
     }
     sources["CMakeLists.txt"] = "CMakeLists.txt"
-    entries = {
-        **dict(
-            NAME=name,
-            GUARD=name.upper(),
-            TITLE=type(model).__name__,
-            VERSION=__version__,
-        ),
+    entries: Entries = {
+        "NAME": name,
+        "GUARD": name.upper(),
+        "TITLE": type(model).__name__,
+        "VERSION": __version__,
         "ABOUT_Q": about_q.replace("*/", "* /"),
-        **dict(REAL=_REAL[dtype], N=plan.n_inputs, TOL=_TOLERANCE[dtype]),
-        **_code(plan, controller, dtype),
-        **_vectors(modules, plan, controller, dtype),
+        "REAL": _REAL[dtype],
+        "N": plan.n_inputs,
+        "TOL": _TOLERANCE[dtype],
     }
-    parts = dict(
-        STEP_H="step.h", STEP_C="step.c", TICKS="ticks.c", STEP_README="step.md"
-    )
-    for key, template in parts.items():
+    entries |= _code(plan, controller, dtype)
+    entries |= _vectors(modules, plan, controller, dtype)
+    for key, template in _STEP_PARTS.items():
         entries[key] = "" if controller is None else filled(template, entries)
 
     texts = {file: filled(template, entries) for file, template in sources.items()}
@@ -228,10 +265,10 @@ def c_project(
     return CProject(controller, plan, home, entries, texts)
 
 
-def filled(template: str, entries: dict[str, Any]) -> str:
+def filled(template: str, entries: Mapping[str, object]) -> str:
     """Return the text of a template with its entries."""
     text = _with_headers(_FOLDER / "templates" / template)
-    return re.sub(r"@(\w+)@", lambda found: str(entries[found[1]]), text)
+    return re.sub(r"@(\w+)@", lambda match: str(entries[match[1]]), text)
 
 
 def _with_headers(path: Path) -> str:
@@ -240,65 +277,80 @@ def _with_headers(path: Path) -> str:
         return c_header()
     return re.sub(
         r'(?m)^#include "(\w+\.h)"$',
-        lambda found: _with_headers(_FOLDER / "src" / found[1]),
+        lambda match: _with_headers(_FOLDER / "src" / match[1]),
         path.read_text(),
     )
 
 
-def _code(plan: Plan, controller: _Controller | None, dtype: str) -> dict[str, Any]:
+def _code(plan: Plan, controller: _Controller | None, dtype: str) -> Entries:
     """Return sizes and numbers of a plan as C, and the entries of README.md about them."""
-    at = plan.root if controller is None else plan.entry(plan.root, 0)
-    task = None if controller is None else controller.settings.task
-    pose = task is not None and task.shape == (4, 4)
-    spaces = 0 if task is None else plan.entry(plan.root, 3)
+    model = plan.root
+    poses = False
+    n_spaces = 0
+    step: Entries = {"CALL": "forward(q, x)"}
+    if controller is not None:
+        task = controller.settings.task
+        model = plan.entry(plan.root, 0)
+        n_spaces = plan.entry(plan.root, 3)
+        poses = task.has_rotation
+        step = _step_code(plan, task, n_spaces)
+
     # gcc warns about arrays of length 1 if it cannot see that loops over them run at all.
-    sizes = {f"MAX_{s}": max(plan.largest[what], 2) for s, what in _SIZES.items()}
-    kinds = sum(1 << kind for kind in {*plan.code[plan.places].tolist()})
-    lines = [
-        f"#define HK_{a} {number}"
-        for a, number in {
-            **sizes,
-            "KINDS": f"{kinds}u",
-            "POSES": int(pose),
-            "SPACES": int(spaces > 0),
-        }.items()
-    ]
-    fields = {
-        "DEFINES": "\n".join(["#define HK_FLOAT"] * (dtype == "float32") + lines),
-        "CODE": literals(plan.code),
-        "DATA": literals(plan.data.astype(dtype)),
-        **dict(M=plan.lengths(at)[1], MODEL=at, ROOT=plan.root, CALL="forward(q, x)"),
-        "BYTES": len(plan.data) * (8 if dtype == "float64" else 4) + 4 * len(plan.code),
-        "OPERATIONS": f"{_operations(plan):,}",
+    defines: Entries = {
+        f"MAX_{s}": max(plan.largest[what], 2) for s, what in _SIZES.items()
     }
-    if task is not None:
-        limits, dt = _limits(plan)
-        words = (", ".join(f"{v:.6g}" for v in row) for row in limits)
-        fields |= zip(("Q_MIN", "Q_MAX", "DQ_MAX", "DDQ_MAX"), words, strict=True)
-        fields |= {"DT": dt, "CALL": "step(&state, target, NULL, NULL)"}
-        sentence = "limits.md" if np.isfinite(limits).any() else "no_limits.md"
-        fields["LIMITS"] = filled(sentence, fields)
-        m = plan.n_outputs
-        fields["NEWTON"] = (
-            f"{10 * plan.n_inputs**2 + (20 + 7 * m * m) * plan.n_inputs:,}"
-        )
-        fields |= {"TASK": m, "WIDTH": math.prod(task.shape)}
-        fields["NORMALS"] = plan.entry(plan.root, 2)
-        fields["ABOUT_TARGET"] = _ABOUT_POSES if pose else "desired x now [m];"
-        fields["SPACES"] = _ABOUT_SPACES if spaces else ""
-    return fields
+    kinds = {*plan.code[plan.places].tolist()}
+    defines["KINDS"] = f"{sum(1 << kind for kind in kinds)}u"
+    defines["POSES"] = int(poses)
+    defines["SPACES"] = int(n_spaces > 0)
+    lines = [f"#define HK_{name} {number}" for name, number in defines.items()]
+    if dtype == "float32":
+        lines.insert(0, "#define HK_FLOAT")
+
+    data = plan.data.astype(dtype)
+    return {
+        "DEFINES": "\n".join(lines),
+        "CODE": literals(plan.code),
+        "DATA": literals(data),
+        "M": plan.lengths(model)[1],
+        "MODEL": model,
+        "ROOT": plan.root,
+        "BYTES": data.nbytes + 4 * len(plan.code),
+        "OPERATIONS": f"{_operations(plan):,}",
+        **step,
+    }
+
+
+def _step_code(plan: Plan, task: _Task, n_spaces: int) -> Entries:
+    """Return the entries about a step of inverse kinematics."""
+    limits, dt = _limits(plan)
+    n = plan.n_inputs
+    m = plan.n_outputs
+    entries: Entries = {
+        "CALL": "step(&state, target, NULL, NULL)",
+        "DT": dt,
+        "TASK": m,
+        "WIDTH": math.prod(task.shape),
+        "NORMALS": plan.entry(plan.root, 2),
+        "NEWTON": f"{10 * n**2 + (20 + 7 * m * m) * n:,}",
+        "ABOUT_TARGET": _ABOUT_POSES if task.has_rotation else "desired x now [m];",
+        "SPACES": _ABOUT_SPACES if n_spaces else "",
+    }
+    names = ("Q_MIN", "Q_MAX", "DQ_MAX", "DDQ_MAX")
+    for name, limit in zip(names, limits.tolist(), strict=True):
+        entries[name] = ", ".join(f"{value:.6g}" for value in limit)
+    sentence = "limits.md" if np.isfinite(limits).any() else "no_limits.md"
+    entries["LIMITS"] = filled(sentence, entries)
+    return entries
 
 
 def _check_stack(plan: Plan, dtype: str) -> None:
     """Raise if the code would need more than 64 KiB of stack; bounds the HK_MODEL_WORK of src."""
     n, segments, m, features, powers, rows = plan.code[:6].tolist()
-    numbers = (
-        2 * (features + powers)
-        + max(n, 3 * segments, m) * (n + 41)
-        + 200 * segments
-        + 30
-        + (8 * (rows + 1) * (n + 12) if rows else 0)
-    )
+    numbers = 2 * (features + powers)
+    numbers += max(n, 3 * segments, m) * (n + 41) + 200 * segments + 30
+    if rows:
+        numbers += 8 * (rows + 1) * (n + 12)
     if numbers * np.dtype(dtype).itemsize > _MOST_STACK:
         raise NoKernel(
             "its sizes need more than 64 KiB of stack, too much for a controller"
@@ -359,15 +411,14 @@ def _middle(
 
 def _vectors(
     modules: list[ForwardModel], plan: Plan, controller: _Controller | None, dtype: str
-) -> dict[str, Any]:
+) -> Entries:
     """Return the data of the test: inputs, and the outputs that torch computes."""
     doubles = [copy.deepcopy(module).double() for module in modules]
     rng = np.random.default_rng(0)
     center, half = _middle(modules[0], plan, controller)
     # Eight usual rows, then rows at growing distance from the center; the last one is NaN.
-    far = np.concatenate(
-        [np.linspace(0.0, 0.7, 8), np.linspace(0.8, 5.0, 8), [math.nan]]
-    )
+    usual = np.linspace(0.0, 0.7, 8)
+    far = np.concatenate([usual, np.linspace(0.8, 5.0, 8), [math.nan]])
     rows = center + half * far[:, None] * rng.uniform(-1.0, 1.0, (17, len(half)))
     rows = rows.astype(dtype)
     with torch.no_grad():
@@ -378,16 +429,17 @@ def _vectors(
         distances = [double.domain_distance(at).numpy() for double in doubles]
     distance = np.max(distances, axis=0)
     arrays = {"Q": rows, "X": x, "J": J, "DISTANCE": distance, "HOME": rows[0]}
-    fields = {f"{key}_SCALE": float(np.nanmax(abs(a[:8]))) for key, a in arrays.items()}
+    entries: Entries = {"ROWS": len(rows)}
+    for name, array in arrays.items():
+        entries[f"{name}_SCALE"] = float(np.nanmax(abs(array[:8])))
     if controller is not None:
-        runs, fields["COMPARED"] = _runs(controller, plan, rows[:8], dtype)
+        runs, entries["COMPARED"] = _runs(controller, plan, rows[:8], dtype)
         arrays |= runs
-        fields |= {"STEPS": _STEPS, "MEMORY": _MEMORY * _limits(plan)[1]}
-    return {
-        "ROWS": len(rows),
-        **fields,
-        **{key: literals(a) for key, a in arrays.items()},
-    }
+        entries["STEPS"] = _STEPS
+        entries["MEMORY"] = _MEMORY * _limits(plan)[1]
+    for name, array in arrays.items():
+        entries[name] = literals(array)
+    return entries
 
 
 def _usual(module: ForwardModel, n: int) -> tuple[NDArray, NDArray]:
@@ -400,10 +452,11 @@ def _usual(module: ForwardModel, n: int) -> tuple[NDArray, NDArray]:
     radii = buffers.get("radii", np.full(1, 2.0))
     gains = buffers.get("gains", np.ones(n))
     extensible = "gains" in buffers and "lengths" not in buffers
-    middle = (3.0 * radii.mean() if extensible else 0.0) / gains
-    return middle + buffers.get("actuator_zeros", 0.0), 0.5 * radii.min() / np.abs(
-        gains
-    )
+    middle = buffers.get("actuator_zeros", np.zeros(n))
+    if extensible:
+        middle = middle + 3.0 * radii.mean() / gains
+    half_width = 0.5 * radii.min() / np.abs(gains)
+    return middle, half_width
 
 
 def _runs(
@@ -420,51 +473,52 @@ def _runs(
     far = np.array([0.2, 0.1, 0.01] if dtype == "float64" else [1e-4, 1e-3, 1e-4])
     task = controller.settings.task
     with torch.no_grad():
-        here = task.evaluate(torch.from_numpy(starts.astype(float)))[0].numpy()
-    size = np.ptp(_positions(task, here), axis=0)
-    target, measured = (
-        _beside(task, here, share * size, rng).astype(dtype) for share in far[[0, 2]]
-    )
+        x, _ = task.evaluate(torch.from_numpy(starts.astype(float)))
+    size = np.ptp(task.positions(x).numpy(), axis=0)
+    target = _beside(task, x, far[0] * size, rng).astype(dtype)
+    measured = _beside(task, x, far[2] * size, rng).astype(dtype)
     rows = rng.standard_normal((8, _STEPS, plan.n_outputs))
     dx = (far[1] * size.mean() * rows).astype(dtype)
     measured[:, 2] = math.nan  # no measurement
-    fields = []
+    commands = []
+    squares = []
     healthy = 8 if dtype == "float64" else 4  # runs whose steps are compared
-    for run_number, (q, *run) in enumerate(
-        zip(starts, target, dx, measured, strict=True)
-    ):
-        tracker = controller.tracker(
-            torch.from_numpy(q.astype(float)), memory=_MEMORY * dt
-        )
-        for i, rows in enumerate(zip(*run, strict=True)):
-            goal, speed, tip = (torch.from_numpy(a.astype(float)) for a in rows)
-            reading = tip if i < _STEPS - 1 else None  # as in the template
-            q = tracker.step(goal, speed, x_measured=reading).numpy()
-            fields.append([*q, tracker.sigma_min**2])
+    for k, start in enumerate(_doubles(starts)):
+        tracker = controller.tracker(start, memory=_MEMORY * dt)
+        tips = [
+            *_doubles(measured[k, :-1]),
+            None,
+        ]  # none at the end, as in the template
+        steps = zip(_doubles(target[k]), _doubles(dx[k]), tips, strict=True)
+        for goal, speed, tip in steps:
+            q = tracker.step(goal, speed, x_measured=tip)
+            commands.append(np.asarray(q))
+            squares.append(tracker.sigma_min**2)
             if dtype == "float32" and tracker.damping > 0.0:
-                healthy = min(healthy, run_number)  # weak directions
-    command, squares = np.split(np.array(fields), [plan.n_inputs], axis=1)
-    fields = {
+                healthy = min(healthy, k)  # weak directions
+    runs = {
         "STARTS": starts,
         "LOW": low,
         "HIGH": high,
-        "COMMAND": command,
-        "SIGMA_SQ": squares,
+        "COMMAND": np.array(commands),
+        "SIGMA_SQ": np.array(squares),
+        "TARGET": target,
+        "DX": dx,
+        "MEASURED_TIPS": measured,
     }
-    fields |= {"TARGET": target, "DX": dx, "MEASURED_TIPS": measured}
-    return fields, healthy
+    return runs, healthy
 
 
-def _positions(task: Any, x: NDArray) -> NDArray:
-    """Return the positions (N, ..., 3) in points or poses of a task (N, ...)."""
-    return x[:, :3, 3] if task.shape == (4, 4) else x
+def _doubles(rows: NDArray) -> Tensor:
+    """Return rows as a tensor in double precision."""
+    return torch.from_numpy(rows.astype(float))
 
 
-def _beside(task: Any, x: NDArray, size: NDArray, rng: np.random.Generator) -> NDArray:
+def _beside(task: _Task, x: Tensor, size: NDArray, rng: np.random.Generator) -> NDArray:
     """Return points or poses (N, steps, ...) beside those of a task, turned by up to 0.1 rad."""
-    beside = np.repeat(x[:, None], _STEPS, axis=1)
+    beside = np.repeat(x.numpy()[:, None], _STEPS, axis=1)
     change = rng.standard_normal((*beside.shape[:2], *size.shape)) * size
-    if task.shape != (4, 4):
+    if not task.has_rotation:
         return beside + change
     beside[..., :3, 3] += change
     turns = torch.from_numpy(0.1 * change / max(np.abs(change).max(), 1e-9))
@@ -476,27 +530,20 @@ def _measured(source: str, texts: dict[str, str]) -> str:
     """Return the size of the code and of its stack, measured by the compiler of this machine."""
     if shutil.which("cc") and shutil.which("size"):
         with (
-            suppress(OSError),
+            suppress(OSError),  # the disk may be full
             tempfile.TemporaryDirectory() as home,
-        ):  # the disk may be full
+        ):
             for name, text in texts.items():
                 Path(home, name).write_text(text)
             built = Path(home) / "a.o"
             usage = Path(home) / "a.su"
-            options = [
-                "-std=c99",
-                "-Os",
-                "-fstack-usage",
-                "-c",
-                Path(home, source),
-                "-o",
-                built,
-            ]
-            done = subprocess.run(["cc", *options], capture_output=True)
+            compiler = "cc -std=c99 -Os -fstack-usage -c -o".split()
+            command = [*compiler, built, Path(home, source)]
+            done = subprocess.run(command, capture_output=True)
             if done.returncode == 0 and usage.exists():
-                stack = sum(
-                    int(line.split("\t")[1]) for line in usage.read_text().splitlines()
-                )
-                text = subprocess.check_output(["size", built], text=True).split()[6]
-                return f"{text} and {stack} bytes on the machine of the export, with `cc -Os`"
+                lines = usage.read_text().splitlines()
+                stack = sum(int(line.split("\t")[1]) for line in lines)
+                sizes = subprocess.check_output(["size", built], text=True)
+                code = sizes.split()[6]
+                return f"{code} and {stack} bytes on the machine of the export, with `cc -Os`"
     return "not measured: the machine of the export had no C compiler"

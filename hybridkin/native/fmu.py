@@ -148,7 +148,7 @@ def _variables(project: CProject) -> list[Variable]:
     n = plan.n_inputs
     if project.controller is None:
         m = plan.n_outputs
-        about_q = project.entries["ABOUT_Q"]
+        about_q = str(project.entries["ABOUT_Q"])
         return [
             Variable("q", "input", about_q, (n,), project.home),
             Variable("x", "output", "tip [m]", (m,)),
@@ -161,14 +161,16 @@ def _variables(project: CProject) -> list[Variable]:
     (gain, beta, _) = project.gains
     number = np.array
     variables = [
-        Variable("target", "input", project.entries["ABOUT_TARGET"], width, target),
+        Variable(
+            "target", "input", str(project.entries["ABOUT_TARGET"]), width, target
+        ),
         Variable("velocity", "input", "of the target [m/s]", rows, np.zeros(rows)),
         Variable("measured", "input", "tip, or NaN", width, np.full(width, np.nan)),
         Variable("start", "parameter", "command at rest", (n,), project.home),
         Variable("gain", "parameter", "of the error [1/s]", (), number(gain)),
         Variable("beta", "parameter", "of the posture [1/s]", (), number(beta)),
         Variable("memory", "parameter", "of measurements [s]", (), number(0.0)),
-        Variable("command", "output", project.entries["ABOUT_Q"], (n,)),
+        Variable("command", "output", str(project.entries["ABOUT_Q"]), (n,)),
         Variable("tip", "output", "of the model at the command, as target", width),
         Variable("error", "output", "distance to the target [m]", ()),
         Variable("status", "output", "0 free, 1 at limits, 2 held", ()),
@@ -213,7 +215,7 @@ def _entries(variables: list[Variable]) -> dict[str, str]:
 
 def _description(project: CProject, variables: list[Variable], token: str) -> bytes:
     """Return modelDescription.xml."""
-    name = project.entries["NAME"]
+    name = str(project.entries["NAME"])
     root = ElementTree.Element(
         "fmiModelDescription",
         fmiVersion="3.0",

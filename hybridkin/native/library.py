@@ -6,11 +6,10 @@ import ctypes
 import os
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -55,12 +54,13 @@ def available() -> bool:
 
 def backend(model: ForwardModel) -> str:
     """Return how a model is computed for NumPy arrays: "compiled", or "torch: " and a reason."""
-    missing = library() is None
-    reason = _opened()[1]
-    if not missing:
+    opened, reason = _opened()
+    if opened is not None:
         program_of(model)
         reason = vars(model)["_program"].reason
-    return f"torch: {reason}" if reason else "compiled"
+    if reason:
+        return f"torch: {reason}"
+    return "compiled"
 
 
 @cache
@@ -94,14 +94,13 @@ def _fault(opened: ctypes.CDLL) -> str:
     opened.hk_work.argtypes = [pointer, ctypes.c_int32]
     opened.hk_work.restype = ctypes.c_int64
     opened.hk_ik_tick.argtypes = [pointer]
-    opened.hk_evaluate.restype = opened.hk_play.restype = None
-    opened.hk_play.argtypes = [
-        ctypes.c_int64,
-        ctypes.c_int32,
-        ctypes.c_int32,
-        *[pointer] * 5,
-    ]
-    return "" if _is_right(opened) else "computes wrong numbers"
+    opened.hk_evaluate.restype = None
+    opened.hk_play.restype = None
+    sizes = [ctypes.c_int64, ctypes.c_int32, ctypes.c_int32]
+    opened.hk_play.argtypes = [*sizes, *[pointer] * 5]
+    if not _is_right(opened):
+        return "computes wrong numbers"
+    return ""
 
 
 def _is_right(opened: ctypes.CDLL) -> bool:
@@ -116,11 +115,15 @@ def _is_right(opened: ctypes.CDLL) -> bool:
     beside = q[:, None, None] + 1e-5 * np.stack([np.eye(3), -np.eye(3)])
     for write, right in ((_two_halves, x), (_three_units, 1.0 / (1.0 + np.exp(-q)))):
         program = Program(Plan(write), opened)
-        ahead, behind = program.evaluate(beside)[0].swapaxes(0, 1)
+        x_beside, _, _ = program.evaluate(beside)
+        ahead, behind = x_beside.swapaxes(0, 1)
         slopes = np.swapaxes(ahead - behind, 1, 2) / 2e-5
-        of_each_row = zip(*(program.evaluate(row, True)[:2] for row in q), strict=True)
-        for y, J in (program.evaluate(q, True)[:2], map(np.array, of_each_row)):
-            if not (abs(y - right).max() < 1e-12 and abs(J - slopes).max() < 1e-8):
+        # All rows at once, then one by one.
+        for rows in (slice(None), *range(len(q))):
+            y, J, _ = program.evaluate(q[rows], True)
+            value_error = np.abs(y - right[rows]).max()
+            slope_error = np.abs(J - slopes[rows]).max()
+            if not (value_error < 1e-12 and slope_error < 1e-8):
                 return False
     return True
 
@@ -130,7 +133,8 @@ def _two_halves(plan: Plan) -> int:
     identity = np.eye(3)
     frame = np.concatenate([identity.ravel(), np.zeros(3), [1.0], np.zeros(2)])
     half = 0.5 * identity[[2, 0, 1]]
-    return plan.node("arcs", 3, 3, [frame, np.zeros((2, 3)), half, half], 2, 0, 3)
+    numbers = [frame, np.zeros((2, 3)), half, half]
+    return plan.node("arcs", 3, 3, numbers, 2, 0, 3)
 
 
 def _three_units(plan: Plan) -> int:
@@ -209,24 +213,34 @@ class Program:
         """
         lead = q.shape[:-1]
         n, m = self._sizes
-        if q.size == n == q.shape[-1]:  # one row: one array for all results
-            results = np.empty(m + m * n + 1)
-            size = m + m * n
-            at = _address(results) or 0
-            row = np.asarray(q, np.float64).tobytes()
-            places = (
-                at + 8 * m if jacobian else None,
-                at + 8 * size if distance else None,
-            )
-            self._evaluate(self._call.place, row, 1, at, *places)
-            J = results[m:size].reshape(*lead, m, n) if jacobian else None
-            d = results[size:].reshape(lead) if distance else None
-            return results[:m].reshape(*lead, m), J, d
+        if q.size == n == q.shape[-1]:
+            return self._evaluate_row(q, jacobian, distance)
         x = np.empty((*lead, m))
         J = np.empty((*lead, m, n)) if jacobian else None
         d = np.empty(lead) if distance else None
         self._fill(q, [(x, m), (J, m * n), (d, 1)])
         return x, J, d
+
+    def _evaluate_row(self, q: NDArray, jacobian: bool, distance: bool) -> Results:
+        """Return the results of one row (..., n), quickly: they share an array."""
+        lead = q.shape[:-1]
+        n, m = self._sizes
+        end = m + m * n
+        results = np.empty(end + 1)
+        at = _address(results)
+        row = np.asarray(q, np.float64).tobytes()
+        J = None
+        at_J = None
+        if jacobian:
+            J = results[m:end].reshape(*lead, m, n)
+            at_J = at + 8 * m
+        d = None
+        at_d = None
+        if distance:
+            d = results[end:].reshape(lead)
+            at_d = at + 8 * end
+        self._evaluate(self._call.place, row, 1, at, at_J, at_d)
+        return results[:m].reshape(*lead, m), J, d
 
     def domain(self, q: NDArray, slope: bool = False) -> tuple[NDArray, NDArray | None]:
         """Return the domain distance (...) at q (..., n), and its gradient (..., n) or None."""
@@ -239,24 +253,21 @@ class Program:
         n = self._sizes[0]
         if q.shape[-1] != n:
             raise ValueError(f"`q` must have shape (..., {n}), got {q.shape}.")
+        if q.size == 0:
+            return
         q = np.ascontiguousarray(q, np.float64)
-        if q.size:
-            self._in_chunks(q.size // n, q.ctypes.data, results)
-
-    def _in_chunks(
-        self, rows: int, q: int, results: list[tuple[NDArray | None, int]]
-    ) -> None:
-        n = self._sizes[0]
-        places = [(_address(a), 8 * width) for a, width in results]
+        at_q = q.ctypes.data
 
         def run(start: int, count: int) -> None:
-            to = [
-                None if place is None else place + start * step
-                for place, step in places
-            ]
-            self._evaluate(self._call.place, q + 8 * n * start, count, *to)
+            places = []
+            for a, width in results:
+                at = None
+                if a is not None:
+                    at = _address(a) + 8 * width * start
+                places.append(at)
+            self._evaluate(self._call.place, at_q + 8 * n * start, count, *places)
 
-        in_chunks(rows, run)
+        in_chunks(q.size // n, run)
 
 
 def in_chunks(rows: int, run: Callable[[int, int], None]) -> None:
@@ -273,7 +284,7 @@ def in_chunks(rows: int, run: Callable[[int, int], None]) -> None:
 
 
 def play(
-    rows: NDArray, state: Sequence[Any], half: NDArray, lead: bool
+    rows: NDArray, state: tuple[ArrayLike, ArrayLike], half: NDArray, lead: bool
 ) -> list[NDArray]:
     """Return rows (T, n) after the play of the tendons, and the state after the last row.
 
@@ -281,7 +292,7 @@ def play(
     ----------
     rows : ndarray of shape (T, n)
         Commands, or effective changes if `lead`; contiguous float64, at least one row.
-    state : sequence of two array-likes of shape (n,)
+    state : pair of array-likes of shape (n,)
         The command and the effective change before the first row.
     half : ndarray of shape () or (n,)
         Half the play of every tendon.
@@ -290,7 +301,8 @@ def play(
     """
     n = rows.shape[1]
     vectors = np.empty((3, n))
-    vectors[0], vectors[1], vectors[2] = half, *state
+    vectors[0] = half
+    vectors[1], vectors[2] = state
     at = _address(vectors)
     effective = np.empty_like(rows)
     places = at, _address(rows), at + 8 * n, at + 16 * n, _address(effective)
@@ -298,10 +310,8 @@ def play(
     return [effective, vectors[1], vectors[2]]
 
 
-def _address(a: NDArray | None) -> int | None:
+def _address(a: NDArray) -> int:
     """Return the address of a contiguous, writable array; faster than `a.ctypes`."""
-    if a is None:
-        return None
     return ctypes.addressof(_BYTE.from_buffer(a))  # pyright: ignore[reportArgumentType]
 
 
@@ -317,15 +327,18 @@ class _Compiled:
         self.reason = ""
         self.tensors = []
         self.views = []
-        modules = [*model.modules()]
-        dicts = [d for m in modules for d in (m._modules, m._buffers, m._parameters)]
-        self.dicts = [d for d in dicts if d]
-        self.parts = [dict(d) for d in self.dicts]
-        portable = [m for m in modules if isinstance(m, PortableModule)]
-        self.settings = [
-            (vars(m), name) for m in portable for name in m.layout.settings
-        ]
         self.content = []
+        self.dicts = []
+        self.settings = []
+        modules = [*model.modules()]
+        for module in modules:
+            for parts in (module._modules, module._buffers, module._parameters):
+                if parts:
+                    self.dicts.append(parts)
+            if isinstance(module, PortableModule):
+                for name in module.layout.settings:
+                    self.settings.append((vars(module), name))
+        self.parts = [dict(parts) for parts in self.dicts]
         self.state = self._state()
         try:
             _check_classes(modules)
@@ -342,12 +355,10 @@ class _Compiled:
         except (ValueError, TypeError) as error:
             self.reason = str(error).split(";")[0]
 
-    def _state(self) -> list[Any]:
-        places = [
-            *map(Tensor.data_ptr, self.tensors),
-            *map(Tensor.stride, self.tensors),
-        ]
-        return places + [attributes.get(name) for attributes, name in self.settings]
+    def _state(self) -> list[object]:
+        settings = [attributes.get(name) for attributes, name in self.settings]
+        places = map(Tensor.data_ptr, self.tensors)
+        return [*places, *map(Tensor.stride, self.tensors), *settings]
 
     def holds(self) -> bool:
         """Return whether the model is still the same."""
@@ -360,12 +371,8 @@ class _Compiled:
 
 def _memory(a: Tensor) -> memoryview:
     """Return the memory that a tensor reads."""
-    return (
-        torch.empty(0, dtype=a.dtype, device=a.device)
-        .set_(a.untyped_storage())
-        .numpy()
-        .data
-    )
+    whole = torch.empty(0, dtype=a.dtype, device=a.device)
+    return whole.set_(a.untyped_storage()).numpy().data
 
 
 def _check_classes(modules: list[torch.nn.Module]) -> None:
@@ -426,18 +433,18 @@ def evaluate(
     """
     q = np.asarray(q, np.float64)
     program = program_of(model)
-    if program is not None and not (value or jacobian):
-        return (program.domain(q)[0],)
     if program is not None:
+        if not (value or jacobian):
+            return (program.domain(q)[0],)
         results = program.evaluate(q, jacobian, distance)
         return tuple([part for part in results if part is not None])
     rows = torch.from_numpy(np.require(q, requirements="W"))
-    results = ()
+    results = []
     with torch.no_grad():
         if jacobian:
-            results = model.forward_and_jacobian(rows)
+            results += model.forward_and_jacobian(rows)
         elif value:
-            results = (model(rows),)
+            results.append(model(rows))
         if distance:
-            results = *results, model.domain_distance(rows)
+            results.append(model.domain_distance(rows))
     return tuple(part.numpy() for part in results)

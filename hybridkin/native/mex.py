@@ -54,7 +54,7 @@ def export_mex(
     """
     project = c_project(model, name=name, about_q=about_q)
     entries = dict(project.entries)
-    about_lines = textwrap.wrap(entries["ABOUT_Q"], 92)
+    about_lines = textwrap.wrap(str(entries["ABOUT_Q"]), 92)
     entries["ABOUT_Q_HELP"] = "\n%   ".join(about_lines)
     parts = {
         "STEP_MEX": "mex_step.c",

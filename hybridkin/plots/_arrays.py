@@ -27,6 +27,22 @@ def shaped(
     return arrays.shaped(plain(value, name), name, need, length)
 
 
+def shaped_or_none(
+    value: object, name: str, need: Sequence[int | str], length: int | None = None
+) -> NDArray[np.float64] | None:
+    """Return `shaped` numbers, or None for None."""
+    if value is None:
+        return None
+    return shaped(value, name, need, length)
+
+
+def scaled(scale: float, values: NDArray | None) -> NDArray | None:
+    """Return values in another unit, or None for None."""
+    if values is None:
+        return None
+    return scale * values
+
+
 def times(value: ArrayLike | None, n_rows: int) -> NDArray | None:
     """Return increasing times (T,) [s], or None."""
     if value is None:

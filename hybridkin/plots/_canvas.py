@@ -6,7 +6,7 @@ import itertools
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, TypeAlias
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -19,6 +19,8 @@ from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Self
 
 from hybridkin._core.arrays import one_of
+
+Space: TypeAlias = Any  # Axes3D, whose annotations lack methods and arguments
 
 LENGTHS = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
 # Okabe & Ito: colour-blind readers can distinguish them.
@@ -88,13 +90,15 @@ class Display:
 
 def axes_or_new(ax: Axes | None) -> Axes:
     """Return the axes given, or those of a new figure of pyplot, which ``plt.show()`` shows."""
-    return plt.figure(layout="constrained").add_subplot() if ax is None else ax
+    if ax is None:
+        ax = plt.figure(layout="constrained").add_subplot()
+    return ax
 
 
-def space_or_new(ax: Axes | None) -> Any:
+def space_or_new(ax: Axes | None) -> Space:
     """Return the 3-D axes given, or those of a new figure of pyplot."""
     if ax is None:
-        return plt.figure(layout="constrained").add_subplot(projection="3d")
+        ax = plt.figure(layout="constrained").add_subplot(projection="3d")
     if not isinstance(ax, Axes3D):
         raise TypeError(
             '`ax` must be a 3-D axes, got a plane one; make it with projection="3d", as in '
@@ -125,9 +129,10 @@ def model_color(name: str, default: str = "#000000") -> str:
     >>> plots.model_color("hybrid, ELM") == plots.model_color("hybrid on nominal")
     True
     """
-    return next(
-        (color for words, color, _ in _MODELS if re.search(words, str(name))), default
-    )
+    for words, color, _ in _MODELS:
+        if re.search(words, str(name)):
+            return color
+    return default
 
 
 def looks_of(names: Iterable[str]) -> list[dict[str, Any]]:
@@ -137,11 +142,13 @@ def looks_of(names: Iterable[str]) -> list[dict[str, Any]]:
     """
     colors = [model_color(name, "") for name in names]
     left = itertools.cycle([color for color in COLORS if color not in colors] or COLORS)
+    first_styles = {color: style for _, color, style in _MODELS}
     looks = []
     counts = Counter[str]()
-    for color in (color or next(left) for color in colors):
-        first = next((style for _, of, style in _MODELS if of == color), "-")
-        style = STYLES[(STYLES.index(first) + counts[color]) % len(STYLES)]
+    for color in colors:
+        color = color or next(left)
+        first = STYLES.index(first_styles.get(color, "-"))
+        style = STYLES[(first + counts[color]) % len(STYLES)]
         looks.append({"color": color, "linestyle": style, "linewidth": 1.5})
         counts[color] += 1
     return looks
@@ -150,14 +157,22 @@ def looks_of(names: Iterable[str]) -> list[dict[str, Any]]:
 def legend_below(ax: Axes, n_columns: int = 1) -> None:
     """Put the legend under the axis' name, off the data."""
     down = ScaledTranslation(0.0, -0.5, ax.figure.dpi_scale_trans)
-    place = {"loc": "upper center", "bbox_to_anchor": (0.5, 0.0), "borderaxespad": 0.0}
-    place |= {"bbox_transform": ax.transAxes + down, "ncols": n_columns}
-    ax.legend(frameon=False, fontsize="small", **place)
+    ax.legend(
+        frameon=False,
+        fontsize="small",
+        loc="upper center",
+        bbox_to_anchor=(0.5, 0.0),
+        bbox_transform=ax.transAxes + down,
+        borderaxespad=0.0,
+        ncols=n_columns,
+    )
 
 
 def steps_of(t: NDArray | None, n_rows: int) -> tuple[NDArray, str]:
     """Return the values and the name of a time axis: times [s], or steps without times."""
-    return (np.arange(n_rows), "time step") if t is None else (t, "time [s]")
+    if t is None:
+        return np.arange(n_rows), "time step"
+    return t, "time [s]"
 
 
 def scale_of(unit: str, known: Mapping[str, float] = LENGTHS) -> float:
@@ -168,28 +183,26 @@ def scale_of(unit: str, known: Mapping[str, float] = LENGTHS) -> float:
 def decimals(values: ArrayLike) -> int:
     """Return the decimals, 2 to 6, that show two digits of the largest value."""
     values = np.asarray(values, dtype=float)
-    largest = float(np.abs(values[np.isfinite(values)]).max(initial=0.0))
-    return 2 if largest == 0.0 else int(np.clip(1 - np.floor(np.log10(largest)), 2, 6))
+    largest = np.abs(values[np.isfinite(values)]).max(initial=0.0)
+    if largest == 0.0:
+        return 2
+    power = np.floor(np.log10(largest))
+    return int(np.clip(1 - power, 2, 6))
 
 
-def label_space(ax: Any, unit: str) -> None:
+def label_space(ax: Space, unit: str) -> None:
     """Label the axes of space and scale them equally, none too short, on white panes."""
     ax.set(xlabel=f"x [{unit}]", ylabel=f"y [{unit}]", zlabel=f"z [{unit}]")
     low, high = np.array([ax.get_xlim(), ax.get_ylim(), ax.get_zlim()]).T
     middle = 0.5 * (low + high)
     half = 0.5 * (high - low)
     half = half.clip(min=0.25 * half.max())
-    ax.set(
-        **{
-            f"{k}lim": (m - h, m + h)
-            for k, m, h in zip("xyz", middle, half, strict=True)
-        }
-    )
-    for axis, share in zip(
-        (ax.xaxis, ax.yaxis, ax.zaxis), half / half.max(), strict=True
-    ):
+    xlim, ylim, zlim = np.stack([middle - half, middle + half], axis=1)
+    ax.set(xlim=xlim, ylim=ylim, zlim=zlim)
+    n_ticks = np.maximum(2, np.rint(5.0 * half / half.max()).astype(int))
+    for axis, n in zip((ax.xaxis, ax.yaxis, ax.zaxis), n_ticks.tolist(), strict=True):
         axis.set_pane_color((1.0, 1.0, 1.0, 0.0))
-        axis.set_major_locator(MaxNLocator(max(2, round(5 * share))))
+        axis.set_major_locator(MaxNLocator(n))
     ax.patch.set_visible(False)  # it would hide the labels of the axes beside it
     ax.set_aspect("equal")
     ax.set_box_aspect(half, zoom=0.88)  # space for the z label, which layouts ignore

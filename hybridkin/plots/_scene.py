@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
-from hybridkin.plots._canvas import COLORS, label_space
+from hybridkin.plots._canvas import COLORS, Space, label_space
 
 
 class Line(NamedTuple):
@@ -23,8 +23,13 @@ class Line(NamedTuple):
 
     def look(self) -> dict[str, Any]:
         """Return the look as arguments of matplotlib."""
-        look = {"color": self.color, "linewidth": self.width, "linestyle": self.style}
-        return look | {"marker": self.marker, "markersize": 6}
+        return {
+            "color": self.color,
+            "linewidth": self.width,
+            "linestyle": self.style,
+            "marker": self.marker,
+            "markersize": 6,
+        }
 
 
 class Scene(NamedTuple):
@@ -47,21 +52,20 @@ class Scene(NamedTuple):
 class Stage:
     """Axes that show one frame of a scene after another."""
 
-    def __init__(self, scene: Scene, ax: Any, error_ax: Axes | None = None) -> None:
+    def __init__(self, scene: Scene, ax: Space, error_ax: Axes | None = None) -> None:
         self.scene = scene
-        self.title_ax = ax if error_ax is None else error_ax
-        for name, low, high in zip("xyz", scene.low, scene.high, strict=True):
-            ax.set(**{f"{name}lim": (low, high)})
+        self.title_ax = error_ax or ax
+        xlim, ylim, zlim = np.stack([scene.low, scene.high], axis=1)
+        ax.set(xlim=xlim, ylim=ylim, zlim=zlim)
         label_space(ax, scene.unit)
         if scene.target is not None:
             ax.plot(*scene.target.T, color="black", linewidth=1.0, label="target")
-        self.trail = ax.plot(
-            [], [], [], color=COLORS[0], linewidth=1.2, linestyle="--"
-        )[0]
-        self.moving = [
-            (ax.plot([], [], [], label=line.label or None, **line.look())[0], line)
-            for line in scene.moving
-        ]
+        trail = ax.plot([], [], [], color=COLORS[0], linewidth=1.2, linestyle="--")
+        self.trail = trail[0]
+        self.artists = []
+        for line in scene.moving:
+            artists = ax.plot([], [], [], label=line.label or None, **line.look())
+            self.artists += artists
         ax.legend(
             frameon=False,
             fontsize="small",
@@ -79,9 +83,9 @@ class Stage:
     def show(self, k: int) -> None:
         """Move everything to frame k."""
         scene = self.scene
-        row = self.scene.rows[k]
+        row = scene.rows[k]
         self.trail.set_data_3d(*scene.x[: row + 1].T)
-        for artist, line in self.moving:
+        for artist, line in zip(self.artists, scene.moving, strict=True):
             artist.set_data_3d(*line.points[k].T)
         self.title_ax.set_title(scene.captions[k], fontsize="medium")
         if self.cursor is not None and scene.error is not None:

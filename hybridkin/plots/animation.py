@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib import animation
@@ -16,7 +15,14 @@ from typing_extensions import Self
 
 from hybridkin._core.arrays import whole
 from hybridkin._core.files import write_file
-from hybridkin.plots._arrays import distance, plain, shaped, times
+from hybridkin.plots._arrays import (
+    distance,
+    plain,
+    scaled,
+    shaped,
+    shaped_or_none,
+    times,
+)
 from hybridkin.plots._canvas import (
     COLORS,
     Display,
@@ -98,14 +104,15 @@ class TrackAnimation(Display):
     ) -> None:
         self.x = shaped(x, "x", "T3")
         T = len(self.x)
-        self.target = None if target is None else shaped(target, "target", "T3", T)
-        self.error = None if self.target is None else distance(self.x, self.target)
-        self.error_name = "error"
-        if expected is not None:
-            self.error = shaped(expected, "expected", "T", T)
-            self.error_name = "expected error"
+        self.target = shaped_or_none(target, "target", "T3", T)
+        self.error = shaped_or_none(expected, "expected", "T", T)
+        self.error_name = "expected error"
+        if self.error is None:
+            self.error_name = "error"
+            if self.target is not None:
+                self.error = distance(self.x, self.target)
         self.t = times(t, T)
-        shown = np.arange(T) if rows is None else shaped(rows, "rows", "K")
+        shown = shaped(np.arange(T) if rows is None else rows, "rows", "K")
         K = len(shown)
         inside = K > 0 and shown[0] >= 0 and shown[-1] < T
         if not (inside and (np.diff(shown) > 0).all()):
@@ -168,26 +175,29 @@ class TrackAnimation(Display):
         if q.ndim != 2 or len(q) == 0:
             raise ValueError(f"`q` must have shape (T, n) with T >= 1, got {q.shape}.")
         rows = _evenly(times(t, len(q)), len(q), n_frames)
-        ends = None if tips is None else shaped(tips, "tips", "T3", len(q))[rows]
+        ends = shaped_or_none(tips, "tips", "T3", len(q))
+        if ends is not None:
+            ends = ends[rows]
         body = BackboneDisplay.from_estimator(model, q[rows], tips=ends, names=names)
-        name = "tip (model)" if x is None else "tip (measured)"
+        name = "tip (measured)"
         if x is None:
+            name = "tip (model)"
             x = tips
         if x is None:
             finite = np.isfinite(q).all(axis=1)
             x = np.full((len(q), 3), np.nan)
             x[finite] = predicted(model, q[finite])
-        shown: Any = {"body": body, "rows": rows, "name": name, "expected": expected}
-        return cls(x, target=target, t=t, **shown)
+        return cls(
+            x, target=target, t=t, body=body, rows=rows, name=name, expected=expected
+        )
 
     @property
     def fps(self) -> float:
         """Frames per second at which the film takes as long as the motion [1/s]."""
         if self.t is None or len(self.rows) < 2:
             return _PACE
-        return (len(self.rows) - 1) / float(
-            self.t[self.rows[-1]] - self.t[self.rows[0]]
-        )
+        t = self.t[self.rows]
+        return (len(t) - 1) / float(t[-1] - t[0])
 
     def plot(
         self, ax: Axes | None = None, *, unit: str = "cm", frame: int = -1
@@ -210,7 +220,8 @@ class TrackAnimation(Display):
         """
         space = space_or_new(ax)
         K = len(self.rows)
-        Stage(self._scene(unit), space).show(whole(frame, "frame", -K, K - 1) % K)
+        frame = whole(frame, "frame", -K, K - 1)
+        Stage(self._scene(unit), space).show(frame % K)
         return self._drawn(space)
 
     def save(
@@ -272,22 +283,12 @@ class TrackAnimation(Display):
             return path
         writer = _writer(kind, fps)
         figure = Figure(figsize=_SIZE, layout="constrained")
-        grid = figure.add_gridspec(1, 2, width_ratios=(1.5, 1.0))
-        ax = figure.add_subplot(
-            grid[:] if self.error is None else grid[0], projection="3d"
-        )
-        ax.view_init(*view)
-        stage = Stage(
-            scene, ax, None if self.error is None else figure.add_subplot(grid[1])
-        )
-        stage.show(0)
-        figure.draw_without_rendering()
-        figure.set_layout_engine("none")  # keeps the axes in place
+        stage = _stage(figure, scene, view)
+        if dpi is None:
+            dpi = _DPI[kind]
 
         def draw(staging: Path) -> None:
-            with writer.saving(
-                figure, str(staging), _DPI[kind] if dpi is None else dpi
-            ):
+            with writer.saving(figure, str(staging), dpi):
                 for k in range(len(self.rows)):
                     stage.show(k)
                     writer.grab_frame()
@@ -303,22 +304,22 @@ class TrackAnimation(Display):
         Those of the body, and with a target the error: a line from the tip to its target.
         """
         x = self.x[self.rows]
-        artists = [] if self.body is None else self.body.lines(tip=False)
+        lines = []
+        if self.body is not None:
+            lines += self.body.lines(tip=False)
         if self.target is not None:
             way = np.stack([self.target[self.rows], x], axis=1)
-            artists.append(Line("tip error", way, "black", 2.0))
-            artists.append(Line("", way[:, :1], "black", 1.0, marker="x", style="none"))
-        artists.append(
-            Line(self.name, x[:, None], COLORS[0], 1.0, marker="o", style="none")
-        )
-        return artists
+            lines.append(Line("tip error", way, "black", 2.0))
+            lines.append(Line("", way[:, :1], "black", 1.0, marker="x", style="none"))
+        tip = Line(self.name, x[:, None], COLORS[0], 1.0, marker="o", style="none")
+        return [*lines, tip]
 
     def limits(self) -> tuple[NDArray, NDArray]:
         """Return the corners (3,) of a box around all points, with a margin [m]."""
         parts = [self.x, *(line.points.reshape(-1, 3) for line in self.lines())]
-        everything = np.concatenate(
-            parts if self.target is None else [*parts, self.target]
-        )
+        if self.target is not None:
+            parts.append(self.target)
+        everything = np.concatenate(parts)
         finite = everything[np.isfinite(everything).all(axis=1)]
         if len(finite) == 0:
             raise ValueError("`x` must hold at least one known tip; all rows are NaN.")
@@ -330,25 +331,28 @@ class TrackAnimation(Display):
     def caption(self, k: int, unit: str) -> str:
         """Return the title of frame k: the time, and the error [unit]."""
         row = self.rows[k]
-        when = f"step {row}" if self.t is None else f"t = {self.t[row]:.2f} s"
-        if self.error is None:
+        if self.t is None:
+            when = f"step {row}"
+        else:
+            when = f"t = {self.t[row]:.2f} s"
+        error = scaled(scale_of(unit), self.error)
+        if error is None:
             return when
-        error = scale_of(unit) * self.error[row]
-        places = decimals(scale_of(unit) * self.error)
-        shown = f"{error:.{places}f} {unit}" if np.isfinite(error) else "not known"
-        return f"{when}, {self.error_name} {shown}"
+        if not np.isfinite(error[row]):
+            return f"{when}, {self.error_name} not known"
+        return f"{when}, {self.error_name} {error[row]:.{decimals(error)}f} {unit}"
 
     def _scene(self, unit: str) -> Scene:
         scale = scale_of(unit)
-        (low, high) = self.limits()
+        low, high = self.limits()
         steps, when = steps_of(self.t, len(self.x))
         return Scene(
             unit=unit,
             low=scale * low,
             high=scale * high,
             x=scale * self.x,
-            target=None if self.target is None else scale * self.target,
-            error=None if self.error is None else scale * self.error,
+            target=scaled(scale, self.target),
+            error=scaled(scale, self.error),
             error_name=f"{self.error_name} [{unit}]",
             steps=steps,
             when=when,
@@ -363,7 +367,24 @@ def _evenly(t: NDArray | None, n_rows: int, most: int) -> NDArray:
     if t is None:
         t = np.arange(n_rows)
     wanted = np.linspace(t[0], t[-1], min(most, n_rows))
-    return np.unique(np.rint(np.interp(wanted, t, np.arange(n_rows))).astype(int))
+    rows = np.interp(wanted, t, np.arange(n_rows))
+    return np.unique(np.rint(rows).astype(int))
+
+
+def _stage(figure: Figure, scene: Scene, view: tuple[float, float]) -> Stage:
+    """Return the robot on the left of a figure, and the error, if there is one, on the right."""
+    grid = figure.add_gridspec(1, 2, width_ratios=(1.5, 1.0))
+    place = grid[:] if scene.error is None else grid[0]
+    space = figure.add_subplot(place, projection="3d")
+    space.view_init(*view)
+    error_ax = None
+    if scene.error is not None:
+        error_ax = figure.add_subplot(grid[1])
+    stage = Stage(scene, space, error_ax)
+    stage.show(0)
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")  # keeps the axes in place
+    return stage
 
 
 def _writer(kind: str, fps: float) -> animation.AbstractMovieWriter:

@@ -117,7 +117,7 @@ class ErrorHistogramDisplay(_ErrorDisplay):
         finite = self._known(unit)
         ax = axes_or_new(ax)
         bins = whole(bins, "bins", most=10_000)
-        top = max(float(values.max()) for values in finite.values()) or 1e-3
+        top = max(float(errors.max()) for errors in finite.values()) or 1e-3
         edges = np.linspace(0.0, top, bins + 1).tolist()
         for look, (name, values) in zip(looks_of(finite), finite.items(), strict=True):
             color = look["color"]
@@ -191,9 +191,10 @@ class ErrorBoxDisplay(_ErrorDisplay):
         ax.set_yticks(places, [*finite])
         ax.set(xlabel=f"tip error [{unit}]")
         if log:
-            low = min(float(np.percentile(errors, 5)) for errors in values)
             most = largest.max()
-            ax.set(xscale="log", xlim=(0.7 * max(low, 1e-6 * most), 1.5 * most))
+            low = min(float(np.percentile(errors, 5)) for errors in values)
+            low = max(low, 1e-6 * most)
+            ax.set(xscale="log", xlim=(0.7 * low, 1.5 * most))
         else:
             upper = np.median([np.percentile(errors, 95) for errors in values])
             # A few bad models do not extend a linear axis.
@@ -203,13 +204,13 @@ class ErrorBoxDisplay(_ErrorDisplay):
                 words = f"max {largest[row]:.0f}"
                 if means[row] > end:
                     words = f"mean {means[row]:.0f}, {words}"
-                beside = {
-                    "xytext": (4, 0),
-                    "textcoords": "offset points",
-                    "va": "center",
-                }
                 ax.annotate(
-                    f"▸ {words}", (end, places[row]), **beside, fontsize="small"
+                    f"▸ {words}",
+                    (end, places[row]),
+                    xytext=(4, 0),
+                    textcoords="offset points",
+                    va="center",
+                    fontsize="small",
                 )
         legend_below(ax, 2)
         return self._drawn(ax)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol, TypeAlias, cast, runtime_checkable
+from functools import partial
+from typing import Protocol, TypeAlias, TypedDict, runtime_checkable
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
+from typing_extensions import Required
 
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
@@ -24,9 +26,34 @@ _REACHED = 1e-6  # largest distance of a drawn tip from its place [m]
 class Predictor(Protocol):
     """A fitted estimator."""
 
-    def predict(self, X: object, /) -> Any:
+    def predict(self, X: object, /) -> NDArray:
         """Return tips (N, m) for actuator vectors (N, n)."""
         ...
+
+
+class _Corrected(Protocol):
+    corrects_inside: bool
+
+
+@runtime_checkable
+class _Hybrid(Predictor, Protocol):
+    """A fitted hybrid model of a chain."""
+
+    mechanical_model_: Chain
+    fitted_module_: _Corrected
+
+
+class Body(TypedDict, total=False):
+    """The arguments of `BackboneDisplay`."""
+
+    points: Required[NDArray]
+    actuators: Required[list[NDArray]]
+    frames: Required[NDArray]
+    tips: Required[NDArray]
+    segments: list[int]
+    disks: NDArray
+    predicted: NDArray
+    rigid: bool
 
 
 Model: TypeAlias = Predictor | torch.nn.Module
@@ -42,7 +69,7 @@ def predicted(model: Model, q: ArrayLike) -> NDArray:
 
 def body_of(
     model: Model, q: ArrayLike, n_points: int, tips: ArrayLike | None = None
-) -> dict[str, Any]:
+) -> Body:
     """Return the arguments of `BackboneDisplay` for a robot in configurations q (K, n) or (n,).
 
     Where `tips` (K, 3) are given, or the model corrects its robot inside, the body ends there.
@@ -56,46 +83,55 @@ def body_of(
         )
     q = shaped(np.atleast_2d(plain(q, "q")), "q", ("K", chain.n_actuators))
     drawn = np.asarray(np.isfinite(q).all(axis=1))
+
+    # Where the body ends: at given tips, or at those of a model that corrects its robot inside.
     ends = None
     predicted_tips = None
-    leads = False
+    corrects_inside = False
     if tips is not None:
         ends = shaped(tips, "tips", "K3", len(q))
         drawn = drawn & np.isfinite(ends).all(axis=1)
-    elif isinstance(model, Predictor):
-        predicted_tips = _spread(_predicted_tips(model, chain, q[drawn]), drawn)
-        leads = cast(
-            Any, model
-        ).fitted_module_.corrects_inside  # of a HybridForwardModel
-        if leads:
+    elif isinstance(model, _Hybrid):
+        predicted_tips = _spread(drawn, _predicted_tips(model, chain, q[drawn]))
+        corrects_inside = model.fitted_module_.corrects_inside
+        if corrects_inside:
             ends = predicted_tips
     rows = torch.from_numpy(q[drawn])
     if ends is not None:
         rows = _led_to(chain, rows, torch.from_numpy(ends[drawn]))
+
+    spread = partial(_spread, drawn)
     with torch.no_grad():
-        body: dict[str, Any] = {
-            "frames": _spread(chain.poses(rows), drawn),
-            "tips": _spread(chain.tip_model(rows), drawn),
-        }
+        tip = spread(chain.tip_model(rows))
+        frames = spread(chain.poses(rows))
         if isinstance(chain, ArcChain):
             arcs = _Arcs(chain, rows, n_points)
-            body["points"] = _spread(arcs.backbone, drawn)
-            body["actuators"] = [_spread(path, drawn) for path in arcs.actuators()]
-            body["disks"] = _spread(arcs.disks(), drawn)
-            body["segments"] = np.repeat(
-                range(chain.n_segments), chain.actuators_per_segment
-            )
+            body: Body = {
+                "points": spread(arcs.backbone),
+                "actuators": [*map(spread, arcs.actuators())],
+                "segments": arcs.segments,
+                "disks": spread(arcs.disks()),
+                "frames": frames,
+                "tips": tip,
+            }
         else:
-            body["points"] = _spread(chain.backbone(rows), drawn)
-            body["rigid"] = True
+            body = {
+                "points": spread(chain.backbone(rows)),
+                "actuators": [],
+                "frames": frames,
+                "tips": tip,
+                "rigid": True,
+            }
+
+    # The learned correction is shown where the body does not end at the predicted tip.
     if predicted_tips is not None:
-        way = np.abs(body["tips"] - predicted_tips)
-        if not leads or np.nanmax(way, initial=0.0) > _REACHED:
+        largest = np.nanmax(np.abs(tip - predicted_tips), initial=0.0)
+        if not corrects_inside or largest > _REACHED:
             body["predicted"] = predicted_tips
     return body
 
 
-def _spread(values: torch.Tensor | NDArray, drawn: NDArray[np.bool_]) -> NDArray:
+def _spread(drawn: NDArray[np.bool_], values: torch.Tensor | NDArray) -> NDArray:
     """Return values of drawn configurations among rows of NaN for the others."""
     spread = np.full((len(drawn), *values.shape[1:]), np.nan)
     spread[drawn] = values
@@ -107,7 +143,9 @@ def _predicted_tips(model: Predictor, chain: Chain, q: NDArray) -> NDArray:
     if not len(q):
         return np.empty((0, 3))
     x = plain(model.predict(q), "x")
-    return x[:, :3] if chain.n_outputs == 3 else x[:, -3:]
+    if chain.n_outputs == 3:
+        return x[:, :3]
+    return x[:, -3:]
 
 
 def _led_to(chain: Chain, q: torch.Tensor, tips: torch.Tensor) -> torch.Tensor:
@@ -117,7 +155,8 @@ def _led_to(chain: Chain, q: torch.Tensor, tips: torch.Tensor) -> torch.Tensor:
     """
     for _ in range(_STEPS):
         x, J = chain.tip_model.forward_and_jacobian(q)
-        step = torch.linalg.pinv(J, rtol=_SINGULAR) @ (tips - x)[..., None]
+        inverse = torch.linalg.pinv(J, rtol=_SINGULAR)
+        step = inverse @ (tips - x)[..., None]
         q = q + step[..., 0]
     return q.detach()
 
@@ -128,10 +167,13 @@ class _Arcs:
     def __init__(self, chain: ArcChain, q: torch.Tensor, n_points: int) -> None:
         self.chain = chain
         self.radii = plain(chain.radii)
+        counts = chain.actuators_per_segment
+        self.segments = np.repeat(range(chain.n_segments), counts).tolist()
         frames = plain(chain.poses(q))
+        turns = frames[..., :3, :3]
         bending = plain(chain.arcs(q)[1])
         if chain.stage is not None:  # in the frames that turn with the stage
-            turned = frames[:, 0, :3, :3].swapaxes(1, 2) @ frames[:, 1, :3, :3]
+            turned = turns[:, 0].swapaxes(1, 2) @ turns[:, 1]
             bending = bending @ turned[:, :2, :2]
         self.backbone = plain(chain.backbone(q, n_points))
         offsets = plain(chain.offsets)
@@ -139,40 +181,43 @@ class _Arcs:
         self.centres = []  # (K, P, 3) of each segment
         self.turns = []  # (K, P, 3, 3)
         for s in range(chain.n_segments):
-            centre = self.backbone[:, s * n_points : (s + 1) * n_points + 1].copy()
+            start = s * n_points
+            centre = self.backbone[:, start : start + n_points + 1].copy()
             # The backbone includes the rigid offset, the actuators do not.
             centre[:, -1] -= offsets[s] * frames[:, s + 1, :3, 2]
+            self.centres.append(centre)
+
             # An arc turns evenly about the normal of its bending direction.
             normal = np.zeros((len(q), 1, 3))
             normal[:, 0, 0] = -bending[:, s, 1]
             normal[:, 0, 1] = bending[:, s, 0]
-            turn = Rotation.from_rotvec((along * normal).reshape(-1, 3)).as_matrix()
-            turn = turn.reshape(len(q), len(along), 3, 3)
-            self.centres.append(centre)
-            self.turns.append(frames[:, s, None, :3, :3] @ turn)
+            rotation_vectors = along * normal
+            arc = Rotation.from_rotvec(rotation_vectors.reshape(-1, 3)).as_matrix()
+            arc = arc.reshape(*rotation_vectors.shape, 3)
+            self.turns.append(turns[:, s, None] @ arc)
 
     def actuators(self) -> list[NDArray]:
         """Return the points of every actuator, each (K, P_i, 3)."""
-        chain = self.chain
-        segments = np.repeat(range(chain.n_segments), chain.actuators_per_segment)
         paths = []
-        for s, angle in zip(segments, plain(chain.angles), strict=True):
-            at = self.radii[s] * np.array([np.cos(angle), np.sin(angle), 0.0])
-            crossed = range(chain.starts[s], s + 1)
-            path = [self.centres[k] + self.turns[k] @ at for k in crossed]
+        for s, angle in zip(self.segments, plain(self.chain.angles), strict=True):
+            place = self.radii[s] * np.array([np.cos(angle), np.sin(angle), 0.0])
+            path = []
+            for k in range(self.chain.starts[s], s + 1):
+                path.append(self.centres[k] + self.turns[k] @ place)
             paths.append(np.concatenate(path, axis=1))
         return paths
 
     def disks(self) -> NDArray:
         """Return the rims of the disks (K, S + 1, C, 3): at the base and at every segment's end."""
-        based = self.chain.routing == "base"
         disks = [self._disk(0, 0, self.radii[0])]
         for s, radius in enumerate(self.radii):
-            disks.append(self._disk(s, -1, self.radii[s:].max() if based else radius))
+            if self.chain.routing == "base":
+                radius = self.radii[s:].max()
+            disks.append(self._disk(s, -1, radius))
         return np.stack(disks, axis=1)
 
     def _disk(self, s: int, point: int, radius: float) -> NDArray:
         corner = np.linspace(0.0, 2.0 * np.pi, _CORNERS)
-        rim = _RIM * radius * np.stack([np.cos(corner), np.sin(corner), 0.0 * corner])
-        turned = (self.turns[s][:, point] @ rim).swapaxes(-1, -2)
-        return self.centres[s][:, point, None] + turned
+        circle = np.stack([np.cos(corner), np.sin(corner), 0.0 * corner])
+        rim = self.turns[s][:, point] @ (_RIM * radius * circle)
+        return self.centres[s][:, point, None] + rim.swapaxes(-1, -2)

@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Sequence
-from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
+from matplotlib.collections import PathCollection
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Self
 
 from hybridkin._core.arrays import whole
-from hybridkin.plots._arrays import distance, plain, shaped
-from hybridkin.plots._canvas import COLORS, Display, label_space, scale_of, space_or_new
+from hybridkin.plots._arrays import distance, plain, shaped, shaped_or_none
+from hybridkin.plots._canvas import (
+    COLORS,
+    Display,
+    Space,
+    label_space,
+    scale_of,
+    space_or_new,
+)
 from hybridkin.plots._scene import Line
 from hybridkin.plots.models import Model, body_of
 
@@ -69,7 +77,7 @@ class WorkspaceDisplay(Display):
     ) -> None:
         self.x = shaped(x, "x", "N3")
         self.predicted = shaped(predicted, "predicted", "N3", len(self.x))
-        self.backbone = None if backbone is None else shaped(backbone, "backbone", "P3")
+        self.backbone = shaped_or_none(backbone, "backbone", "P3")
         self.row = row
         if row is not None:
             whole(row, "row", -len(self.x), len(self.x) - 1)
@@ -105,30 +113,46 @@ class WorkspaceDisplay(Display):
             line = scale * self.backbone.T
             space.plot(*line, color=_BODY, linewidth=4, label="robot (model)")
         if self.row is not None:
-            measured = scale * self.x[self.row]
-            predicted = scale * self.predicted[self.row]
-            space.plot(
-                *np.stack([measured, predicted], axis=1), color="black", linewidth=1.5
-            )
-            space.scatter(
-                *measured, color="black", s=30, label="measured tip", zorder=3
-            )
-            ring = {"facecolor": "white", "edgecolor": "black", "depthshade": False}
-            space.scatter(*predicted, s=30, label="predicted tip", zorder=3, **ring)
+            self._draw_row(space, scale, self.row)
         if self.backbone is not None or self.row is not None:
-            place = {"loc": "upper center", "bbox_to_anchor": (0.5, 0.03), "ncols": 3}
-            space.legend(frameon=False, fontsize="small", **place)
+            space.legend(
+                frameon=False,
+                fontsize="small",
+                loc="upper center",
+                bbox_to_anchor=(0.5, 0.03),
+                ncols=3,
+            )
         label_space(space, unit)
         return self._drawn(space)
 
-    def _draw_tips(self, space: Any, scale: float) -> Any:
+    def _draw_row(self, space: Space, scale: float, row: int) -> None:
+        """Draw the measured and the predicted tip of a sample, joined by a line."""
+        measured = scale * self.x[row]
+        predicted = scale * self.predicted[row]
+        ends = np.stack([measured, predicted], axis=1)
+        space.plot(*ends, color="black", linewidth=1.5)
+        space.scatter(*measured, color="black", s=30, label="measured tip", zorder=3)
+        space.scatter(
+            *predicted,
+            s=30,
+            label="predicted tip",
+            zorder=3,
+            facecolor="white",
+            edgecolor="black",
+            depthshade=False,
+        )
+
+    def _draw_tips(self, space: Space, scale: float) -> PathCollection:
         """Draw the measured tips, coloured by error, the worst in front."""
         errors = scale * distance(self.predicted, self.x)
-        finite = np.flatnonzero(np.isfinite(errors))
-        order = finite[np.argsort(errors[finite])]
-        top = float(np.quantile(errors[order], _TOP)) if len(order) else 1.0
+        order = np.argsort(errors)
+        order = order[np.isfinite(errors[order])]
+        top = 1.0
+        if len(order):
+            top = float(np.quantile(errors[order], _TOP))
+        tips = scale * self.x[order]
         return space.scatter(
-            *(scale * self.x[order].T),
+            *tips.T,
             c=errors[order],
             s=7,
             cmap="cividis",
@@ -201,9 +225,9 @@ class BackboneDisplay(Display):
         rigid: bool = False,
     ) -> None:
         points = plain(points, "points")
-        self.points = shaped(
-            points[None] if points.ndim == 2 else points, "points", "KP3"
-        )
+        if points.ndim == 2:
+            points = points[None]
+        self.points = shaped(points, "points", "KP3")
         K = len(self.points)
         if not isinstance(actuators, Iterable):
             raise ValueError(
@@ -212,11 +236,10 @@ class BackboneDisplay(Display):
         self.actuators = tuple(
             shaped(path, "actuators", "KP3", K) for path in actuators
         )
-        if segments is None:
-            self.segments = (0,) * len(self.actuators)
-        else:
-            self.segments = tuple(segments)
         n = len(self.actuators)
+        if segments is None:
+            segments = (0,) * n
+        self.segments = tuple(segments)
         if len(self.segments) != n:
             raise ValueError(f"`segments` must hold {n} numbers, one per actuator.")
         self.names = tuple(names)
@@ -224,16 +247,12 @@ class BackboneDisplay(Display):
             raise ValueError(
                 f"`names` must hold {n} names, one per actuator, got {names!r:.80}."
             )
-        self.disks = None if disks is None else shaped(disks, "disks", "KDC3", K)
-        self.frames = None if frames is None else shaped(frames, "frames", "KF44", K)
-        if tips is None:
-            self.tips = self.points[:, -1]
-        else:
-            self.tips = shaped(tips, "tips", "K3", K)
-        if predicted is None:
-            self.predicted = None
-        else:
-            self.predicted = shaped(predicted, "predicted", "K3", K)
+        self.disks = shaped_or_none(disks, "disks", "KDC3", K)
+        self.frames = shaped_or_none(frames, "frames", "KF44", K)
+        self.tips = shaped(
+            self.points[:, -1] if tips is None else tips, "tips", "K3", K
+        )
+        self.predicted = shaped_or_none(predicted, "predicted", "K3", K)
         self.rigid = rigid
 
     @classmethod
@@ -338,34 +357,35 @@ class BackboneDisplay(Display):
     def _actuator_lines(self) -> list[Line]:
         """Return the actuators, each by its name or together by segment."""
         lines = []
-        for i, name in enumerate(self.names):
-            lines.append(Line(name, self.actuators[i], COLORS[i % len(COLORS)], 1.6))
-        if lines:
+        if self.names:
+            colors = itertools.cycle(COLORS)
+            for name, path, color in zip(
+                self.names, self.actuators, colors, strict=False
+            ):
+                lines.append(Line(name, path, color, 1.6))
             return lines
-        paths: dict[int, list[NDArray]] = {
-            segment: [] for segment in sorted({*self.segments})
-        }
-        for segment, path in zip(self.segments, self.actuators, strict=True):
-            paths[segment].append(path)
-        for segment, own in paths.items():
+        for segment in sorted({*self.segments}):
+            paths = []
+            for path, of in zip(self.actuators, self.segments, strict=True):
+                if of == segment:
+                    paths.append(path)
+            label = f"actuators of segment {segment + 1}"
             color = _SEGMENTS[segment % len(_SEGMENTS)]
-            lines.append(
-                Line(f"actuators of segment {segment + 1}", _joined(own), color, 1.6)
-            )
+            lines.append(Line(label, _joined(paths), color, 1.6))
         return lines
 
-    def _draw_outline(self, space: Any, k: int, scale: float) -> None:
+    def _draw_outline(self, space: Space, k: int, scale: float) -> None:
         """Draw backbone and tip of one of several configurations."""
         color = colormaps["cividis"](k / len(self.points))
         for line in self.lines(body=False):
-            space.plot(*(scale * line.points[k].T), **line.look() | {"color": color})
+            points = scale * line.points[k]
+            space.plot(*points.T, **line.look() | {"color": color})
 
-    def _draw_body(self, space: Any, scale: float) -> None:
+    def _draw_body(self, space: Space, scale: float) -> None:
         """Draw all parts of the only configuration."""
         for line in self.lines():
-            space.plot(
-                *(scale * line.points[0].T), label=line.label or None, **line.look()
-            )
+            points = scale * line.points[0]
+            space.plot(*points.T, label=line.label or None, **line.look())
         if self.disks is not None and self.disks.size:
             disks = scale * self.disks[0]
             space.add_collection3d(
@@ -374,12 +394,13 @@ class BackboneDisplay(Display):
         if self.frames is not None:
             self._draw_frames(space, self.frames[0], scale)
 
-    def _draw_frames(self, ax: Any, frames: NDArray, scale: float) -> None:
+    def _draw_frames(self, ax: Space, frames: NDArray, scale: float) -> None:
         steps = np.linalg.norm(np.diff(self.points, axis=1), axis=-1)
         size = _AXIS_LENGTH * float(np.nanmax(steps.sum(axis=-1)))
+        origins = frames[:, :3, 3]
         for axis, (letter, color) in enumerate(zip("xyz", _AXES, strict=True)):
-            ends = frames[:, :3, 3] + size * frames[:, :3, axis]
-            strokes = np.stack([frames[:, :3, 3], ends], axis=1)
+            ends = origins + size * frames[:, :3, axis]
+            strokes = np.stack([origins, ends], axis=1)
             ax.plot(*(scale * _joined(strokes).T), color=color, linewidth=1.5)
             ax.text(*(scale * ends[-1]), letter, color=color, fontsize="small")
 

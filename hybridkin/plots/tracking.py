@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Protocol
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -12,7 +12,14 @@ from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Self
 
 from hybridkin._core.arrays import one_of, whole
-from hybridkin.plots._arrays import distance, named, plain, shaped, times
+from hybridkin.plots._arrays import (
+    distance,
+    named,
+    plain,
+    shaped,
+    shaped_or_none,
+    times,
+)
 from hybridkin.plots._canvas import (
     COLORS,
     LENGTHS,
@@ -28,6 +35,21 @@ from hybridkin.plots._canvas import (
 
 _ACTUATOR_UNITS = {**LENGTHS, "rad": 1.0, "deg": 180.0 / np.pi}
 _PLANES = ("xy", "xz", "yx", "yz", "zx", "zy")
+
+
+class _Followed(Protocol):
+    """A result of `InverseKinematics.track`."""
+
+    @property
+    def t(self) -> ArrayLike: ...
+    @property
+    def q(self) -> ArrayLike: ...
+    @property
+    def x(self) -> ArrayLike: ...
+    @property
+    def x_measured(self) -> ArrayLike | None: ...
+    @property
+    def target(self) -> ArrayLike: ...
 
 
 class TrackingDisplay(Display):
@@ -79,7 +101,7 @@ class TrackingDisplay(Display):
         self.t = times(t, T)
 
     @classmethod
-    def from_tracks(cls, tracks: Mapping[str, Any]) -> Self:
+    def from_tracks(cls, tracks: Mapping[str, _Followed]) -> Self:
         """Return the display of results of `InverseKinematics.track`.
 
         Parameters
@@ -92,17 +114,15 @@ class TrackingDisplay(Display):
         TrackingDisplay
             Not drawn yet.
         """
-        first, *further = named(tracks, "tracks").values()
+        first = next(iter(named(tracks, "tracks").values()))
         target = shaped(first.target, "target", "T3")
-        for other in further:
-            if not np.array_equal(plain(other.target), target, equal_nan=True):
+        reached = {}
+        for name, track in tracks.items():
+            if not np.array_equal(plain(track.target), target, equal_nan=True):
                 raise ValueError(
                     "`tracks` must follow one path, got different targets."
                 )
-        reached = {
-            name: track.x if track.x_measured is None else track.x_measured
-            for name, track in tracks.items()
-        }
+            reached[name] = track.x if track.x_measured is None else track.x_measured
         return cls(target, reached, first.t)
 
     def plot(
@@ -127,16 +147,12 @@ class TrackingDisplay(Display):
         one_of(plane, "plane", _PLANES)
         scale = scale_of(unit)
         ax = axes_or_new(ax)
-        i, j = map("xyz".index, plane)
-        for look, (name, x) in zip(
-            looks_of(self.tracks), self.tracks.items(), strict=True
-        ):
+        columns = [*map("xyz".index, plane)]
+        for name, x, look in self._looks():
             label = self._summary(name, scale, unit)
-            ax.plot(scale * x[:, i], scale * x[:, j], label=label, **look)
-        target = scale * self.target
-        ax.plot(
-            target[:, i], target[:, j], color="black", linewidth=1.0, label="target"
-        )
+            ax.plot(*(scale * x[:, columns].T), label=label, **look)
+        target = scale * self.target[:, columns]
+        ax.plot(*target.T, color="black", linewidth=1.0, label="target")
         ax.set(xlabel=f"{plane[0]} [{unit}]", ylabel=f"{plane[1]} [{unit}]")
         ax.set_aspect("equal", adjustable="datalim")
         legend_below(ax)
@@ -147,9 +163,7 @@ class TrackingDisplay(Display):
         scale = scale_of(unit)
         ax = axes_or_new(ax)
         steps, when = steps_of(self.t, len(self.target))
-        for look, (name, x) in zip(
-            looks_of(self.tracks), self.tracks.items(), strict=True
-        ):
+        for name, x, look in self._looks():
             lines = ax.plot(steps, scale * x, **{**look, "linewidth": 1.2})
             lines[0].set_label(name)
         ax.plot(steps, scale * self.target, color="black", linewidth=1.0)
@@ -193,13 +207,12 @@ class TrackingDisplay(Display):
         scale = scale_of(unit)
         ax = axes_or_new(ax)
         steps, when = steps_of(self.t, len(self.target))
-        for look, (name, x) in zip(
-            looks_of(self.tracks), self.tracks.items(), strict=True
-        ):
+        for name, x, look in self._looks():
             error = scale * distance(x, self.target)
             ax.plot(steps, error, label=self._summary(name, scale, unit), **look)
         ax.set(xlabel=when, ylabel=f"tip error [{unit}]")
-        ax.set_xlim((steps[0], steps[-1]) if len(steps) > 1 else None)
+        if len(steps) > 1:
+            ax.set_xlim(steps[0], steps[-1])
         levels = dict(expected or {})
         least = []
         for (label, level), style in zip(levels.items(), STYLES * 2, strict=False):
@@ -217,10 +230,16 @@ class TrackingDisplay(Display):
         legend_below(ax)
         return self._drawn(ax)
 
+    def _looks(self) -> list[tuple[str, NDArray, dict[str, Any]]]:
+        """Return name, tips and look of every track."""
+        return [
+            *zip(self.tracks, self.tracks.values(), looks_of(self.tracks), strict=True)
+        ]
+
     def _summary(self, name: str, scale: float, unit: str) -> str:
         error = scale * distance(self.tracks[name], self.target)
-        finite = np.isfinite(error)
-        mean = error[finite].mean() if finite.any() else np.nan
+        finite = error[np.isfinite(error)]
+        mean = finite.mean() if finite.size else np.nan
         return f"{name}: mean error {mean:.{decimals(mean)}f} {unit}"
 
 
@@ -275,18 +294,16 @@ class ActuatorDisplay:
         self.t = times(t, *rows)
         self.names: list[str] = []
         if names is not None:
-            self.names = [
-                str(name) for name in np.ravel(np.asarray(names, dtype=object))
-            ]
+            self.names = [*map(str, np.ravel(np.asarray(names, dtype=object)))]
             if len(self.names) != n:
                 raise ValueError(
                     f"`names` must hold {n} names, one per actuator, got {names!r:.80}."
                 )
-        self.limits = None if limits is None else shaped(limits, "limits", ("2", n))
+        self.limits = shaped_or_none(limits, "limits", ("2", n))
 
     @classmethod
     def from_tracks(
-        cls, tracks: Mapping[str, Any], actuators_per_segment: Sequence[int]
+        cls, tracks: Mapping[str, _Followed], actuators_per_segment: Sequence[int]
     ) -> Self:
         """Return the display of results of `InverseKinematics.track`.
 
@@ -302,10 +319,9 @@ class ActuatorDisplay:
         ActuatorDisplay
             Not drawn yet.
         """
-        t = next(iter(named(tracks, "tracks").values())).t
-        return cls(
-            {name: track.q for name, track in tracks.items()}, actuators_per_segment, t
-        )
+        first = next(iter(named(tracks, "tracks").values()))
+        paths = {name: track.q for name, track in tracks.items()}
+        return cls(paths, actuators_per_segment, first.t)
 
     def plot(
         self,
@@ -344,9 +360,9 @@ class ActuatorDisplay:
             scale = 1.0 / size
         if axes is None:
             size = (6.0, 1.0 + 1.6 * n)
-            axes = plt.subplots(n, 1, figsize=size, sharex=True, layout="constrained")[
-                1
-            ]
+            _, axes = plt.subplots(
+                n, 1, figsize=size, sharex=True, layout="constrained"
+            )
         axes = np.ravel(np.asarray(axes, dtype=object))
         if len(axes) != n:
             raise ValueError(f"`axes` must hold {n} axes, got {len(axes)}.")
@@ -357,15 +373,20 @@ class ActuatorDisplay:
             ax.set(ylabel=f"segment {k + 1} [{unit}]")
         if self.names:
             for ax in axes:
-                beside = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5)}
-                ax.legend(frameon=False, fontsize="small", **beside)
+                ax.legend(
+                    frameon=False,
+                    fontsize="small",
+                    loc="center left",
+                    bbox_to_anchor=(1.0, 0.5),
+                )
         else:
-            above = {
-                "loc": "lower center",
-                "bbox_to_anchor": (0.5, 1.0),
-                "ncols": len(self.paths),
-            }
-            axes[0].legend(frameon=False, fontsize="small", **above)
+            axes[0].legend(
+                frameon=False,
+                fontsize="small",
+                loc="lower center",
+                bbox_to_anchor=(0.5, 1.0),
+                ncols=len(self.paths),
+            )
         axes[-1].set(xlabel=when)
         self.axes_ = axes
         self.figure_ = axes[0].figure
@@ -380,9 +401,8 @@ class ActuatorDisplay:
         if self.names:
             colors = [COLORS[j % 8] for j in range(len(columns))]
         for i, (name, q) in enumerate(self.paths.items()):
-            lines = ax.plot(
-                steps, (scale * q)[:, columns], **{**looks[i], "linewidth": 1.2}
-            )
+            values = (scale * q)[:, columns]
+            lines = ax.plot(steps, values, **{**looks[i], "linewidth": 1.2})
             lines[0].set_label(name)
             if self.names:
                 for line, color in zip(lines, colors, strict=True):

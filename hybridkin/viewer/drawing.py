@@ -51,7 +51,7 @@ class Body:
             scene.add_spline_catmull_rom(
                 f"/robot/actuator {k + 1}", path[0], thickness=0.4 * self._thick
             )
-            for k, path in enumerate(body.get("actuators", []))
+            for k, path in enumerate(body["actuators"])
         ]
         self._markers = None
         if self._chain is not None and self._chain.n_outputs > 3:
@@ -65,7 +65,10 @@ class Body:
         self._disks = None
         if "disks" in body:
             self._disks = scene.add_line_segments(
-                "/robot/disks", _rims(body), GREY, thickness=0.3 * self._thick
+                "/robot/disks",
+                _rims(body["disks"]),
+                GREY,
+                thickness=0.3 * self._thick,
             )
 
     def move(self, robot: SteeredRobot) -> None:
@@ -75,14 +78,14 @@ class Body:
             return
         self._backbone.points = body["points"][0]
         self._tip.position = robot.x
-        if self._disks is not None:
-            self._disks.points = _rims(body)
+        if self._disks is not None and "disks" in body:
+            self._disks.points = _rims(body["disks"])
         if self._markers is not None:
             self._markers.points = self._marked(robot)
         colors, slack = self._tensions(robot)
         for k, handle in enumerate(self._actuators):
             handle.points = body["actuators"][k][0]
-            color = tuple(int(c) for c in colors[k])
+            color = tuple(colors[k].tolist())
             thickness = (0.12 if slack[k] else 0.4) * self._thick
             if tuple(handle.color) != color:
                 handle.color = color
@@ -138,8 +141,10 @@ class LogCloud:
         self._commands = commands[::every]
         self._tips = tips[::every]
         error = np.linalg.norm(loaded.tips(self._commands) - self._tips, axis=1)
+        largest = 1.0
+        if len(error):
+            largest = float(np.percentile(error, 95))
         self._size = 0.007 * robot.size
-        largest = float(np.percentile(error, 95)) if len(error) else 1.0
         self.name = f"log, red: error of {1e3 * largest:.3g} mm or more"
         self.dots = scene.add_point_cloud(
             "/log",
@@ -167,10 +172,10 @@ class LogCloud:
         ways = self._tips - origin
         along = ways @ direction
         distance = np.linalg.norm(ways - along[:, None] * direction, axis=1)
-        hit = np.flatnonzero((distance < _CLICK * self._size) & (along > 0.0))
-        if not len(hit):
+        hit = (distance < _CLICK * self._size) & (along > 0.0)
+        if not hit.any():
             return None
-        first = hit[np.argmin(along[hit])]
+        first = np.argmin(np.where(hit, along, np.inf))
         return self._commands[first], self._tips[first]
 
 
@@ -180,13 +185,15 @@ def tips_of(model: ForwardModel, q: NDArray) -> NDArray:
         return model.tip_model(torch.from_numpy(q)).numpy()
 
 
-def _rims(body: dict[str, Any]) -> NDArray:
-    """Return the rims of the disks as segments (L, 2, 3)."""
-    rims = body["disks"][0]
-    return np.stack([rims[:, :-1], rims[:, 1:]], axis=2).reshape(-1, 2, 3)
+def _rims(disks: NDArray) -> NDArray:
+    """Return the rims of the disks (1, D, C, 3) as segments (L, 2, 3)."""
+    rims = disks[0]
+    strokes = np.stack([rims[:, :-1], rims[:, 1:]], axis=2)
+    return strokes.reshape(-1, 2, 3)
 
 
 def between(low: Color, high: Color, fraction: NDArray) -> NDArray:
     """Return colours (N, 3) from low to high for fractions (N,) from 0 to 1."""
     part = np.clip(fraction, 0.0, 1.0)[:, None]
-    return ((1.0 - part) * np.array(low) + part * np.array(high)).astype(np.uint8)
+    colors = (1.0 - part) * np.array(low) + part * np.array(high)
+    return colors.astype(np.uint8)

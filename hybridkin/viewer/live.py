@@ -109,10 +109,9 @@ def view(
 
 def _has_range(model: LoadedModel) -> bool:
     """Return whether the model or its description gives a range of the actuators."""
-    described = (
-        model.description is not None and model.description.limits.q_min is not None
-    )
-    return described or model.trained_range is not None
+    if model.trained_range is not None:
+        return True
+    return model.description is not None and model.description.limits.q_min is not None
 
 
 class LiveView:
@@ -272,7 +271,7 @@ class LiveView:
         log_format = robot.loaded.log_format()
         self._factor = np.broadcast_to(log_format.q_factor, robot.q.shape)
         ends = [robot.limits.q_min / self._factor, robot.limits.q_max / self._factor]
-        (low, high) = np.sort(ends, axis=0)
+        low, high = np.sort(ends, axis=0)
         start = robot.q / self._factor
         self._sliders = []
         with self._server.gui.add_folder(f"Actuators [{log_format.q_unit}]"):
@@ -304,7 +303,8 @@ class LiveView:
         origin = np.array(event.ray_origin)
         row = self._rows.row_at(origin, np.array(event.ray_direction))
         if row is not None and self._rows.dots.visible:
-            (q, self._measured.position) = row
+            q, tip = row
+            self._measured.position = tip
             self._measured.visible = True
             self.go_to(q)
 
@@ -327,8 +327,10 @@ class LiveView:
 
     def _expected(self) -> float:
         """Return the error to expect of the robot here [m], 0 if it is not known."""
-        expected = [*self.robot.loaded.expected_errors(self.robot.q[None]).values()]
-        return float(expected[0][0]) if expected else 0.0
+        expected = self.robot.loaded.expected_errors(self.robot.q[None])
+        for errors in expected.values():
+            return float(errors[0])
+        return 0.0
 
     def _run(self) -> None:
         try:
@@ -355,14 +357,13 @@ class LiveView:
                 due = time.perf_counter()
             due += 1.0 / RATE
             now = time.perf_counter()
-            late = now - due
-            self.ticks_per_second += 0.1 * (
-                min(RATE, 1.0 / (1.0 / RATE + max(late, 0.0))) - self.ticks_per_second
-            )
+            late = max(now - due, 0.0)
+            rate = 1.0 / (1.0 / RATE + late)
+            self.ticks_per_second += 0.1 * (rate - self.ticks_per_second)
             if late > 0.0:
                 due = now
             else:
-                time.sleep(-late)
+                time.sleep(due - now)
 
     def _show(self) -> None:
         """Draw the robot as it is."""

@@ -140,27 +140,33 @@ class SteeredRobot:
         """What there is to say about robot and target."""
         with self._lock:
             inside = bool(self.loaded.domain_distance(self.q[None])[0] <= 1.0)
-            domain = "" if inside else ", outside the domain of the model"
-            if self._goal is not None:
-                words = f"Actuators set by hand{domain}."
-                return Situation(words, True, False, inside, math.nan)
             error = float(np.linalg.norm(self.target - self.x))
-            if error <= self._close:
-                return Situation(f"On target{domain}.", True, False, inside, error)
-            if not self._resting:
-                return Situation(f"Moving{domain}.", False, False, inside, error)
-            at_limits = self._tracker.status == IKStatus.AT_LIMITS
-            cause = ": actuators are at their limits" if at_limits else ""
-            return Situation(
-                f"Out of reach{cause}{domain}.", False, True, inside, error
-            )
+            reached = error <= self._close
+            out_of_reach = False
+            if self._goal is not None:
+                words = "Actuators set by hand"
+                reached = True
+                error = math.nan
+            elif reached:
+                words = "On target"
+            elif not self._resting:
+                words = "Moving"
+            else:
+                words = "Out of reach"
+                out_of_reach = True
+                if self._tracker.status == IKStatus.AT_LIMITS:
+                    words += ": actuators are at their limits"
+            if not inside:
+                words += ", outside the domain of the model"
+            return Situation(f"{words}.", reached, out_of_reach, inside, error)
 
     @property
     def held(self) -> NDArray[np.bool_]:
         """Which actuators are at a limit of position (n,)."""
         close = 1e-6 * self.span
-        low = self.q <= self.limits.q_min + close
-        return low | (self.q >= self.limits.q_max - close)
+        at_low = self.q <= self.limits.q_min + close
+        at_high = self.q >= self.limits.q_max - close
+        return at_low | at_high
 
     def measured_rows(self, log: Log) -> tuple[NDArray, NDArray]:
         """Return motions of the actuators (N, n) and tips (N, 3) of the known rows of a log."""
