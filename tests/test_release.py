@@ -139,14 +139,6 @@ def test_the_sdist_builds_the_same_and_can_be_tested(built):
     assert not any("/lib/" in name for name in names)
 
 
-@pytest.mark.slow
-def test_the_index_would_take_them(built):
-    pytest.importorskip("twine")
-    command = [sys.executable, "-m", "twine", "check", "--strict", *map(str, built)]
-    said = subprocess.run(command, capture_output=True, text=True)
-    assert said.returncode == 0, said.stdout
-
-
 @needs_compiler
 @pytest.mark.slow
 def test_the_wheel_holds_kernels_for_this_platform(built, hatch_build, tmp_path):

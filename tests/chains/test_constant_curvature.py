@@ -382,20 +382,6 @@ def test_blocks_of_rows_are_as_one(rng):
     assert [tuple(part.shape) for part in empty] == [(2, 0, 3), (2, 0, 3, 9)]
 
 
-@pytest.mark.parametrize("kind", [ConstantCurvatureChain, ElasticTendonChain])
-def test_another_base_moves_the_tips_alone(kind, rng):
-    chain = kind([0.01, 0.009], lengths=[0.1, 0.08])
-    q = -0.003 * torch.rand(5, 6, generator=rng, dtype=torch.float64)
-    base = torch.eye(4, dtype=torch.float64)
-    base[:2, :2], base[:3, 3] = base.new_tensor([[0.0, -1.0], [1.0, 0.0]]), 0.3
-    moved = chain.with_geometry(base=base)
-    assert_close(moved(q), chain(q) @ base[:3, :3].mT + base[:3, 3])
-    assert torch.equal(chain.base, torch.eye(4, dtype=torch.float64))
-    again = moved.with_geometry(radii=2.0 * chain.radii)
-    assert torch.equal(again.base, base)
-    assert (again(q) - moved(q)).abs().max() > 1e-4
-
-
 def test_with_geometry_is_differentiable_and_leaves_the_chain(rng):
     q = random_q(rng, 4)
     chain = bha()

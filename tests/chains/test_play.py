@@ -75,28 +75,6 @@ def test_motions_start_afresh_wherever_their_rows_lie(rng):
     close(play.apply_by_group(q.numpy(), groups), y)
 
 
-@pytest.mark.parametrize("width", [-1.0, np.nan, np.inf, [[0.1]], [0.1, -0.1]])
-def test_width_must_be_a_play(width):
-    with pytest.raises(ValueError, match="`width` must be"):
-        PlayOperator(width)
-
-
-def test_bad_rows_and_states_are_named():
-    play, two = PlayOperator([0.1, 0.1]), np.zeros((3, 2))
-    for q, message in [
-        (np.zeros((3, 3)), r"`q` must have shape \(T, 2\), got \(3, 3\)"),
-        (np.zeros(2), r"`q` must have shape"),
-        (two + np.nan, "`q` must be finite"),
-        (two[:0], "`q` must hold at least one row"),
-    ]:
-        with pytest.raises(ValueError, match=message):
-            play.apply(q)
-    with pytest.raises(ValueError, match=r"`state` must hold two finite vectors of shape \(2,\)"):
-        play.apply(two, PlayOperator(0.1).apply(np.zeros((1, 3)))[1])
-    with pytest.raises(ValueError, match="`groups` must have shape"):
-        play.apply_by_group(two, np.zeros(2))
-
-
 def log_of(width, noise):
     rng = np.random.default_rng(0)
     truth = ConstantCurvatureChain([0.005], lengths=[0.1])

@@ -196,31 +196,6 @@ def test_angular_jacobian_turns_the_tip_frame(rng):
 LINKS = '<robot name="r"><link name="a"/><link name="b"/>{}</robot>'
 JOINT = '<joint name="j" type="{}"><parent link="a"/><child link="b"/>{}</joint>'
 SECOND = JOINT.replace('"j"', '"k"').format("fixed", "")
-EYES = np.stack([np.eye(4)] * 2)
-
-
-@pytest.mark.parametrize(
-    ("name", "make"),
-    [
-        ("origins", lambda: RigidChain(EYES, [Z])),
-        (r"origins\[0\]", lambda: RigidChain(2 * EYES, [Z, Z])),
-        ("axes", lambda: RigidChain(EYES, [Z, [0, 0, 0]])),
-        ("kinds", lambda: planar(kinds=["revolute"])),
-        ("kinds", lambda: planar(kinds=["revolute", "ball"])),
-        ("kinds", lambda: planar(kinds=3)),
-        ("names", lambda: planar(names=["a"])),
-        ("q_min", lambda: planar(q_min=[1, 1], q_max=[2, 0])),
-        ("q_min", lambda: planar(q_min=[0, math.nan])),
-        ("dq_max", lambda: planar(dq_max=[1, 0])),
-        ("couplings", lambda: planar(couplings=[[1.0]])),
-        ("tip", lambda: planar(tip=2 * np.eye(4))),
-        ("q", lambda: planar()(torch.zeros(4, 3))),
-        ("n_points", lambda: planar().backbone(torch.zeros(2), 0)),
-    ],
-)
-def test_bad_arguments_are_refused_by_name(name, make):
-    with pytest.raises((TypeError, ValueError), match=f"`{name}`"):
-        make()
 
 
 @pytest.mark.parametrize(

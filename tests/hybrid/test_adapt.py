@@ -140,20 +140,6 @@ def test_an_adapted_model_is_the_fit_moved_and_shifted(case):
         assert_allclose(model.module_.pose(at), motion @ fitted.module_.pose(then).numpy())
 
 
-def test_a_drift_is_learned_on_top_of_a_change_and_forgotten_by_the_next(case):
-    fitted, q, x, _ = case
-    model = copy.deepcopy(fitted).adapt(q, x)
-    adapted_only = model.predict(q)
-    target = adapted_only.copy()
-    target[:, :3] += [0.02, -0.01, 0.03]
-    model.partial_fit(q[:80], target[:80], decay=1.0, alpha=1e-3)
-    inside = model.in_domain(q)
-    off = np.linalg.norm((target - adapted_only)[inside], axis=1).mean()
-    left = np.linalg.norm((model.predict(q) - target)[inside], axis=1).mean()
-    assert left < 0.2 * off
-    assert_allclose(model.adapt(q, x).predict(q), adapted_only, rtol=0, atol=1e-12)
-
-
 def test_only_what_may_have_changed_is_adapted(trunk):
     fitted, (q, x), _ = trunk
     model = copy.deepcopy(fitted).adapt(q, moved(x), parameters=["base"])

@@ -12,7 +12,6 @@ from sklearn.linear_model import LinearRegression
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import MinMaxScaler, PolynomialFeatures
 from sklearn.utils.estimator_checks import parametrize_with_checks
-from torch.testing import assert_close
 
 from hybridkin import (
     ConstantCurvatureChain,
@@ -20,7 +19,6 @@ from hybridkin import (
     ELMRegressor,
     ELMRegressorCV,
     HybridForwardModel,
-    datasets,
     jacobian,
     robots,
 )
@@ -242,64 +240,3 @@ def test_the_plain_chain_tells_of_slack_once_per_call(slack_log):
     fitted.predict_error(q)
     parts = q.reshape(-1, 2, 3)
     fitted.predict((parts - parts.mean(2, keepdims=True)).reshape(q.shape))
-
-
-@pytest.mark.parametrize("alpha", [0.1, 1e-6])
-def test_value_and_jacobian_in_one_pass_are_those_of_value_and_weight(alpha):
-    """Batches with and without rows outside, where the network shares its features."""
-    data, chain = datasets.load_trunk(), robots.bionic_handling_assistant()
-    model = HybridForwardModel(chain, ELMRegressor(alpha=alpha, random_state=0)).fit(data.q, data.x)
-    module = model.module_
-    rng = np.random.default_rng(0)
-    low, high = data.q.min(0), data.q.max(0)
-    wide = low + (high - low) * rng.uniform(-0.7, 1.7, (400, 9))
-    q = torch.from_numpy(np.concatenate([data.q[::10], wide]))
-    inside = module.in_domain(q)
-    assert inside.any()
-    assert (~inside).any()
-    x, J = module.forward_and_jacobian(q)
-    assert_close(x, module(q), rtol=0, atol=1e-12)
-    alone = module.forward_and_jacobian(q[inside])
-    assert_close(alone, (x[inside], J[inside]), rtol=0, atol=1e-12)
-    expected = torch.func.vmap(torch.func.jacrev(module))(q[::10])
-    assert_close(J[::10], expected, rtol=1e-8, atol=1e-9)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("guard", ["leverage", "box"])
-@pytest.mark.parametrize(
-    "error_model",
-    [
-        ELMRegressor(alpha=1e-9, random_state=0),
-        make_pipeline(MinMaxScaler(), PolynomialFeatures(3), LinearRegression()),
-    ],
-    ids=["elm", "cubic"],
-)
-def test_no_configuration_is_far_from_the_mechanical_model(guard, error_model):
-    """An optimiser looks for the longest correction in and far out of the box."""
-    data, chain = datasets.load_trunk(), robots.bionic_handling_assistant()
-    q, x = data.q[::6], data.x[::6]
-    module = HybridForwardModel(chain, error_model, guard=guard).fit(q, x).module_
-    rows = torch.from_numpy(q)
-    longest = module.error_part(rows).norm(dim=-1).max()
-    low, high = rows.amin(0), rows.amax(0)
-    free = HybridForwardModel(chain, error_model, guard=None).fit(q, x).module_
-    worst = {}
-    for name, model in (("guarded", module), ("free", free)):
-        generator = torch.Generator().manual_seed(0)
-        u = 4.0 * torch.rand(200, 9, generator=generator, dtype=torch.float64) - 1.5
-        u.requires_grad_()
-        optimiser = torch.optim.Adam([u], lr=0.05)
-        for _ in range(60):
-            loss = -model.error_part(low + (high - low) * u).square().sum()
-            optimiser.zero_grad()
-            loss.backward()
-            optimiser.step()
-        worst[name] = model.error_part(low + (high - low) * u).norm(dim=-1).max()
-    assert worst["free"] > 5 * longest
-    assert worst["guarded"] <= (1.5 + 1e-12) * longest
-    # Beyond the largest, value and Jacobian of the sum are still each other's.
-    at = (low + (high - low) * u).detach()[:20]
-    assert_close(module.forward_and_jacobian(at)[0], module(at), rtol=0, atol=1e-9)
-    reverse = torch.func.vmap(torch.func.jacrev(module))(at)
-    assert_close(module.jacobian(at), reverse, rtol=1e-6, atol=1e-6 * float(reverse.abs().max()))

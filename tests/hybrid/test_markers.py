@@ -5,7 +5,6 @@ import copy
 import numpy as np
 import pytest
 import torch
-from sklearn.kernel_ridge import KernelRidge
 from sklearn.linear_model import LinearRegression
 from sklearn.metrics import r2_score
 
@@ -39,18 +38,6 @@ def without(x, share=0.3, seed=1):
     missing = np.random.default_rng(seed).random((len(x), 3)) < share
     missing[:, 2] &= ~missing.all(axis=1)
     return np.where(missing.repeat(3, axis=1), np.nan, x)
-
-
-def test_outside_the_robot_every_marker_is_learned_alone():
-    q, x = log(60)
-    missing = without(x)
-    model = HybridForwardModel(CHAIN, KernelRidge(kernel="rbf"), guard=None).fit(q, missing)
-    for k, tip in enumerate(CHAIN.tips()):
-        y = missing[:, 3 * k : 3 * k + 3]
-        rows = ~np.isnan(y[:, 0])
-        alone = HybridForwardModel(tip, KernelRidge(kernel="rbf"), guard=None).fit(q[rows], y[rows])
-        found = model.predict(q)[:, 3 * k : 3 * k + 3]
-        np.testing.assert_allclose(found, alone.predict(q), atol=1e-12)
 
 
 def test_inside_the_robot_all_markers_are_learned_together():

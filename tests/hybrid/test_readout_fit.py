@@ -190,22 +190,6 @@ def test_rows_left_out_equal_fits_without_them(sizes, rng):
         assert_close(found[out], expected, atol=1e-10, rtol=1e-10)
 
 
-def test_rows_left_out_of_the_whole_fit(rng):
-    chain, q = rows_of("trunk", rng, 60)
-    x = disturbed(chain, q, rng, size=0.002, noise=0.002)[1]
-    features = QuadraticFeatures.of_range(q)
-    fit = read_out(chain, features, q, x, alphas=(0.3, 3.0))
-    weight = torch.ones(60, dtype=torch.float64)
-    for row in (0, 17):
-        weight[row] = 0.0
-        other = read_out(chain, features, q, x, alphas=(0.3, 3.0), sample_weight=weight)
-        weight[row] = 1.0
-        left = x[row] - hybrid(chain, other.readout)(q[row])
-        # Scales of the coordinates and the basis change a little with the row.
-        assert_close(torch.from_numpy(fit.residual[row]), left, atol=2e-4, rtol=0.05)
-        assert torch.isnan(torch.from_numpy(other.residual[row])).all()
-
-
 @pytest.mark.parametrize("coupling", ["serial", "parallel"])
 def test_no_correction_is_the_mechanical_model(coupling, rng):
     chain, q = rows_of("trunk", rng, 40)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
-from sklearn.base import clone
 from sklearn.linear_model import LinearRegression
 from torch.testing import assert_close
 
@@ -112,25 +111,6 @@ def test_one_domain_in_torch_and_compiled(kind, groups):
             distance = model.module_.domain_distance(torch.from_numpy(new)).numpy()
             (found,) = evaluate(model.module_, new, value=False, distance=True)
             assert_allclose(found, distance, rtol=1e-8, atol=1e-12)
-
-
-@pytest.mark.parametrize("n", [3, 5])
-def test_few_rows_move_as_many_directions_as_they_can(n):
-    """Then only the warning of few rows is given; the corrections are constant all the same."""
-    q = log("all", n)
-    with pytest.warns(UserWarning, match="too few to rely on") as caught:
-        model = HybridForwardModel(CHAIN, "quadratic").fit(q, tips(q))
-    assert len(caught) == 1
-    assert not model.in_domain(q + 0.5 * across(q)[0]).any()
-
-
-def test_without_a_mechanical_model_the_tip_is_constant_where_no_row_moves():
-    q = log("rest")
-    model = HybridForwardModel(None, clone(ELM)).fit(q, tips(q))
-    step = 0.5 * across(q)[0]
-    assert_allclose(model.predict(q + step), model.predict(q), atol=1e-10)
-    assert model.in_domain(q).all()
-    assert not model.in_domain(q + step).any()
 
 
 def test_a_log_that_moves_all_is_not_projected():

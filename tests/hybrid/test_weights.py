@@ -90,16 +90,6 @@ def test_weights_are_repetitions_in_the_selection(log):
     assert_equal_models(weighed, repeated, weights, new)
 
 
-@pytest.mark.parametrize("kind", ["linear", "network"])
-def test_weights_are_repetitions_with_play(kind, log):
-    q, x, weights, motions, new = log
-    weights = np.maximum(weights, 1)
-    many = np.repeat(np.arange(len(q)), weights)
-    weighed = hybrid(kind, play=0.01).fit(q, x, weights, motions)
-    repeated = hybrid(kind, play=0.01).fit(q[many], x[many], groups=motions[many])
-    assert_equal_models(weighed, repeated, weights, new)
-
-
 def test_a_row_of_weight_zero_still_moves_the_actuators(log):
     q, x, weights, _, new = log
     kept = weights > 0
@@ -109,22 +99,6 @@ def test_a_row_of_weight_zero_still_moves_the_actuators(log):
     assert_allclose(
         weighed.module_(torch.from_numpy(new)).numpy(), plain.predict(new), rtol=0, atol=1e-10
     )
-
-
-@pytest.mark.slow
-def test_weights_are_repetitions_in_the_choice_of_play():
-    rng = np.random.default_rng(0)
-    turns = np.linspace(0.0, 12.0, 90)[:, None] + [0.0, 2.1, 4.2]
-    q = 0.25 + 0.03 * np.sin(turns) * np.linspace(0.6, 1.0, 90)[:, None]
-    motion = PlayOperator(0.01).apply_by_group(q, np.zeros(len(q)))
-    x = ConstantCurvatureChain([0.05])(torch.from_numpy(motion)).numpy()
-    x, weights = x + 1e-4 * rng.normal(size=x.shape), rng.integers(1, 5, len(q))
-    many = np.repeat(np.arange(len(q)), weights)
-    weighed = hybrid("linear", play="auto").fit(q, x, weights)
-    repeated = hybrid("linear", play="auto").fit(q[many], x[many])
-    assert weighed.play_ is not None
-    assert_allclose(weighed.play_.width, repeated.play_.width, rtol=1e-9)
-    assert_allclose(weighed.module_.weights, repeated.module_.weights)
 
 
 def test_rows_of_a_later_fit_fade_once_for_each_repetition(log):

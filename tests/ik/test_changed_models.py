@@ -1,7 +1,6 @@
 """A model that changes after its inverse kinematics was made: what uses it from which moment."""
 
 import copy
-import threading
 
 import numpy as np
 import pytest
@@ -224,29 +223,3 @@ def test_a_pose_task_follows_its_estimator():
     after = ik.step(NOW, poses[8].numpy()).dq
     assert np.abs(after - before).max() > 1e-4
     np.testing.assert_array_equal(after, fresh.step(NOW, poses[8].numpy()).dq)
-
-
-def test_a_thread_waits_until_another_one_has_done_its_step():
-    inside, go_on, done = threading.Event(), threading.Event(), []
-
-    def slow(q):
-        if threading.current_thread() is first:
-            inside.set()
-            go_on.wait(10.0)
-        return CHAIN(q)
-
-    first = threading.Thread()  # not yet
-    tracker = InverseKinematics(slow, q_min=0.05, q_max=0.2).tracker(NOW)
-    first = threading.Thread(target=lambda: done.append(tracker.step(TARGET)), daemon=True)
-    second = threading.Thread(target=lambda: done.append(tracker.step(X[9])), daemon=True)
-    first.start()
-    assert inside.wait(10.0)
-    second.start()
-    second.join(0.05)
-    assert second.is_alive()
-    assert not done
-    twin = copy.deepcopy(tracker)  # it has a turn of its own
-    assert twin.step(TARGET).shape == (6,)
-    go_on.set()
-    [thread.join(10.0) for thread in (first, second)]
-    assert len(done) == 2

@@ -177,53 +177,6 @@ def test_straight_backbone_leaves_the_point_where_first_order_is_blind():
     assert abs(solution.error[4] - 0.01) < 1e-6
 
 
-def test_a_batch_equals_its_loop(rng):
-    ik = bha()
-    q = uniform(rng, 0.2, 0.3, 2, 6, 9)
-    target = CHAIN(uniform(rng, 0.1, 0.4, 2, 6, 9))
-    whole = ik.solve(target, restarts=2)
-    near = CHAIN(q) + 0.01 * randn(rng, 2, 6, 3)
-    step = ik.step(q, near)
-    assert step.dq.shape == (2, 6, 9)
-    for i in np.ndindex(2, 6):
-        alone = ik.solve(target[i], restarts=2)
-        assert_close(whole.q[i], alone.q, rtol=0.0, atol=1e-12)
-        assert whole.status[i] == alone.status
-        assert_close(step.dq[i], ik.step(q[i], near[i]).dq, rtol=0.0, atol=1e-12)
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf])
-@pytest.mark.parametrize("kind", [np.asarray, torch.from_numpy])
-def test_a_target_that_is_not_finite_returns_the_start_within_the_limits(bad, kind):
-    # The start is straight, where starts beside it are tried for good targets.
-    chain = ConstantCurvatureChain([0.02] * 2, lengths=[0.1] * 2, routing="base")
-    ik = InverseKinematics(chain, q_min=-0.02, q_max=0.02)
-    bent = chain(torch.tensor([0.01, -0.005, -0.005, 0.015, -0.0075, -0.0075]).double()).tolist()
-    target = kind(np.array([bent, [0.05, bad, 0.15]]))
-    outside = kind(np.array([0.01, 0.0, -0.01, 0.03, 0.0, 0.0]))
-    for q0, expected in ((None, np.zeros(6)), (outside, [0.01, 0.0, -0.01, 0.02, 0.0, 0.0])):
-        solution = ik.solve(target, q0, restarts=1)
-        assert solution.status.tolist() == [IKStatus.CONVERGED, IKStatus.INVALID_INPUT]
-        np.testing.assert_array_equal(solution.q[1], expected)
-        assert np.isfinite(np.asarray(solution.x)).all()
-
-
-def test_a_model_may_be_out_of_its_domain():
-    class Guarded(ForwardModel):
-        def forward(self, q):
-            return CHAIN(q)
-
-        def domain_distance(self, q):
-            return torch.where(CHAIN(q)[..., 0] > 0.0, 0.0, 2.0).to(q)
-
-    class Fitted:
-        module_ = Guarded()
-
-    target = np.array([[0.1, 0.0, 0.7], [-0.1, 0.0, 0.7], [0.0, 0.0, 9.0]])
-    solution = InverseKinematics(Fitted(), q_min=[0.1] * 9, q_max=0.4).solve(target)
-    assert solution.status.tolist() == [0, IKStatus.OUT_OF_DOMAIN, IKStatus.MAX_ITER]
-
-
 # ---------------------------------------------------------------- track
 
 

@@ -141,20 +141,6 @@ def test_status_of_a_tick():
     assert flat.backend.startswith("torch: ")
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_commands_are_of_the_kind_of_the_start(dtype):
-    ik, q0 = InverseKinematics(CHAIN, q_min=0.1, q_max=0.4), torch.full((9,), 0.25, dtype=dtype)
-    tracker, arrays = ik.tracker(q0), ik.tracker(q0.numpy())
-    q = tracker.step([0.05, 0.0, 0.75])
-    q0[:], kept = torch.nan, q.clone()
-    assert q.dtype == tracker.x.dtype == dtype
-    np.testing.assert_array_equal(arrays.step([0.05, 0.0, 0.75]), q.numpy())
-    assert arrays.q.dtype == q.numpy().dtype
-    q[:] = torch.nan
-    torch.testing.assert_close(tracker.q, kept, rtol=0.0, atol=0.0)
-    assert isinstance(InverseKinematics(CHAIN).tracker([0.25] * 9).q, np.ndarray)
-
-
 def test_a_posture_in_numpy_is_refused_by_name():
     ik = InverseKinematics(CHAIN, q_min=0.1, q_max=0.4, q_pref=lambda q: np.asarray(q))
     with pytest.raises(TypeError, match="`q_pref` must map torch tensors to torch tensors, got nd"):

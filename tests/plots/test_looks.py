@@ -110,18 +110,3 @@ def test_films_show_names_of_actuators_and_the_error_to_expect():
     assert film.caption(2, "mm") == "step 2, expected error 3.00 mm"
     with pytest.raises(ValueError, match="`names` must hold 9 names"):
         plots.TrackAnimation.from_estimator(chain, q, names=names[:3])
-
-
-def test_a_body_is_led_to_given_tips(bent_inside):
-    chain, q, model = bent_inside
-    tips = model.predict(q[:4])
-    tips[1] = np.nan
-    body = plots.BackboneDisplay.from_estimator(chain, q[:4], tips=tips)
-    np.testing.assert_allclose(body.points[:, -1], tips, atol=1e-7)
-    film = plots.TrackAnimation.from_estimator(chain, q[:4], tips=tips)
-    assert film.name == "tip (model)"
-    np.testing.assert_array_equal(film.x, tips)
-    far = plots.BackboneDisplay.from_estimator(chain, q[0], tips=[[0.0, 0.0, 9.0]])
-    assert np.isfinite(far.points).all()
-    with pytest.raises(ValueError, match="`tips`"):
-        plots.BackboneDisplay.from_estimator(chain, q[:4], tips=tips[:3])

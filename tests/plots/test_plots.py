@@ -5,7 +5,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import torch
-from matplotlib.figure import Figure
 from PIL import Image
 from sklearn.base import BaseEstimator, RegressorMixin
 
@@ -14,7 +13,6 @@ from hybridkin import (
     ElasticTendonChain,
     HybridForwardModel,
     InverseKinematics,
-    RigidChain,
     datasets,
     plots,
     robots,
@@ -204,19 +202,6 @@ def test_disks_and_frames_stand_on_the_backbone():
     np.testing.assert_allclose(first[-1], poses[0, 1, :3, 3] + 0.01 * poses[0, 1, :3, 0])
 
 
-def test_a_rigid_arm_shows_its_links():
-    origins = np.stack([np.eye(4)] * 3)
-    origins[1:, 2, 3] = 0.3
-    arm = RigidChain(origins, [[0, 0, 1], [0, 1, 0], [0, 1, 0]], tool=[0.0, 0.0, 0.2])
-    q = np.array([0.3, 0.5, -0.8])
-    display = plots.BackboneDisplay.from_estimator(arm, q)
-    np.testing.assert_allclose(display.points[0], arm.backbone(torch.from_numpy(q)))
-    _, ax = plots.new_figure(4, 4, subplot_kw=SPACE)
-    display.plot(ax)
-    np.testing.assert_allclose(np.array(ax.lines[0].get_data_3d()).T, 100 * display.points[0])
-    assert "links and joints" in ax.get_legend_handles_labels()[1]
-
-
 @pytest.mark.slow
 def test_a_fitted_hybrid_shows_its_correction(hybrid, data, tmp_path):
     display = plots.BackboneDisplay.from_estimator(hybrid, data.q[3])
@@ -233,39 +218,7 @@ def test_a_fitted_hybrid_shows_its_correction(hybrid, data, tmp_path):
     assert drawn(figure, tmp_path)
 
 
-def test_several_bodies_and_rows_without_one(data):
-    q = data.q[:3].copy()
-    q[1, 4] = np.nan
-    display = plots.BackboneDisplay.from_estimator(robots.bionic_handling_assistant(), q)
-    assert np.isfinite(display.points).all(axis=(1, 2)).tolist() == [True, False, True]
-    figure, axes = plots.new_figure(8, 4, 1, 2, subplot_kw=SPACE)
-    display.plot(axes[0])
-    assert len(axes[0].lines) == 4  # two backbones, two tips
-    plots.BackboneDisplay(data.x[:10]).plot(axes[1], unit="mm")
-    assert axes[1].get_zlabel() == "z [mm]"
-    figure.draw_without_rendering()
-
-
 # Tracks
-
-
-@pytest.mark.slow
-def test_tracks_show_what_was_measured(track, tmp_path):
-    display = plots.TrackingDisplay.from_tracks({"a": track, "b": track})
-    np.testing.assert_array_equal(display.tracks["a"], track.x_measured)
-    figure = Figure(layout="constrained")
-    ax = figure.add_subplot()
-    assert display.plot_error(ax, unit="mm").ax_ is ax
-    error = np.stack([track.t, 1e3 * track.error], axis=1)
-    np.testing.assert_allclose(ax.lines[0].get_xydata(), error)
-    assert (ax.get_xlabel(), ax.get_ylabel()) == ("time [s]", "tip error [mm]")
-    assert drawn(figure, tmp_path)
-    free = InverseKinematics(robots.bionic_handling_assistant(), q_pref=0.25, dt=0.05)
-    free = free.track(torch.from_numpy(track.target[:5]), torch.from_numpy(track.t[:5]))
-    single = plots.TrackingDisplay.from_tracks({"free": free})
-    np.testing.assert_array_equal(single.tracks["free"], free.x)
-    with pytest.raises(ValueError, match="one path"):
-        plots.TrackingDisplay.from_tracks({"a": track, "b": free})
 
 
 @pytest.mark.slow
