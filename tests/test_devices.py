@@ -24,9 +24,7 @@ from hybridkin import (
     plots,
     save_model,
     tasks,
-    trajectories,
 )
-from hybridkin.datasets import Log, check_log
 
 Q, X, GROUPS = trunk_log(40)
 TENDONS = 0.002 * np.random.default_rng(1).uniform(-1, 1, (3, 7))
@@ -84,11 +82,6 @@ def inverse(build, q):
     ]
 
 
-def of_points():
-    task = tasks.PointsTask(trunk(), [0.5, 1.0])
-    return InverseKinematics(task, q_min=0.1, q_max=0.4).solve(X[:2].reshape(1, 2, 3)).x
-
-
 def of_numpy():
     task = tasks.PositionTask.from_numpy(lambda q: q**2, lambda q: 2 * q[..., None] * np.eye(3))
     return InverseKinematics(task).solve(np.ones(3), q0=0.5 * np.ones(3)).q
@@ -133,11 +126,8 @@ WORK = {
     "arm": lambda _: of_chain(arm, JOINTS),
     "inverse of a trunk": lambda _: inverse(trunk, Q[:3]),
     "inverse of an arm": lambda _: inverse(arm, JOINTS),
-    "points": lambda _: [of_points()],
-    "functions": lambda _: [of_numpy()],
     "calibrate": lambda _: calibrated("radii", groups=GROUPS),
     "calibrate tensors": lambda _: calibrated("radii", "base", tensors=1),
-    "calibrate robustly": lambda _: calibrated("turns", "rest_bends", "tool", loss="soft_l1"),
     "play": lambda _: [
         PlayOperator(0.01).apply(Q)[0],
         fit_play(trunk(), Q, X, GROUPS, [0.001], ("radii",)).cv_rmse,
@@ -146,27 +136,19 @@ WORK = {
     "parallel elm": lambda _: hybrid(error_model=NETWORK, coverage=0.8),
     "parallel linear": lambda _: hybrid(error_model="linear", guard="box", play=0.01),
     "serial quadratic": lambda _: hybrid(error_model="quadratic", coupling="serial"),
-    "serial pose": lambda _: hybrid(error_model="pose", coupling="serial", calibrate="default"),
-    "serial elm": lambda _: hybrid(error_model=NETWORK, coupling="serial"),
     "pose output": lambda _: hybrid(error_model=NETWORK, output="pose"),
-    "kernel": lambda _: hybrid(error_model="kernel"),
     "chosen": lambda _: hybrid(error_model=ELMRegressorCV(8, cv=3, random_state=0)),
     "save": saved,
-    "draw": lambda _: drawn(),
-    "trajectory": lambda _: [trajectories.line(X[0], X[1], duration=0.1).x],
-    "log": lambda _: [check_log(Log(Q, X, GROUPS), chain=trunk()).x_range],
 }
 SLOW = {
-    "calibrate robustly",
     "play",
     "parallel elm",
-    "serial pose",
     "pose output",
     "chosen",
     "save",
 }
-SLOW |= {"inverse of a trunk", "inverse of an arm", "calibrate", "calibrate tensors", "kernel"}
-SLOW |= {"serial quadratic", "draw", "parallel linear", "arm", "arc chain"}
+SLOW |= {"inverse of a trunk", "inverse of an arm", "calibrate", "calibrate tensors"}
+SLOW |= {"serial quadratic", "parallel linear", "arm", "arc chain"}
 
 
 @pytest.mark.parametrize(

@@ -353,35 +353,6 @@ def test_functional_transforms(rng):
     assert_close(lifted[:, 2], chain(q)[:, 2] + 1.0, rtol=1e-14, atol=0)
 
 
-@pytest.mark.slow
-def test_blocks_of_rows_are_as_one(rng):
-    """More rows than a block has: under every transform what one pass would give."""
-    chain, q = bha(), random_q(rng, 4097)
-    both, one = chain.forward_and_jacobian, torch.ones((), dtype=torch.float64)
-    expected = chain._forward_and_jacobian(q)
-    two = torch.stack([q, 0.9 * q])
-    assert_close(both(q), expected, rtol=0, atol=1e-14)
-    assert_close(torch.func.vmap(both)(two), both(two), rtol=0, atol=1e-14)
-    compiled = torch.compile(both, backend="eager", fullgraph=True)
-    assert_close(compiled(q), expected, rtol=0, atol=1e-14)
-    with torch.no_grad():
-        assert_close(both(q.clone().requires_grad_()), expected, rtol=0, atol=1e-14)
-
-    def of_scale(function):
-        return lambda scale: function(scale * q)[1].sum((0, 1))
-
-    for take in (torch.func.jacrev, torch.func.jacfwd):
-        slopes = [take(of_scale(f))(one) for f in (both, chain._forward_and_jacobian)]
-        assert_close(*slopes, rtol=1e-11, atol=1e-9)
-        slopes = [torch.func.vmap(take(of_scale(both)))(one[None])[0], slopes[1]]
-        assert_close(*slopes, rtol=1e-11, atol=1e-9)
-    q.requires_grad_()
-    slopes = [torch.autograd.grad(f(q)[1].sum(), q)[0] for f in (both, chain._forward_and_jacobian)]
-    assert_close(*slopes, rtol=1e-11, atol=1e-9)
-    empty = both(q.new_empty(2, 0, 9))
-    assert [tuple(part.shape) for part in empty] == [(2, 0, 3), (2, 0, 3, 9)]
-
-
 def test_with_geometry_is_differentiable_and_leaves_the_chain(rng):
     q = random_q(rng, 4)
     chain = bha()
@@ -440,30 +411,18 @@ def test_another_tip_lies_on_the_backbone(name, at, rng):
     ("make", "message"),
     [
         (lambda: ConstantCurvatureChain([0.1, -0.1]), "`radii` must be positive"),
-        (lambda: ConstantCurvatureChain([[0.1]]), r"`radii` must have shape \(n,\)"),
-        (lambda: ConstantCurvatureChain([0.1, float("nan")]), "`radii` must be finite"),
-        (lambda: ConstantCurvatureChain(["a"]), "`radii` must be numeric"),
         (lambda: bha(n_actuators=[3, 0, 3]), "at least 1 on every segment"),
         (lambda: bha(n_actuators=2.5), "`n_actuators` must be one whole number .* got 2.5"),
-        (lambda: bha(n_actuators=[3, 3]), "`n_actuators` must be one whole number or 3"),
         (lambda: bha(angles=[0.0, 0.0, 0.0]), "`angles` must determine the bending"),
         (lambda: bha(angles=[[0.0, 2.0, 4.0]] * 2), "`angles` must hold"),
         (lambda: bha(lengths=[0.1, 0.1]), r"`lengths` must have shape \(3,\)"),
-        (lambda: bha(lengths=[0.1, 0.1, 0.0]), "`lengths` must be positive"),
         (lambda: bha(routing="through"), "`routing` must be one of"),
-        (lambda: bha(offsets=[0.0]), r"`offsets` must have shape \(3,\)"),
         (lambda: bha(rest_bends=[0.0, 1.0]), r"`rest_bends` must have shape \(3, 2\)"),
-        (lambda: bha(rest_bends=math.nan), "`rest_bends` must be finite"),
-        (lambda: bha(actuator_zeros=[0.0]), r"`actuator_zeros` must have shape \(9,\)"),
         (lambda: bha().with_tip(0), r"`at` must lie in \(0, 3\]"),
-        (lambda: bha().with_tip(3.01), r"`at` must lie in \(0, 3\]"),
-        (lambda: bha().with_tip(math.nan), r"`at` must lie in \(0, 3\]"),
         (lambda: bha(base=np.eye(3)), r"`base` must be one pose of shape \(4, 4\)"),
         (lambda: bha(base=2 * np.eye(4)), "`base` must hold a rotation"),
         (lambda: bha()(torch.zeros(4, 6, dtype=torch.float64)), r"`q` must have shape \(..., 9\)"),
-        (lambda: bha().backbone(STRAIGHT, 0), "`n_points` must be 1 to"),
         (lambda: bha().check_actuators(STRAIGHT - 0.25), "positive actuator lengths"),
-        (lambda: bha().check_actuators(STRAIGHT * torch.nan), "must be finite"),
     ],
 )
 def test_bad_input_says_what_is_needed(make, message):

@@ -176,18 +176,6 @@ def test_pairs_mixed_segments_and_stages(write):
     assert_close(turned.metres(q)[0], torch.tensor(math.degrees(1.0)).double(), rtol=1e-7, atol=0)
 
 
-def test_the_tighter_of_two_limits_counts_and_unknown_ones_leave_the_other():
-    one = robots.Limits(q_min=np.array([-1.0, -2.0]), q_max=np.array(3.0))
-    two = robots.Limits(
-        q_min=np.array([-2.0, -1.0]), q_max=np.array([4.0, 2.0]), dq_max=np.array(5.0)
-    )
-    for found in (one.intersect(two), two.intersect(one)):
-        np.testing.assert_array_equal(found.q_min, [-1.0, -1.0])
-        np.testing.assert_array_equal(found.q_max, [3.0, 2.0])
-        assert found.dq_max == 5.0
-        assert found.ddq_max is None
-
-
 def test_markers_of_a_log_are_the_outputs_of_the_chain(write):
     columns = [f"{axis}{k}" for k in range(2) for axis in "xyz"]
     log = f"[log]\nq = ['a', 'b', 'c']\nx = {columns}\n"

@@ -12,7 +12,6 @@ from simulated_log import run
 
 from hybridkin import ConstantCurvatureChain, load_model, robots
 from hybridkin.cli import _demo
-from hybridkin.cli._init import _proposed
 
 TENDONS = ["--kind", "tendons", "--segments", "2", "--radius", "5", "--length", "100"]
 
@@ -51,20 +50,6 @@ def test_init_from_options(tmp_path, capsys):
     )
 
 
-@pytest.mark.parametrize(
-    ("kind", "found"), [("chambers", "ConstantCurvature"), ("elastic-tendons", "ElasticTendon")]
-)
-def test_init_of_other_kinds(tmp_path, capsys, kind, found):
-    sign = [] if kind == "chambers" else ["--q-sign", "1"]
-    options = [*TENDONS, *sign, "--kind", kind, "--actuators", "4", "--q-unit", "cm"]
-    assert run(capsys, "init", tmp_path / "r.toml", *options)[0] == 0
-    robot = robots.read_description(tmp_path / "r.toml")
-    assert type(robot.chain).__name__ == f"{found}Chain"
-    assert robot.chain.n_actuators == 8
-    assert all(robot.chain.extensible) == (kind == "chambers")
-    assert (robot.log.q_unit, robot.log.q_sign) == ("cm", 1)
-
-
 MOTORS = [*TENDONS, "--q-sign", "1"]
 
 
@@ -101,26 +86,6 @@ def test_init_reads_the_header_of_a_log_and_checks_it(log, tmp_path, capsys):
     assert code == 1  # as of `describe`, whose check this is
     assert "these look like millimetres" in re.sub(r"\s+", " ", err)
     assert not json.loads(out)["log_check"]["ok"]
-
-
-@pytest.mark.parametrize(
-    ("header", "q", "x"),
-    [
-        ("l1 l2 l3 pos_x pos_y pos_z", "l1 l2 l3", "pos_x pos_y pos_z"),
-        ("X Y Z a_1 b_1 a_2 b_2 a_3 b_3", "a_1 a_2 a_3", "X Y Z"),
-        ("vx vy vz tip[x] tip[y] tip[z] p1 p2 v1", "p1 p2 v1", "tip[x] tip[y] tip[z]"),
-        ("t1 t2 t3 max_x max_y max_z", "t1 t2 t3", "max_x max_y max_z"),
-        ("left right up x y z", None, "x y z"),
-        ("c1 c2 c3 east north high", "c1 c2 c3", None),
-    ],
-)
-def test_columns_are_proposed_by_their_names(tmp_path, header, q, x):
-    path = tmp_path / "log.csv"
-    path.write_text(header.replace(" ", ",") + "\n")
-    found = _proposed({"log": path, "segments": 1, "actuators": 3}, None)
-    for key, names in {"q": q, "x": x}.items():
-        assert list(found.get(key, ())) == (names or "").split()
-    assert not {"groups", "time"} & {*found}
 
 
 @pytest.mark.parametrize(

@@ -6,9 +6,9 @@ import re
 import numpy as np
 import pytest
 import torch
-from simulated_log import COLUMNS, FIT, HEADER, ROBOT, document, rows, run, write
+from simulated_log import FIT, HEADER, ROBOT, document, rows, run, write
 
-from hybridkin import load_model, robots, workflow
+from hybridkin import load_model, workflow
 from hybridkin.cli.main import main
 
 
@@ -52,20 +52,6 @@ def test_fit_without_auto_and_with_a_radius(log, robot, tmp_path, capsys):
     _, record = document(capsys, "evaluate", out, log)
     assert 0.8 < record["all"]["share_in_radius"] <= 1
     assert "mm covers 80 % of the tips" in run(capsys, "describe", out)[1]
-
-
-def test_options_stand_over_the_log_table(log, robot, tmp_path, capsys):
-    table = rows()
-    table[:, 1:7] *= -0.1  # cm, shortening negative
-    path = tmp_path / "cm.csv"
-    header = HEADER.replace("t1", "a1").replace("time", "clock")
-    np.savetxt(path, table, delimiter=";", header=header.replace(",", ";"), comments="")
-    columns = ["--q", ",".join(["a1", *COLUMNS[1:]]), "--time", "clock"]
-    units = ["--q-unit", "cm", "--q-sign", "1"]
-    code, other = document(capsys, "describe", path, "--robot", robot, *columns, *units)
-    _, usual = document(capsys, "describe", log, "--robot", robot)
-    assert code == 0
-    np.testing.assert_allclose(other["q_range"], usual["q_range"], atol=1e-8)
 
 
 def in_metres(table):
@@ -185,20 +171,6 @@ def test_evaluate_takes_new_and_fitted_rows_apart(fitted, tmp_path, capsys):
     new = write(tmp_path / "new.csv", table[120:])
     _, record = document(capsys, "evaluate", fitted / "model", new)
     assert (record["fitted_rows"], record["fitted"], record["held_out"]) == (0, None, None)
-
-
-def test_evaluate_of_a_description_is_the_mechanical_model(fitted, capsys):
-    arguments = [fitted / "robot.toml", fitted / "log.csv"]
-    code, record = document(capsys, "evaluate", *arguments)
-    assert code == 0
-    table = rows()
-    with torch.no_grad():
-        x = robots.from_toml(fitted / "robot.toml")(torch.from_numpy(-1e-3 * table[:, 1:7]))
-    mean = np.linalg.norm(x.numpy() - 1e-3 * table[:, 7:10], axis=1).mean()
-    assert record["all"]["mean"] == pytest.approx(mean, rel=1e-6)
-    assert record["all"]["share_in_domain"] is None
-    assert document(capsys, "evaluate", *arguments, "--fail-above", "0.01")[0] == 1
-    assert document(capsys, "evaluate", *arguments, "--fail-above", "1000")[0] == 0
 
 
 def test_describe_tells_what_a_model_is(fitted, capsys):

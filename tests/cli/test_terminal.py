@@ -31,18 +31,6 @@ def test_a_pipe_gets_a_line_when_a_stage_begins_and_one_with_its_time(clock, cap
     ]
 
 
-def test_a_long_stage_says_how_much_time_is_left(clock, capsys):
-    stages = Stages()
-    stages("tracking", 0, 10)
-    for done in range(1, 5):  # a line after 20 and after 40 seconds
-        clock[0] += 10.0
-        stages("tracking", done, 10)
-    assert capsys.readouterr().err.splitlines()[1:] == [
-        "hybridkin: tracking: 2 of 10, about 1.3 min left",
-        "hybridkin: tracking: 4 of 10, about 1.0 min left",
-    ]
-
-
 def test_quiet_leaves_warnings_and_what_is_important(clock, capsys):
     stages = Stages(quiet=True)
     stages("tracking", 0, 4)

@@ -91,28 +91,6 @@ def test_track_of_a_shape_can_be_sent_and_read_back(fitted, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_track_of_points_within_given_limits(fitted, tmp_path, capsys):
-    tip = 1e3 * load_model(fitted / "model" / "model.safetensors").predict(np.zeros((1, 6)))[0]
-    path, out = tmp_path / "path.csv", tmp_path / "track"
-    far = tip + np.array([[0, 0, -0.1], [15, 0, -4], [30, 0, -8]])
-    np.savetxt(path, far, delimiter=",", header="x,y,z", comments="")
-    arguments = ["track", fitted / "model", path, "--out", out]
-    assert "--dt" in run(capsys, *arguments)[2]
-    # In the log's sign: at least -1 mm pulled, at most 0.2.
-    limits = ["--dt", "1", "--q-min=-1", "--q-max", "0.2"]
-    code, _, errors = run(capsys, *arguments, *limits)
-    assert (code, out.exists()) == (2, False)
-    assert "2 of 3 checked points are out of reach" in errors
-    code, record = document(capsys, *arguments, *limits, "--force")
-    assert code == 1
-    assert record["reached"] < 3
-    assert record["limits"]["q_min"] == pytest.approx([-0.0002] * 6)
-    assert record["limits"]["q_max"] == pytest.approx([0.001] * 6)
-    assert commands(out).min() >= -1 - 1e-9
-    assert commands(out).max() <= 0.2 + 1e-9
-
-
-@pytest.mark.slow
 def test_track_says_how_much_of_a_path_is_within_reach(robot, tmp_path, capsys):
     arguments = ["track", robot, *SHAPE, "--out", tmp_path / "track"]
     arguments += ["--center", "0,0,190"]  # else it is placed where it fits

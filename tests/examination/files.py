@@ -11,16 +11,13 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import resource
 import signal
-import subprocess
 import sys
 import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterator
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +25,6 @@ from _line import Line
 from _readers import READERS, made, outcome
 from tqdm import tqdm
 
-HERE = Path(__file__).resolve().parent
 SECONDS, MEGABYTES = 2.0, 300.0  # that a file may take
 NUMBERS = {"model": 20_000}  # of the full run; of other formats 700
 SPACE = 1_500_000_000
@@ -43,26 +39,6 @@ def examine(full: bool) -> Iterator[Line]:
             number = NUMBERS.get(kind, 700)
             yield of_kind(kind, number if full else number // 20, Path(folder))
         yield no_files(Path(folder))
-        yield fuzzed(300 if full else 10, Path(folder))
-
-
-def fuzzed(seconds: int, folder: Path) -> Line:
-    """Return what a fuzzer that is guided by the lines reached finds in the readers."""
-    what = "files made by a fuzzer (atheris, seed 20)"
-    if find_spec("atheris") is None:
-        return Line(what, "atheris is not installed here", None)
-    (folder / "corpus").mkdir()
-    command = [sys.executable, str(HERE / "_fuzz_readers.py"), "corpus", "-seed=20", "-timeout=20"]
-    command += [f"-max_total_time={seconds}", "-max_len=20000", "-rss_limit_mb=1500"]
-    done = subprocess.run(command, capture_output=True, text=True, errors="replace")
-    print(done.stderr[-4000:], file=sys.stderr)
-    runs = re.findall(r"Done (\d+) runs", done.stderr)
-    places = re.findall(r"cov: (\d+)", done.stderr)
-    if done.returncode or not runs or not places:
-        return Line(what, f"ends by {done.returncode}", False)
-    figure = f"{runs[-1]} files in {seconds} s, {places[0]} places reached by whole files, "
-    figure += f"{places[-1]} by all"
-    return Line(what, figure, int(places[-1]) > int(places[0]))
 
 
 def of_kind(kind: str, n: int, folder: Path) -> Line:

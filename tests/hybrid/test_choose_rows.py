@@ -108,16 +108,6 @@ def test_the_order_of_candidates_and_the_unit_do_not_matter():
     assert_allclose(doubled, 2.0 * error, rtol=1e-9)
 
 
-def test_rows_for_a_path_leave_less_error_there():
-    q = lengths(200)
-    path = np.linspace(q[0], q[1], 20)
-    everywhere = choose_rows(trunk(), q, 15)[0]
-    rows, error = choose_rows(trunk(), q, 15, target=path)
-    known = explicit(trunk(), q, q[:0], path)
-    assert_allclose(error[-1] ** 2, known(rows.tolist()), rtol=1e-9)
-    assert error[-1] ** 2 < 0.5 * known(everywhere.tolist())
-
-
 def test_a_hybrid_stands_for_its_mechanical_model():
     q = lengths(40)
     with torch.no_grad():

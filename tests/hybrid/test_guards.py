@@ -8,7 +8,7 @@ from sklearn.linear_model import LinearRegression
 from torch.testing import assert_close
 
 from hybridkin import ConstantCurvatureChain, HybridForwardModel
-from hybridkin.hybrid._guards import BoxGuard, GroupDistance, LeverageGuard, QuadraticLeverage
+from hybridkin.hybrid._guards import GroupDistance, LeverageGuard, QuadraticLeverage
 
 LONGEST = torch.tensor(0.01).double()
 
@@ -34,15 +34,6 @@ def test_weight_of_a_leverage_is_full_up_to_three_times_the_limit():
     half = (distance - 6.0).abs().argmin()
     assert_close(weight[half], torch.tensor(0.5).double(), rtol=0, atol=0.05)
     assert weight[-1] < 1e-3
-
-
-def test_weight_of_a_box_fades_from_its_edge():
-    guard = BoxGuard(-torch.ones(2).double(), torch.ones(2).double(), LONGEST)
-    q = torch.tensor(
-        [[1.0, -1.0], [1.2, 0.0], [1.4, 0.0]], dtype=torch.float64
-    )  # a tenth and two of 2
-    expected = torch.tensor([[1.0], [1 / 2], [1 / 65]], dtype=torch.float64)
-    assert_close(guard(q), expected, rtol=1e-12, atol=0)
 
 
 @pytest.mark.parametrize("factor", [2.9, 3.0, 3.3, 8.0])
@@ -160,12 +151,3 @@ def test_motions_of_single_actuators_do_not_vouch_for_what_lies_between(guard):
     assert without > 0.4
     assert model.in_domain(new).mean() < 0.25
     assert_array_equal(model.error_weight(new), weight)  # that of the guard alone
-
-
-def test_no_guard_or_nothing_learned_has_no_domain():
-    q, x, groups = corner_log()
-    for given in ({"guard": None}, {"error_model": "drop"}):
-        model = HybridForwardModel(ConstantCurvatureChain([0.05]), **given)
-        module = model.fit(q, x, groups=groups).module_
-        assert module.tested is None
-        assert module.in_domain(torch.from_numpy(10.0 * q)).all()

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from numpy.testing import assert_array_equal
 from sklearn.linear_model import Ridge
 
 from hybridkin import (
@@ -33,23 +32,6 @@ def motions(seed, n_motions=240, n=6, noise=2e-3):
         + noise * rng.standard_normal(x.shape)
     )
     return q, x, motion
-
-
-def test_infinite_outside_the_domain_and_monotone_in_coverage():
-    q, x, motion = motions(0)
-    narrow, wide = (
-        HybridForwardModel(
-            robots.bionic_handling_assistant(), coverage=coverage, random_state=0
-        ).fit(q, x, groups=motion)
-        for coverage in (0.5, 0.95)
-    )
-    assert narrow.radius_.inside < wide.radius_.inside < np.inf
-    rows = np.concatenate([q, q + 0.2])
-    _, radius = wide.predict(rows, return_radius=True)
-    inside = wide.in_domain(rows)
-    assert inside[: len(q)].all()
-    assert not inside[len(q) :].any()
-    assert_array_equal(radius, np.where(inside, wide.radius_.inside, np.inf))
 
 
 def few(n, coverage, groups=True, error_model="drop"):

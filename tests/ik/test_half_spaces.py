@@ -10,6 +10,7 @@ TRUNK = robots.bionic_handling_assistant()
 HOME = np.full(9, 0.25)
 
 
+@pytest.mark.slow
 def test_the_tip_can_brake_before_a_plane():
     """A straight push at full thrust: the tip stands at the plane, not beyond, within ddq_max."""
     axis = torch.tensor([[0.0], [0.0], [1.0]], dtype=torch.float64)

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from scipy.optimize import nnls
 
 from hybridkin import InverseKinematics, robots
 from hybridkin.ik.results import IKStatus
@@ -72,24 +71,6 @@ def test_what_cannot_be_stopped_brakes_as_hard_as_it_may():
 
 
 # ---------------------------------------------------------------- limits of the tip
-
-
-def test_the_nearest_point_within_half_spaces():
-    """By the conditions of optimality, with redundant and nearly parallel planes."""
-    draw = np.random.default_rng(0)
-    for _ in range(10):
-        k = draw.integers(1, 9)
-        A, b = draw.standard_normal((k, 3)), draw.uniform(0.0, 1.0, k)
-        ik = InverseKinematics(TRUNK, tip_limits=(A, b))
-        x = 2.0 * draw.standard_normal((4, 3))
-        found = ik.settings.allowed(torch.from_numpy(x)).numpy()
-        assert (found @ A.T <= b + 1e-12).all()
-        for start, end in zip(x, found, strict=True):
-            touched = A[A @ end > b - 1e-9]  # the way is a sum of normals, with shares >= 0
-            left = nnls(touched.T, start - end)[1] if len(touched) else np.abs(start - end).max()
-            assert left < 1e-9
-        inner = torch.from_numpy(1e-3 * b.min() * x)
-        np.testing.assert_array_equal(ik.settings.allowed(inner), inner)
 
 
 def plane(distance):

@@ -5,7 +5,14 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from hybridkin import ForwardModel, HybridForwardModel, RigidChain, datasets, robots
+from hybridkin import (
+    ConstantCurvatureChain,
+    ForwardModel,
+    HybridForwardModel,
+    RigidChain,
+    datasets,
+    robots,
+)
 from hybridkin.ik._gram import apply_rows
 from hybridkin.ik.solver import IKStatus, InverseKinematics
 from hybridkin.ik.tasks import (
@@ -230,3 +237,46 @@ def test_the_limits_of_an_arm_are_the_defaults(rng):
     assert free.solve(np.array([-0.79, 0.0, 0.0]), q0=np.full(3, 0.1)).converged
     some = InverseKinematics(arm, q_max=0.1)
     assert "q_min=-2 to -0.5 of the model, q_max=0.1, dq_max" in repr(some)
+
+
+def test_weights_decide_between_points_that_conflict():
+    """Two points of a straight trunk are 0.3 m apart at most; the heavier one is missed by less."""
+    target = np.array([[0.0, 0.0, 0.6], [0.0, 0.0, 1.4]])
+    missed = {}
+    for weights in ([3.0, 1.0], [1.0, 1.0], [1.0, 3.0]):
+        task = PointsTask(CHAIN, [2.0, 3.0], weights=weights)
+        x = InverseKinematics(task, **LIMITS).solve(target, restarts=4).x
+        missed[tuple(weights)] = np.linalg.norm(x - target, axis=1)
+    lower, equal, upper = missed.values()
+    assert lower[0] < equal[0] < upper[0]
+    assert lower[1] > equal[1] > upper[1]
+
+
+def test_a_pose_at_which_first_order_is_blind_is_left():
+    """Upright below the straight tip: no small motion of a straight backbone gets nearer."""
+    tendons = ConstantCurvatureChain([0.02] * 3, lengths=[0.1] * 3)
+    target = np.eye(4)
+    target[2, 3] = 0.28
+    ik = InverseKinematics(PoseTask(tendons), q_min=-0.03, q_max=0.03)
+    solution = ik.solve(target, q0=np.zeros(9), tol=(1e-4, 1e-3))
+    assert solution.converged
+    alone = ik.solve(torch.from_numpy(target), q0=torch.zeros(9).double(), tol=(1e-4, 1e-3))
+    assert alone.converged
+
+
+def test_single_precision_keeps_accelerations_and_half_spaces():
+    limits = {**LIMITS, "dq_max": 0.3, "ddq_max": 4.0, "dt": 0.01}
+    ik = InverseKinematics(CHAIN, **limits, tip_limits=([[0.0, 0.0, 1.0]], [0.8]))
+    tracker = ik.tracker(np.full(9, 0.25, dtype=np.float32))
+    commands = [tracker.q, tracker.q]
+    for _ in range(60):
+        commands.append(tracker.step(np.array([0.1, 0.0, 1.0], dtype=np.float32)))
+    q = np.array(commands)
+    assert q.dtype == np.float32
+    steps = np.diff(q.astype(float), axis=0)
+    ulp = float(np.spacing(np.float32(0.4)))
+    assert np.abs(steps).max() <= 0.3 * 0.01 + ulp
+    assert np.abs(np.diff(steps, axis=0)).max() <= 4.0 * 0.01**2 + 2 * ulp
+    tips = CHAIN(torch.from_numpy(q).double())
+    assert tips[:, 2].max() <= 0.8 + 1e-4
+    assert tips[-1, 2] > 0.79

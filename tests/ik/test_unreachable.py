@@ -61,6 +61,7 @@ def test_no_tip_of_the_robot_is_beyond_its_reach(rng, name):
     assert (settings.misses(x + 100.0) > 1.0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("chain", [TRUNK, TRUNK.with_markers([(0, 1.0), (2, 1.0)])])
 @pytest.mark.parametrize("coupling", ["parallel", "serial"])
 def test_a_hybrid_reaches_farther_by_its_longest_correction(rng, chain, coupling):

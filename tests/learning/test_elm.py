@@ -1,15 +1,11 @@
 """The ELM: its formula, its statistics, its derivatives and its manners as an estimator."""
 
-import copy
-import pickle
-
 import joblib
 import numpy as np
 import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.linalg import LinAlgWarning
-from sklearn.base import clone
 from sklearn.exceptions import NotFittedError
 from sklearn.linear_model import Ridge
 from sklearn.utils.estimator_checks import parametrize_with_checks
@@ -173,17 +169,6 @@ def test_merge_of_seven_shards_equals_fit():
     assert joblib.hash(shards[1]) == before
 
 
-def test_large_offsets_do_not_cancel():
-    X, Y = trunk()
-    params = {"input_scaling": BOUNDS, "fit_intercept": True}
-    base = elm(**params).fit(X, Y)
-    shifted = elm(**params)
-    for i in range(7):
-        shifted.partial_fit(X[i::7], Y[i::7] + 1e6)
-    assert_allclose(shifted.predict(X) - 1e6, base.predict(X), rtol=0, atol=1e-7)
-    assert_allclose(shifted.noise_variance_, base.noise_variance_, rtol=1e-7)
-
-
 @pytest.mark.parametrize("input_scaling", ["minmax", "standard"])
 @pytest.mark.parametrize("fit_intercept", [False, True])
 def test_sample_weight_is_repetition(fit_intercept, input_scaling):
@@ -318,25 +303,6 @@ def test_alpha_zero(fit_intercept):
 
 
 # Manners
-
-
-def test_pickle_clone_copy_and_hash():
-    X, Y = trunk()
-    model = elm(input_scaling=BOUNDS).fit(X, Y)
-    state = copy.copy(model.__dict__)
-    y, std = model.predict(X, return_std=True)
-    assert model.__dict__.keys() == state.keys()
-    assert joblib.hash(model) == joblib.hash(elm(input_scaling=BOUNDS).fit(X, Y))
-    for other in (pickle.loads(pickle.dumps(model)), copy.deepcopy(model)):
-        assert joblib.hash(other) == joblib.hash(model)
-        assert_array_equal(other.predict(X), y)
-        assert_array_equal(other.predict(X, return_std=True)[1], std)
-        assert_array_equal(other.jacobian(X), model.jacobian(X))
-        assert_same_model(other.partial_fit(X, Y), copy.deepcopy(model).partial_fit(X, Y))
-    assert b"torch" not in pickle.dumps(model)
-    fresh = clone(model)
-    assert not hasattr(fresh, "module_")
-    assert joblib.hash(fresh) == joblib.hash(elm(input_scaling=BOUNDS))
 
 
 def test_clear_errors():

@@ -85,17 +85,6 @@ def test_the_code_of_other_tasks(tmp_path, name, dtype):
     assert agrees(tmp_path, limited(make(), **settings), dtype=dtype)
 
 
-@needs_cc
-@pytest.mark.slow
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
-def test_without_limits_no_limit_is_kept_or_promised(tmp_path, dtype):
-    ik = limited(trunk(), q_min=0.15, q_max=0.35, limits="off")
-    assert agrees(tmp_path, ik, dtype=dtype)
-    readme = (tmp_path / "README.md").read_text()
-    assert "keeps no limits" in readme
-    assert "It keeps q between" not in readme
-
-
 FOLLOWS = """
 #include <stdio.h>
 #include "robot.h"

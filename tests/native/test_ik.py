@@ -2,13 +2,10 @@ import numpy as np
 import pytest
 import torch
 from compiled import random_settings
-from sklearn.linear_model import LinearRegression
 
 from hybridkin import (
     ConstantCurvatureChain,
     ElasticTendonChain,
-    ELMRegressor,
-    HybridForwardModel,
     InverseKinematics,
     robots,
 )
@@ -155,19 +152,6 @@ def test_what_has_no_kernel_runs_in_torch():
             Plan(ik.stored())
     single = InverseKinematics(BHA, **limits).tracker(q.astype(np.float32))
     assert single.backend == "torch: `q0` is no float64 array of NumPy"
-
-
-@pytest.mark.parametrize("error_model", [ELMRegressor(8, random_state=0), LinearRegression()])
-def test_a_model_of_data_alone_is_compiled_with_scalar_limits(error_model):
-    draw = np.random.default_rng(0)
-    q = draw.uniform(0.2, 0.3, (60, 9))
-    x = BHA(torch.from_numpy(q)).numpy()
-    model = HybridForwardModel(None, error_model).fit(q, x)
-    assert (model.module_.n_actuators, model.module_.n_outputs) == (9, 3)
-    tracker = InverseKinematics(model, q_min=0.1, q_max=0.4).tracker(q[0])
-    assert tracker.backend == "compiled"
-    vectors = InverseKinematics(model, q_min=np.full(9, 0.1), q_max=np.full(9, 0.4)).tracker(q[0])
-    np.testing.assert_array_equal(tracker.step(x[1]), vectors.step(x[1]))
 
 
 @pytest.mark.parametrize("limits", [{}, {"dq_max": 0.05}, {"ddq_max": 1.0}, {"weights": 2.0}])

@@ -97,16 +97,3 @@ def test_octave_computes_as_python(kind, tmp_path):
     tracker = controller.tracker(q[0])
     commands = [tracker.step(target) for target in targets]
     np.testing.assert_allclose(steps[:, :n], commands, rtol=0, atol=1e-9)
-
-
-def test_a_microcontroller_prints_the_numbers_of_the_desktop():
-    import run as microcontroller
-
-    if microcontroller.missing():
-        pytest.skip(f"needs {', '.join(microcontroller.missing())}")
-    results = microcontroller.measured(systems.CONTROLLERS["trunk"]())
-    for difference, flash, ram, stack in results.values():
-        assert difference < 1e-5
-        assert flash < 60_000
-        assert ram < 2_000
-        assert stack < 16_000

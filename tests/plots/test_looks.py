@@ -48,23 +48,6 @@ def test_a_model_has_the_same_colour_in_every_figure(draw):
     assert draw(NAMES[::-2], axes[1]) == expected[::-2]  # whatever stands beside it
 
 
-def track_errors(names, ax):
-    display = plots.TrackingDisplay(TRACK, {name: TRACK + 0.01 for name in names})
-    display.plot_error(ax, expected={"robot": 0.02})
-
-
-@pytest.mark.parametrize("draw", [boxes, outlines, paths, track_errors, curves])
-def test_legends_do_not_cover_data(draw):
-    figure, ax = plots.new_figure(6, 5)
-    draw(NAMES, ax)
-    figure.draw_without_rendering()
-    legend = ax.get_legend().get_window_extent()
-    assert not legend.overlaps(ax.get_window_extent())
-    assert not legend.overlaps(ax.xaxis.get_tightbbox())
-    assert 0 <= legend.y0
-    assert legend.y1 < ax.xaxis.get_tightbbox().y0
-
-
 # Bodies
 
 

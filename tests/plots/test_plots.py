@@ -85,16 +85,6 @@ def test_error_histogram_counts_every_row_in_the_unit_shown(x, tmp_path):
     assert drawn(figure, tmp_path)
 
 
-def test_rows_that_are_not_known_are_left_out_of_errors():
-    _, axes = plots.new_figure(6, 3, 1, 2)
-    errors = {"a": [0.01, np.nan, 0.03]}
-    plots.ErrorHistogramDisplay(errors).plot(axes[0])
-    plots.ErrorBoxDisplay(errors).plot(axes[1])
-    assert axes[0].get_legend().get_texts()[0].get_text() == "a: mean 2.00, max 3.0 cm"
-    dots = {line.get_label(): line.get_xdata() for line in axes[1].lines}
-    np.testing.assert_allclose([*dots["mean"], *dots["maximum"]], [2.0, 3.0])
-
-
 def test_tendons_on_stages_are_drawn_as_long_as_they_are():
     lengths = [None, None, 0.1, 0.12]
     chain = ConstantCurvatureChain(
@@ -221,25 +211,6 @@ def test_a_fitted_hybrid_shows_its_correction(hybrid, data, tmp_path):
 # Tracks
 
 
-@pytest.mark.slow
-def test_actuators_by_name_against_their_limits(tmp_path):
-    figure, axes = plots.new_figure(4, 4, 2, 1)
-    q, limits = np.arange(15.0).reshape(3, 5), np.array([5 * [-1.0], [16.0, 17, 18, 19, 20]])
-    shown, names = {"sent": q, "done": q + 0.5}, ("a", "b", "c", "d", "e")
-    display = plots.ActuatorDisplay(shown, (2, 3), names=names, limits=limits)
-    display.plot(axes, unit="turns", per_unit=-0.5)
-    assert [len(ax.lines) for ax in axes] == [4, 6]
-    np.testing.assert_allclose(axes[1].lines[0].get_ydata(), -2 * q[:, 2])
-    labels = [text.get_text() for text in axes[1].get_legend().get_texts()]
-    assert labels == ["c", "d", "e", "done", "limits"]
-    (lines,) = axes[0].collections
-    assert [segment[0, 1] for segment in lines.get_segments()] == [2.0, 2.0, -32.0, -34.0]
-    assert lines.get_colors()[0].tolist() == lines.get_colors()[2].tolist()
-    assert axes[0].lines[0].get_color() == axes[0].lines[2].get_color()
-    assert axes[1].get_ylabel() == "segment 2 [turns]"
-    assert drawn(figure, tmp_path)
-
-
 # Films and pages
 
 
@@ -253,19 +224,6 @@ def film(track):
         x=track.x_measured,
         n_frames=5,
     )
-
-
-def test_frames_lie_evenly_in_time(track, film):
-    assert film.rows.tolist() == [0, 10, 20, 30, 40]
-    assert film.fps == pytest.approx(2.0)  # 2 s in four steps
-    np.testing.assert_allclose(film.error, track.error)
-    t = np.array([0.0, 0.1, 0.2, 0.3, 2.0, 3.0])
-    uneven = plots.TrackAnimation.from_estimator(
-        robots.bionic_handling_assistant(), track.q[:6], t=t, n_frames=4
-    )
-    assert uneven.rows.tolist() == [0, 3, 4, 5]
-    np.testing.assert_allclose(uneven.x, track.x[:6], rtol=0, atol=1e-12)
-    assert uneven.error is None
 
 
 def test_a_frame_shows_body_tip_and_target(track, film):

@@ -26,7 +26,7 @@ q, x, groups = trunk_log(24)
 result = calibrate(trunk(), torch.from_numpy(q), torch.from_numpy(x), ("radii", "base"))
 models = {"arc": bent_chain(), "calibrated": result.chain, "elm": ELMRegressor(4, random_state=0)}
 models["elm"].fit(q, x)
-for name in ("linear", "auto"):
+for name in ("linear", "quadratic"):
     model = HybridForwardModel(trunk(), name, calibrate=("radii",), random_state=0)
     models[name] = model.fit(q, x, groups=groups)
 for name, model in models.items():

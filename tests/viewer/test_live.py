@@ -1,7 +1,6 @@
 """The live view: what it draws and says, without a browser."""
 
 import builtins
-import socket
 import time
 from types import SimpleNamespace
 
@@ -53,12 +52,6 @@ def test_the_tip_follows_the_target_and_the_page_says_so(shown):
     assert shown._body._backbone.points[-1] == pytest.approx(shown.robot.x, abs=0.01)
 
 
-def test_out_of_reach_is_red(shown):
-    shown.follow([2.0, 0.0, 0.0])
-    until(lambda: "Out of reach" in shown._words.content)
-    assert tuple(shown._ball.color) == (210, 50, 50)
-
-
 def test_a_robot_at_rest_costs_nothing(shown):
     until(lambda: not shown.robot.tick())
     time.sleep(0.2)
@@ -67,6 +60,7 @@ def test_a_robot_at_rest_costs_nothing(shown):
     assert time.process_time() - start < 0.05
 
 
+@pytest.mark.slow
 def test_every_actuator_wiggles_and_the_robot_returns(shown):
     seen = []
     move = shown.robot.go_to
@@ -117,15 +111,6 @@ def test_an_error_of_the_drawing_is_raised_where_one_waits(shown):
     with pytest.raises(RuntimeError, match="no picture"):
         shown.wait()
     assert "no picture" in shown._words.content
-
-
-def test_a_closed_view_frees_its_port_and_a_taken_port_is_passed_over(fitted):
-    with hybridkin.view(*fitted, port=9310) as first, hybridkin.view(*fitted, port=9310) as second:
-        assert first.address != second.address
-        ports = [int(view.address.rpartition(":")[2]) for view in (first, second)]
-    for port in ports:
-        with socket.socket() as probe:
-            assert probe.connect_ex(("127.0.0.1", port)) != 0
 
 
 def test_messages_of_what_cannot_be_shown(fitted, monkeypatch):

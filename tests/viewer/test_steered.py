@@ -39,16 +39,6 @@ def test_the_tip_reaches_a_target_and_then_rests(trunk):
     assert (trunk.q == before).all()
 
 
-def test_a_target_out_of_reach_is_said_with_what_holds_the_robot(trunk):
-    trunk.follow([3.0, 0.0, 0.0])
-    run(trunk, 1000)
-    situation = trunk.situation
-    assert situation.words.startswith("Out of reach")
-    assert not situation.reached
-    assert situation.error > 1.0
-    assert trunk.held.any()
-
-
 def test_limits_of_position_and_speed_are_kept():
     robot = steered(robots.bionic_handling_assistant(), q_min=0.2, q_max=0.3, dq_max=0.05)
     q = [robot.q]
@@ -80,6 +70,7 @@ def test_a_command_moves_the_actuators_and_a_target_takes_over_from_there(trunk)
     assert np.abs(trunk.q - before).max() < 0.02
 
 
+@pytest.mark.slow
 def test_commands_lead_the_play_and_are_in_the_unit_of_the_log():
     rng = np.random.default_rng(0)
     chain = ConstantCurvatureChain([0.01], lengths=[0.1])

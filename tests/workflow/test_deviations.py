@@ -39,7 +39,7 @@ def said(nominal, truth, parameters, sign=1):
     return [*deviations(nominal, calibrate(nominal, q, x, parameters))]
 
 
-@pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (0.0, 90.0, 0.0), (150.0, 0.0, 60.0)])
+@pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (150.0, 0.0, 60.0)])
 def test_a_right_description_has_no_deviations(turn):
     nominal = robot(turn, radii=1.1 * RADII, length=0.095)
     assert said(nominal, robot(turn), ["radii", "turns", "lengths", "base"]) == []

@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 from hybridkin import ConstantCurvatureChain, HybridForwardModel, PlayOperator, save_model, workflow
 from hybridkin.cli.main import main
 from hybridkin.datasets import Log
-from hybridkin.plots import TrackAnimation
 from hybridkin.workflow.track import TARGET
 
 CHAIN = ConstantCurvatureChain([0.005, 0.005], lengths=[0.1, 0.1])
@@ -130,17 +129,6 @@ def test_the_cause_of_a_fault_is_found(verified, fault, cause, remedy):
     assert remedy in report.plain()
 
 
-def test_a_moved_base_on_a_short_path_is_said_to_be_uncertain(verified):
-    q = loops(0.1 * SIZE)
-    report = verified(*on_a_moved_base(q))
-    assert report.record.cause == "moved base"
-    assert report.record.range < 0.2
-    assert "on so short a path" in " ".join(report.plain().split())
-    report = verified(*on_a_moved_base(loops(SIZE)))
-    assert report.record.range > 0.5
-    assert "on so short a path" not in " ".join(report.plain().split())
-
-
 def test_an_error_of_no_known_cause_is_not_explained(verified):
     q = loops(0.6 * SIZE)
     far = 3e-3 * np.random.default_rng(2).standard_normal((len(q), 3))
@@ -175,19 +163,3 @@ def test_the_command_leaves_out_rows_without_a_tip(loaded, tmp_path, capsys):
     assert record["cause"] == "moved base"
     assert record["parts"]["path"]["rows"] == len(q) - 11
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"report.md", "report.json"}
-
-
-def test_a_film_begins_where_the_path_begins(loaded, tmp_path, monkeypatch):
-    films = []
-
-    def save(film, path, **_):
-        films.append(film)
-        path.touch()
-
-    monkeypatch.setattr(TrackAnimation, "save", save)
-    q = loops(0.6 * SIZE)
-    written(tmp_path / "track.csv", q, truth(q))
-    record = workflow.animate_track(loaded, tmp_path, tmp_path / "film.gif").record
-    np.testing.assert_allclose(films[0].target, truth(q)[10:])
-    np.testing.assert_allclose(films[0].x, loaded.tips(q[10:]))
-    assert record["frames"] == 150

@@ -36,16 +36,6 @@ x_unit = "mm"
 """
 
 
-def fit(path, robot, out, groups=None, auto=False):
-    """Fit a log by two folds."""
-    description = robots.read_description(robot)
-    log_format = replace(description.log, groups=groups)
-    free = "base" in description.calibrate
-    log = workflow.read_log(path, log_format, chain=description.chain, base_is_free=free)
-    settings = workflow.FitSettings(n_folds=2, auto=auto)
-    return workflow.fit_log(log, description, out, settings, n_jobs=1)
-
-
 @pytest.fixture
 def log(tmp_path):
     """A simulated log of 6 motions in millimetres, and its robot description."""
@@ -61,21 +51,6 @@ def log(tmp_path):
     header = "l1,l2,l3,l4,l5,l6,x,y,z,motion"
     np.savetxt(path, rows, delimiter=",", header=header, comments="", fmt="%.6f")
     return path, robot
-
-
-@pytest.mark.slow
-def test_fit_warns_once_of_what_is_unphysical(log, tmp_path):
-    path, robot = log
-    robot.write_text(ROBOT.replace("0.11", "0.05"))
-    with pytest.warns(UserWarning, match="gave unphysical values: radii") as caught:
-        report = fit(path, robot, tmp_path / "m")
-    assert len(caught) == 1
-    # The same page does not call them identified, however far the data narrow the prior.
-    radii = [e for e in report.record.calibration.entries if e.name.startswith("radii")]
-    assert max(entry.narrowing for entry in radii) > 10
-    assert not any(entry.identified or entry.physical for entry in radii)
-    text = (tmp_path / "m" / "report.md").read_text()
-    assert re.search(r"\| radii\[0\] \[mm\] .*\| not physical \|", text)
 
 
 def test_rows_outside_the_domain_count_for_no_radius(log, tmp_path):
@@ -115,6 +90,7 @@ def playful():
     return robot, datasets.Log(q, x, groups, time=np.tile(np.arange(20.0), 8))
 
 
+@pytest.mark.slow
 def test_play_lowers_the_errors_of_auto_on_held_out_motions(playful):
     robot, log = playful
     settings = workflow.FitSettings(n_folds=2, play=4e-4)
@@ -141,21 +117,6 @@ def test_play_is_tried_by_itself_where_the_order_of_the_rows_matters(playful):
     with torch.no_grad():
         x = robot.chain(torch.from_numpy(log.q)).numpy()
     assert play_of(replace(log, x=x)) is None
-
-
-def test_an_actuator_that_never_moved_is_held_where_it_was():
-    data = datasets.load_trunk()
-    q = data.q[:200].copy()
-    q[:, 4] = 0.25
-    chain = robots.bionic_handling_assistant()
-    with pytest.warns(UserWarning, match=r"no motion along \+1 q\[4\]"):
-        model = HybridForwardModel(chain, "linear").fit(q, data.x[:200])
-    loaded = workflow.LoadedModel("trunk", Path("trunk"), model)
-    limits = workflow.path_limits(loaded)
-    assert limits.q_min == pytest.approx(q.min(axis=0))
-    assert limits.q_max == pytest.approx(q.max(axis=0))
-    assert limits.source == "training range"
-    assert model.module_.in_domain(torch.from_numpy(Domain(loaded, limits).sample[0])).all()
 
 
 @pytest.mark.slow
