@@ -21,7 +21,6 @@ from hybridkin import (
     calibrate,
     fit_play,
     load_model,
-    plots,
     save_model,
     tasks,
 )
@@ -82,11 +81,6 @@ def inverse(build, q):
     ]
 
 
-def of_numpy():
-    task = tasks.PositionTask.from_numpy(lambda q: q**2, lambda q: 2 * q[..., None] * np.eye(3))
-    return InverseKinematics(task).solve(np.ones(3), q0=0.5 * np.ones(3)).q
-
-
 def calibrated(*parameters, **options):
     rows = (torch.from_numpy(Q), torch.from_numpy(X)) if options.pop("tensors", 0) else (Q, X)
     result = calibrate(trunk(), *rows, parameters, **options)
@@ -111,12 +105,6 @@ def saved(folder):
     for twin in (load_model(folder / "hybrid"), pickle.loads(pickle.dumps(model))):
         found += [*predictions(twin, Q).values()]
     return found
-
-
-def drawn():
-    body = plots.BackboneDisplay.from_estimator(trunk(), Q[:2]).plot()
-    errors = plots.ErrorHistogramDisplay.from_predictions(X, {"a": Q}).plot()
-    return [body.points, errors.errors["a"]]
 
 
 NETWORK = ELMRegressor(4, random_state=0)

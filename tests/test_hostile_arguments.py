@@ -23,7 +23,6 @@ from entry_points import (
     POINTS,
     ROBOT,
     SAVED,
-    TRACK,
     Q,
     X,
     fuzz,
@@ -60,7 +59,6 @@ from hybridkin import (
 )
 from hybridkin.calibration.choice import choose_geometry
 from hybridkin.datasets import Log, check_log, paper_split
-from hybridkin.plots import ErrorHistogramDisplay, TrackingDisplay
 from hybridkin.workflow import FitSettings
 
 
@@ -120,9 +118,6 @@ BODY = {
     "predicted": DISPLAYED.tips + 0.01,
     "rigid": False,
 }
-
-
-FILM = {"x": X, "target": X, "t": np.arange(24.0), "rows": np.arange(0, 24, 8), "name": "tip"}
 
 
 CALIBRATE = {
@@ -217,7 +212,6 @@ ENTRIES = {
         for name, (chain, q) in CHAINS.items()
         for method in (ROW_BY_ROW[type(chain)] + " check_actuators contradiction").split()
     },
-    "ConstantCurvatureChain.with_tip": (tendon_chain().with_tip, {"at": 1.5}),
     "ConstantCurvatureChain.with_markers": (
         tendon_chain().with_markers,
         {"markers": [(0, 0.5, np.array([0.01, 0.0, 0.0])), (1, 1.0)]},
@@ -241,13 +235,8 @@ ENTRIES = {
         PlayOperator(0.01).apply_by_group,
         {"q": Q, "groups": GROUPS},
     ),
-    "robots.bionic_handling_assistant": (robots.bionic_handling_assistant, {"tool": 0.1}),
     "robots.from_toml": (robots.from_toml, {"path": ROBOT}),
     "robots.read_description": (robots.read_description, {"path": ROBOT}),
-    "trajectories.Trajectory": (
-        lambda t, x: repr(trajectories.Trajectory(t, x)),
-        {"t": PATH.t, "x": PATH.x},
-    ),
     "trajectories.min_jerk": (trajectories.min_jerk, {"s": np.linspace(0, 1, 5)}),
     "trajectories.figure_eight": (trajectories.figure_eight, {"size": (0.3, 0.2), **ROUND}),
     "trajectories.spiral": (
@@ -267,8 +256,6 @@ ENTRIES = {
         datasets.load_log,
         {"path": CSV, **NAMES, "groups": "g", "time": None, **READ},
     ),
-    "datasets.log_columns": (datasets.log_columns, {"path": CSV, "delimiter": None}),
-    "plots.model_color": (plots.model_color, {"name": "hybrid, ELM", "default": "#000000"}),
     "datasets.check_log": (
         lambda q, x, groups, time, **k: str(
             datasets.check_log(datasets.Log(q, x, groups, time), **k)
@@ -291,34 +278,9 @@ ENTRIES = {
         lambda unit, bins, errors: drawn(plots.ErrorHistogramDisplay(errors), unit=unit, bins=bins),
         {"errors": {"a": X[:, 0] ** 2}, "unit": "cm", "bins": 5},
     ),
-    "plots.ErrorBoxDisplay": (
-        lambda unit, errors: drawn(plots.ErrorBoxDisplay(errors), unit=unit),
-        {"errors": {"a": X[:, 0] ** 2, "b": X[:, 1] ** 2}, "unit": "mm"},
-    ),
-    "plots.ErrorHistogramDisplay.from_predictions": (
-        plots.ErrorHistogramDisplay.from_predictions,
-        {"x": X, "predictions": {"a": X + 0.01}},
-    ),
-    "plots.LearningCurveDisplay": (
-        plots.LearningCurveDisplay,  # matplotlib warns of zero errors on its logarithmic axis
-        {"sizes": np.array([5.0, 10.0]), "errors": {"a": np.array([[0.2, 0.3], [0.1, 0.2]])}},
-    ),
     "plots.TrackingDisplay": (
         lambda unit, plane, **k: drawn(plots.TrackingDisplay(**k), unit=unit, plane=plane),
         {"target": X, "tracks": {"a": X + 0.01}, "t": np.arange(24.0), "unit": "cm", "plane": "xz"},
-    ),
-    **{
-        f"plots.TrackingDisplay.{method}": (
-            lambda unit, method=method, **k: drawn(
-                plots.TrackingDisplay(**k), unit=unit, method=method
-            ),
-            {"target": X, "tracks": {"a": X + 0.01}, "t": np.arange(24.0), "unit": "cm"},
-        )
-        for method in ("plot_error", "plot_time")
-    },
-    "plots.TrackingDisplay.from_tracks": (
-        plots.TrackingDisplay.from_tracks,
-        {"tracks": {"a": TRACK}},
     ),
     "plots.ActuatorDisplay": (
         lambda unit, per_unit, **k: plots.ActuatorDisplay(**k).plot(
@@ -334,14 +296,6 @@ ENTRIES = {
             "per_unit": None,
         },
     ),
-    "plots.ActuatorDisplay.from_tracks": (
-        plots.ActuatorDisplay.from_tracks,
-        {"tracks": {"a": TRACK}, "actuators_per_segment": [3]},
-    ),
-    "plots.WorkspaceDisplay": (
-        lambda unit, **k: drawn(plots.WorkspaceDisplay(**k), unit=unit, space=True),
-        {"x": X, "predicted": X + 0.01, "backbone": X, "row": 3, "unit": "cm"},
-    ),
     "plots.BackboneDisplay": (
         lambda unit, **k: drawn(plots.BackboneDisplay(**k), unit=unit, space=True),
         {**BODY, "unit": "cm"},
@@ -349,12 +303,6 @@ ENTRIES = {
     "plots.BackboneDisplay.from_estimator": (
         lambda n_points, q: plots.BackboneDisplay.from_estimator(FITTED, q, n_points=n_points),
         {"q": Q[:2], "n_points": 3},
-    ),
-    "plots.TrackAnimation": (
-        lambda unit, frame, **k: drawn(
-            plots.TrackAnimation(**k), unit=unit, frame=frame, space=True
-        ),
-        {**FILM, "unit": "cm", "frame": 1},
     ),
     "plots.TrackAnimation.from_estimator": (
         plots.TrackAnimation.from_estimator,
@@ -598,11 +546,9 @@ ARRAYS = {
     "calibrate.weights": ("sample_weight", WEIGHTS, lambda v: radii(sample_weight=v)),
     "choose": ("candidates", Q, lambda v: choose_rows(trunk(), v, 3)[1]),
     "choose.measured": ("measured", Q, lambda v: choose_rows(trunk(), Q, 3, measured=v)[1]),
-    "choose.target": ("target", Q, lambda v: choose_rows(trunk(), Q, 3, target=v)[1]),
     "play.q": ("q", Q[:8], lambda v: fit_play(trunk(), **{**PLAY, "q": v}).cv_rmse),
     "play.x": ("x", X[:8], lambda v: fit_play(trunk(), **{**PLAY, "x": v}).cv_rmse),
     "play.width": ("width", HALF / 1e3, lambda v: PlayOperator(v).apply(Q)[0]),
-    "play.apply": ("q", Q, lambda v: PlayOperator(0.01).apply(v)[0]),
     "play.command": ("y", Q, lambda v: PlayOperator(0.01).command(v)[0]),
     "play.apply_by_group": ("q", Q, lambda v: PlayOperator(0.01).apply_by_group(v, GROUPS)),
     "hybrid.fit X": ("X", Q, lambda v: fitted(LINEAR, X=v)),
@@ -611,12 +557,10 @@ ARRAYS = {
     "hybrid.partial_fit X": ("X", Q[:4], lambda v: followed(X=v)),
     "hybrid.partial_fit y": ("y", X[:4], lambda v: followed(y=v)),
     "hybrid.predict": ("X", Q, FITTED.predict),
-    "hybrid.jacobian of rows": ("X", Q, FITTED.jacobian),
     "elm.fit X": ("X", Q, lambda v: fitted(NETWORK, X=v)),
     "elm.fit y": ("y", X, lambda v: fitted(NETWORK, y=v)),
     "elm.fit weights": ("sample_weight", WEIGHTS, lambda v: fitted(NETWORK, sample_weight=v)),
     "elm.predict": ("X", Q, NETWORK.predict),
-    "elm.leverage": ("X", Q, NETWORK.leverage),
     "elm_cv.fit X": ("X", Q, lambda v: fitted(ELMRegressorCV(4, cv=2, random_state=0), X=v)),
     "ik.q_min": ("q_min", 0.1 + HALF / 100, lambda v: solver(q_min=v)),
     "ik.q_max": ("q_max", 0.3 + HALF / 100, lambda v: solver(q_max=v)),
@@ -641,7 +585,6 @@ ARRAYS = {
     "ik.step q": ("q", Q[:3], lambda v: IK.step(v, X[:3]).dq),
     "ik.step x_target": ("x_target", X[:3], lambda v: IK.step(Q[:3], v).dq),
     "ik.step dx": ("dx", X[:3], lambda v: IK.step(Q[:3], X[:3], v).dq),
-    "ik.step dq": ("dq", Q[:3] / 1e3, lambda v: IK.step(Q[:3], X[:3], dq=v).dq),
     "ik.step x_measured": ("x_measured", X[:3], lambda v: IK.step(Q[:3], X[:3], x_measured=v).dq),
     "ik.track": ("path", X[:3], lambda v: IK.track(v, q0=Q[0]).q),
     "ik.track q0": ("q0", Q[0], lambda v: IK.track(X[:3], q0=v).q),
@@ -650,16 +593,10 @@ ARRAYS = {
     "tracker.step": ("x_target", X[1], lambda v: tracked(Q[0], v)),
     "tracker.step dx": ("dx", X[1], lambda v: tracked(Q[0], X[1], v)),
     "tracker.step x_measured": ("x_measured", X[1], lambda v: tracked(Q[0], X[1], x_measured=v)),
-    "trajectory t": ("t", HALF, lambda v: trajectories.Trajectory(v, X[:3]).t),
     "trajectory x": ("x", X[:3], lambda v: trajectories.Trajectory(HALF, v).x),
     "figure_eight": ("center", HALF, lambda v: trajectories.figure_eight(v, duration=0.1).x),
     "line": ("start", HALF, lambda v: trajectories.line(v, X[0], duration=0.1).x),
-    "min_jerk": ("s", HALF / 4, trajectories.min_jerk),
     "log.q": ("q", Q, lambda v: check_log(Log(v, X), chain=trunk()).q_range),
-    "log.x": ("x", X, lambda v: check_log(Log(Q, v), chain=trunk()).x_range),
-    "plots.x": ("x", X, lambda v: ErrorHistogramDisplay.from_predictions(v, {"a": Q}).errors["a"]),
-    "plots.errors": ("errors", X[:, 0], lambda v: ErrorHistogramDisplay({"a": v}).errors["a"]),
-    "plots.target": ("target", X, lambda v: TrackingDisplay(v, {"a": X}).target),
 }
 
 
@@ -779,8 +716,3 @@ def test_a_normal_of_any_size_gives_the_plane(size):
     circle = {"radius": 0.1, "duration": 0.2, "dt": 0.1}
     found = trajectories.spiral(X[0], normal=[0.0, size, 0.0], **circle)
     np.testing.assert_array_equal(found.x, trajectories.spiral(X[0], normal=[0, 1, 0], **circle).x)
-
-
-def test_errors_beyond_the_root_of_the_largest_number_are_drawn():
-    found = plots.ErrorHistogramDisplay.from_predictions(X, {"a": HUGE}).errors["a"]
-    assert found[3] == pytest.approx(np.sqrt(3) * 1e300)

@@ -1,6 +1,5 @@
 """Threads and forks: what belongs to the process stays as it is."""
 
-import copy
 import os
 import signal
 import threading
@@ -11,7 +10,7 @@ import pytest
 import torch
 from saved_models import trunk, trunk_log
 
-from hybridkin import ELMRegressor, ELMRegressorCV, HybridForwardModel, native
+from hybridkin import ELMRegressor, ELMRegressorCV, HybridForwardModel
 from hybridkin._core.turns import TURNS
 
 Q, X, GROUPS = trunk_log()
@@ -139,23 +138,3 @@ def test_a_child_keeps_its_number_of_threads():
         assert torch.get_num_threads() == 3
     finally:
         torch.set_num_threads(threads)
-
-
-def test_a_model_is_copied_while_another_thread_compiles_it():
-    chain = trunk()
-    stop = threading.Event()
-
-    def compile_again():
-        while not stop.is_set():
-            vars(chain).pop("_program", None)
-            native.backend(chain)
-
-    other = threading.Thread(target=compile_again)
-    other.start()
-    try:
-        for _ in range(300):
-            assert "_program" not in chain.__getstate__()
-            copy.deepcopy(chain)
-    finally:
-        stop.set()
-        other.join()

@@ -193,18 +193,6 @@ def test_turned_and_mirrored_rings_are_found_from_none(turns, clockwise, noise, 
 
 
 @pytest.mark.slow
-def test_a_mirror_image_is_found_where_only_the_base_is_free_and_it_warns(rng):
-    q = chambers(rng)
-    truth = trunk(angles=rings([0.0] * 3, (0, 1, 2)), base=planted_base())
-    start = trunk([0.09] * 3)
-    with pytest.warns(UserWarning, match="opposite direction"):
-        result = calibrate(start, q, truth(q), ("radii", "base"))
-    assert_close(result.chain(q), truth(q), rtol=0, atol=1e-9)
-    assert_close(result.chain.angles, -start.angles, rtol=0, atol=0)
-    assert_close(result.chain.radii, truth.radii, rtol=0, atol=1e-9)
-
-
-@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the calibrated model has a median")  # the noise
 @pytest.mark.parametrize(("bend", "noise"), [(1.0, 0.02), (0.01, 0.0), (0.01, 0.02)])
 @pytest.mark.parametrize("names", [("radii", "base"), ("radii", "turns", "base")])

@@ -8,7 +8,6 @@ from scipy.optimize import lsq_linear
 from torch.testing import assert_close
 
 from hybridkin import (
-    ConstantCurvatureChain,
     ElasticTendonChain,
     calibrate,
 )
@@ -147,30 +146,6 @@ def test_slack_tendons_hang(rng):
     loose = torch.full((9,), 0.1, dtype=torch.float64)
     assert chain.slack(loose).all()
     assert_close(chain.arcs(loose), (chain.lengths, chain.rest_bends), rtol=0, atol=1e-15)
-
-
-@pytest.mark.parametrize("routing", ["segment", "base"])
-def test_taut_and_soft_is_the_plain_chain(routing, rng):
-    turns = 2 * math.pi / 3 * np.arange(3) + np.array([[0.3], [1.0], [-0.5]])
-    options = {"angles": turns, "routing": routing, "offsets": [0.002, 0.003, 0.01]}
-    q = random_q(rng, 50)
-    for zeros, axial in ((0.02, 30.0), (0.05, 100.0)):
-        chain = ElasticTendonChain(
-            RADII,
-            LENGTHS,
-            tendon_zeros=zeros,
-            axial_stiffness=axial,
-            bending_stiffness=1e-14 * SQUARED,
-            **options,
-        )
-        assert not chain.slack(q).any()
-        length, bending = chain.arcs(q)
-        plain = ConstantCurvatureChain(RADII, lengths=LENGTHS, **options)
-        assert_close(bending, plain.arcs(q)[1], rtol=0, atol=1e-9)
-        expected = [
-            plain.with_geometry(lengths=own)(row) for own, row in zip(length, q, strict=True)
-        ]
-        assert_close(chain(q), torch.stack(expected), rtol=0, atol=1e-9)
 
 
 def test_tendons_may_be_renamed_and_the_robot_turned(rng):

@@ -350,23 +350,6 @@ def test_joints_that_mimic_others_are_one_actuator(rng):
         assert ik.solve(arm(q[:1]), q0=q[:1] + 0.05).converged.all()
 
 
-@pytest.mark.parametrize("end", ["base", "world"])
-def test_an_arm_of_fixed_joints_is_a_constant(end):
-    arm = RigidChain.from_urdf(URDF, end, tool=[0.1, 0.2, 0.3])
-    q = torch.zeros(4, 5, 0, dtype=torch.float64)
-    x, J = arm.forward_and_jacobian(q)
-    turn = Rotation.from_euler("xyz", [0.1, 0.2, -0.3]) if end == "base" else Rotation.identity()
-    expected = turn.apply([0.1, 0.2, 0.3]) + (end == "base") * np.array([0.1, -0.2, 0.3])
-    assert_close(x, torch.from_numpy(expected).expand(4, 5, 3), rtol=0, atol=1e-15)
-    assert_close(arm(q[0, 0]), x[0, 0], rtol=0, atol=0)
-    assert J.shape == (4, 5, 3, 0)
-    assert arm.pose_jacobian(q).shape == (4, 5, 6, 0)
-    assert_close(arm.poses(q)[..., -1, :, :], arm.pose(q))
-    assert arm.backbone(q).shape == (4, 5, 2, 3)
-    with pytest.raises(ValueError, match="`model` must have an actuator"):
-        InverseKinematics(arm)
-
-
 def test_floating_and_planar_joints_are_moves_and_turns():
     both = joint("p", "b", "c", "planar") + joint(
         "o", "a", "b", "floating", '<origin xyz="1 0 0"/>'

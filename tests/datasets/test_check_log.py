@@ -167,16 +167,6 @@ def test_columns_in_another_order_are_named(order, base_is_free):
         assert tuple(listed) == NAMES
 
 
-def test_chambers_of_negative_length_are_a_sign():
-    chain = ConstantCurvatureChain([0.05])
-    q = 0.2 + 0.02 * np.random.default_rng(0).standard_normal((50, 3))
-    x = chain(torch.from_numpy(q)).numpy()
-    for sign, advice in ((-1, "q_sign = -1"), ([1, -1, 1], "set q_sign = [1, -1, 1] in [log]")):
-        finding = datasets.check_log(Log(q * sign, x), chain=chain).errors[0]
-        assert finding.kind == "sign"
-        assert advice in finding.advice
-
-
 @pytest.mark.parametrize(
     ("q", "x", "units", "advice"),
     [

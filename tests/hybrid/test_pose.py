@@ -18,7 +18,6 @@ from hybridkin import (
     InverseKinematics,
     robots,
 )
-from hybridkin._core.model import PoseModel
 from hybridkin._core.rotations import rotation
 from hybridkin.ik.solver import IKStatus
 from hybridkin.ik.tasks import PoseTask, rotation_vector
@@ -262,31 +261,6 @@ def test_the_guard_bounds_position_and_orientation(fitted, log, monkeypatch):
 # ---------------------------------------------------------------- other robots
 
 
-class Turntable(PoseModel):
-    """A mechanical model of a user's own, without a reach."""
-
-    def pose_and_jacobian(self, q):
-        phi = torch.cat([torch.zeros_like(q[..., :1]), q], dim=-1)
-        R, left = rotation(phi)
-        T = torch.nn.functional.pad(R, (0, 1, 0, 1))
-        T = T + torch.diag(torch.tensor([0.0, 0.0, 0.0, 1.0])).to(q)
-        angular = left[..., 1:]
-        return T, torch.cat([torch.zeros_like(angular), angular], dim=-2)
-
-    def forward(self, q):
-        return torch.zeros_like(torch.cat([q, q[..., :1]], dim=-1))
-
-
-def test_a_mechanical_model_of_ones_own():
-    q = np.random.default_rng(0).uniform(-1, 1, (80, 2))
-    T = Turntable().pose(torch.from_numpy(q)).numpy()
-    errors = q @ np.array([[0.1, 0.0, 0.0, 0.2, 0.0, 0.0], [0.0, 0.0, 0.1, 0.0, 0.0, 0.3]])
-    y = rows_of(moved(T, errors[:, :3], errors[:, 3:]))
-    model = HybridForwardModel(Turntable(), LinearRegression(), output="pose").fit(q, y)
-    assert_allclose(model.predict_error(q), errors, rtol=0, atol=1e-12)
-    assert_allclose(model.predict(q), y, rtol=0, atol=1e-11)
-
-
 # ---------------------------------------------------------------- in use
 
 
@@ -335,10 +309,3 @@ class TipOnly(torch.nn.Module):
 def test_errors_name_the_way_out(log, options, kind):
     with pytest.raises(kind, match="pose"):
         pose_model().set_params(**options).fit(*log)
-
-
-@pytest.mark.parametrize("columns", [3, 7])
-def test_rows_must_hold_six_numbers(log, columns):
-    q, y = log
-    with pytest.raises(ValueError, match=r"\(N, 6\)"):
-        pose_model(calibrate=("base",)).fit(q, np.resize(y, (len(q), columns)))

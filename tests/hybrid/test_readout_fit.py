@@ -2,10 +2,10 @@ from math import inf
 
 import pytest
 import torch
+from saved_models import arm
 from torch.testing import assert_close
 
-from hybridkin import ConstantCurvatureChain, ElasticTendonChain, RigidChain, robots
-from hybridkin._core.model import ForwardModel
+from hybridkin import ConstantCurvatureChain, ElasticTendonChain, robots
 from hybridkin.hybrid._features import Features, HiddenFeatures, QuadraticFeatures, Readout
 from hybridkin.hybrid._linearised import (
     Linearised,
@@ -15,32 +15,6 @@ from hybridkin.hybrid._linearised import (
 from hybridkin.hybrid._module import HybridModule, InnerCorrection, TipCorrection
 from hybridkin.hybrid._readout_fit import _Problem, fit_readout
 from hybridkin.hybrid._rows import Rows
-
-ARM = """
-<robot name="arm">
-  <link name="base"/><link name="upper"/><link name="lower"/><link name="tool"/>
-  <joint name="yaw" type="revolute"><parent link="base"/><child link="upper"/>
-    <origin xyz="0 0 0.1"/><axis xyz="0 0 1"/><limit lower="-2" upper="2" effort="1" velocity="1"/>
-  </joint>
-  <joint name="pitch" type="revolute"><parent link="upper"/><child link="lower"/>
-    <origin xyz="0 0 0.3"/><axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="1" velocity="1"/>
-  </joint>
-  <joint name="slide" type="prismatic"><parent link="lower"/><child link="tool"/>
-    <origin xyz="0 0 0.3"/><axis xyz="1 0 0"/><limit lower="0" upper="1" effort="1" velocity="1"/>
-  </joint>
-</robot>
-"""
-
-
-class Wave(ForwardModel):
-    """A module without a Jacobian of its own."""
-
-    n_actuators = 4
-
-    def forward(self, q):
-        return torch.stack(
-            [q[..., 0].sin() + q[..., 3], q[..., 1] * q[..., 2], q.square().sum(-1)], -1
-        )
 
 
 def read_out(chain, features, q, x, sample_weight=None, groups=None, **options):
@@ -74,11 +48,9 @@ def tendons():
 
 ROBOTS = {
     "trunk": trunk,
-    "middle of the trunk": lambda: (trunk()[0].with_tip(1.5), 0.25, 0.05),
     "cables": lambda: (ConstantCurvatureChain([0.01], lengths=[0.1]), 0.0, 0.005),
     "tendons": tendons,
-    "arm": lambda: (RigidChain.from_urdf(ARM, "tool"), 0.3, 0.5),
-    "wave": lambda: (Wave(), 0.0, 1.0),
+    "arm": lambda: (arm(), 0.3, 0.5),
 }
 
 
@@ -103,18 +75,6 @@ def disturbed(chain, q, rng, size=0.02, noise=0.0):
     truth = hybrid(chain, Readout(features, weights))
     x = truth(q)
     return truth, x + noise * torch.randn(x.shape, generator=rng, dtype=x.dtype)
-
-
-def test_quadratic_features_span_all_monomials(rng):
-    q = uniform(rng, 60, 3)
-    u = (q - q.amin(0)) / (q.amax(0) - q.amin(0)) * 2 - 1
-    monomials = [torch.ones(60).double(), *u.T]
-    monomials += [u[:, i] * u[:, j] for i in range(3) for j in range(i, 3)]
-    phi = QuadraticFeatures.of_range(q)(q)
-    assert phi.shape == (60, 10)
-    assert_close(
-        phi @ torch.linalg.lstsq(phi, torch.stack(monomials, 1)).solution, torch.stack(monomials, 1)
-    )
 
 
 @pytest.mark.slow

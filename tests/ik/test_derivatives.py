@@ -123,32 +123,6 @@ def test_derivatives_in_reachable_directions_are_those_of_the_solutions(name):
     assert_close(slope_of(solve(t, start).q, t), expected, rtol=1e-8, atol=1e-8)
 
 
-@pytest.mark.parametrize(
-    ("chain", "q", "entry", "options", "h"),
-    [
-        (PLANAR, BEND, "links", TURNS, 1e-5),
-        (PAIRS, PULLS, "lengths", PULLED, 1e-6),
-        (PAIRS, PULLS, "radii", PULLED, 1e-6),
-    ],
-)
-def test_derivatives_by_the_geometry_of_deficient_robots(chain, q, entry, options, h):
-    q = torch.tensor(q, dtype=torch.float64)
-    target, value = chain(q), chain.geometry()[entry]
-    change = torch.cos(torch.arange(value.numel()).double()).view(value.shape)
-    if entry == "links":
-        change[0] = change[:, 2] = 0.0  # the arm stays in its plane
-
-    def solve(t, q0):
-        moved = chain.with_geometry(**{entry: value + t * change})
-        ik = InverseKinematics(moved, **options)
-        return ik.solve(target.clone().requires_grad_(), q0, tol=1e-9, differentiable=True)
-
-    t = torch.zeros((), dtype=torch.float64, requires_grad=True)
-    start = solve(t, q).q.detach()
-    expected = difference(solve, start, h)
-    assert_close(slope_of(solve(t, start).q, t), expected, rtol=1e-7, atol=1e-7)
-
-
 def test_singular_solutions_have_no_derivatives_and_say_so():
     tendons = ConstantCurvatureChain([0.02] * 2, lengths=[0.1] * 2, routing="base")
     bent = torch.tensor([0.004, -0.002, 0.001, 0.003, -0.004, 0.002]).double()

@@ -107,21 +107,6 @@ def test_others_are_differenced(regressor):
         assert kinks.mean() < 0.02
 
 
-def test_differences_of_two_outputs_and_their_graph():
-    X, y = data(2)
-    regressor = KernelRidge(kernel="poly", alpha=1e-3).fit(X, y)
-    module, q = error_module(regressor, torch.from_numpy(X)), torch.from_numpy(X[:6])
-    lead = q.reshape(2, 3, 3).requires_grad_()
-    x, J = module.forward_and_jacobian(lead)
-    assert_allclose(x.detach().numpy().reshape(6, 2), regressor.predict(X[:6]))
-    expected = differences(regressor.predict, X[:6])
-    assert_allclose(
-        J.numpy().reshape(6, 2, 3), expected, rtol=1e-4, atol=1e-6 * np.abs(expected).max()
-    )
-    (slope,) = torch.autograd.grad(x[..., 1].sum(), lead)
-    assert_close(slope, J[..., 1, :])
-
-
 @pytest.mark.parametrize("unit", [1e-4, 1e4])
 def test_differences_follow_the_range_of_the_inputs(unit):
     """In another unit the Jacobian is the same, counted in that unit."""

@@ -116,26 +116,6 @@ def test_arcs(counts, routing):
     check_nan_row(chain, q)
 
 
-@pytest.mark.parametrize("routing", ROUTINGS)
-@pytest.mark.parametrize("lengths", [None, [0.1] * 3, [None, 0.1, 0.1]])
-def test_pairs_and_insertions(lengths, routing):
-    counts = [3, 2, 4] if lengths is None or lengths[0] else [1, 2, 3]
-    rng = np.random.default_rng(0)
-    chain = ConstantCurvatureChain(
-        rng.uniform(0.05, 0.1, 3),
-        n_actuators=counts,
-        lengths=lengths,
-        routing=routing,
-        base=pose_of(rng),
-        offsets=rng.uniform(0.0, 0.1, 3),
-        rest_bends=rng.normal(size=(3, 2)),
-        gains=rng.uniform(0.5, 2.0, sum(counts)),
-    )
-    q = STRAIGHT + 0.06 * rng.uniform(-1, 1, (203, sum(counts)))
-    for tip in (3.0, 1.5, 0.4):
-        check(chain.with_tip(tip), q)
-
-
 @pytest.mark.parametrize("bend", [0.0, 1e-9, 1.0, 3.1415, 3.1417, 3.6, 6.3, 12.6, 1e6])
 def test_bends_of_any_size(bend):
     """Around a half turn, where the polynomial ends, and at several turns."""

@@ -212,19 +212,6 @@ def test_distance_from_other_groups(trust, n_rows):
             assert_as_in_torch(module, inputs(spread, 38))
 
 
-@pytest.mark.parametrize(("n", "m"), [(1, 1), (3, 2), (6, 3), (9, 3), (17, 64), (64, 5)])
-@pytest.mark.parametrize("n_hidden", [1, 4, 12, 101])
-def test_networks_of_any_size(n, m, n_hidden):
-    module = network("centred", m, n, n_hidden)
-    q = np.resize(CENTER, n) + 0.1 * draw(11, n)
-    program = program_of(module)
-    x, J = (part.numpy() for part in module.forward_and_jacobian(torch.from_numpy(q)))
-    for found, expected in zip(program.evaluate(q, True), (x, J), strict=False):
-        assert_close_rows(found, expected)
-    for found, expected in zip(program.evaluate(q[0], True), (x, J), strict=False):
-        assert_close_rows(found, expected[0])
-
-
 @pytest.mark.parametrize("path", STORED, ids=lambda path: path.stem)
 def test_stored_models_of_every_kind(path):
     model = load_model(path)

@@ -45,18 +45,6 @@ def test_equal_arrays_are_written_once(tmp_path, kind, fitted):
     assert len({(a.shape, a.dtype.name, a.tobytes()) for a in arrays}) == len(arrays)
 
 
-def test_shared_parts_are_shared_again(tmp_path, fitted):
-    for kind in ("parallel_elm", "serial_pose"):
-        save_model(fitted[kind][0], tmp_path / kind)
-    network = load_model(tmp_path / "parallel_elm")
-    correction = network.module_.corrections[0]
-    assert correction.guard.model is correction.module
-    serial = load_model(tmp_path / "serial_pose")
-    correction = serial.module_.corrections[0]
-    assert correction.module.features.chain is serial.mechanical_model_
-    assert serial.mechanical_model is not serial.mechanical_model_
-
-
 def test_entries_are_checked_when_they_are_read():
     arrays = {"a": np.zeros((2, 3)), "b": np.zeros(3), "n": np.full(2, np.nan)}
     stored = Stored.of("thing", {**arrays, "i": np.arange(3)}, count=3, flag=True, names=["x", 1])

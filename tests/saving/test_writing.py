@@ -74,19 +74,6 @@ def test_links_stay_and_their_targets_are_written(tmp_path, there):
     assert [path.name for path in (tmp_path / "folder").iterdir()] == ["model"]
 
 
-@posix
-def test_permissions_are_kept_or_follow_the_mask(tmp_path):
-    path, mask = tmp_path / "model", os.umask(0o027)
-    try:
-        save_model(trunk(), path)
-        assert stat.S_IMODE(path.stat().st_mode) == 0o640
-        path.chmod(0o604)
-        save_model(trunk(), path)
-        assert stat.S_IMODE(path.stat().st_mode) == 0o604
-    finally:
-        assert os.umask(mask) == 0o027
-
-
 def test_content_is_on_the_disk_before_the_name_and_the_name_after(tmp_path, monkeypatch):
     steps, replace, fsync = [], os.replace, os.fsync
 

@@ -18,7 +18,6 @@ from hybridkin import (
     workflow,
 )
 from hybridkin.cli.main import main
-from hybridkin.hybrid.estimator import fit_quietly
 from hybridkin.workflow.compare import Mechanical, compare_by_group, with_play_detected
 from hybridkin.workflow.domain import Domain
 from hybridkin.workflow.log import checked
@@ -51,29 +50,6 @@ def log(tmp_path):
     header = "l1,l2,l3,l4,l5,l6,x,y,z,motion"
     np.savetxt(path, rows, delimiter=",", header=header, comments="", fmt="%.6f")
     return path, robot
-
-
-def test_rows_outside_the_domain_count_for_no_radius(log, tmp_path):
-    path, robot = log
-    form = robots.read_description(robot).log
-    data = workflow.read_log(path, replace(form, groups="motion"))
-    model = HybridForwardModel(robots.from_toml(robot), "linear", coverage=0.8, guard="box")
-    fit_quietly(model, data.q, data.x, groups=data.groups)
-    save_model(model, tmp_path / "model.safetensors")
-    rows = np.loadtxt(path, delimiter=",", skiprows=1)
-    rows[rows[:, 9] == 1, 0] += 160.0  # all of this motion, outside the training range
-    names = "l1,l2,l3,l4,l5,l6,x,y,z,motion"
-    np.savetxt(path, rows, "%.6f", ",", header=names, comments="")
-    new = workflow.read_log(path, replace(form, groups="motion"))
-    loaded = workflow.open_model(tmp_path / "model.safetensors", robot)
-    report = workflow.evaluate_log(loaded, new, force=True)
-    motions = report.record.motions
-    shares = {float(name): entry.share_in_radius for name, entry in motions.items()}
-    assert np.isnan(shares.pop(1.0))
-    assert report.record.all.share_in_radius == pytest.approx(np.mean([*shares.values()]))
-    assert re.search(r"\| 1[.0]* +\|.*\| +0 \| +- \|", report.markdown())
-    text = " ".join(report.plain().split())
-    assert "covers 80 % of the tips inside the domain. Rows without a radius" in text
 
 
 @pytest.fixture(scope="module")
