@@ -110,8 +110,8 @@ class Search:
         if cold and len(q) > 0:
             q = self._beside_singular_start(q, target)
         best = self._attempt(q, target)
-        stuck = ~best.reached & row_gram(best.J).is_singular
-        rows = stuck.nonzero()[:, 0]
+        missed = (~best.reached).nonzero()[:, 0]
+        rows = missed[row_gram(best.J[missed]).is_singular]
         nudged = self._nudged(best)[rows]
         self._try_again(best, rows, nudged[:, None])
         if restarts > 0:
