@@ -83,21 +83,22 @@ class Rows(NamedTuple):
 
     def residual(self, chain: Chain) -> NDArray:
         """Return the coordinate errors (M, 3), predicted minus measured."""
-        return points(evaluate(chain, self.q.numpy())[0] - self.x.numpy())[self.seen]
+        predicted = evaluate(chain, self.q.numpy())[0]
+        return points(predicted - self.x.numpy())[self.seen]
 
     def jacobian(self, problem: Problem, theta: NDArray, chain: Chain) -> NDArray:
         """Return the derivative of the residual, times the roots of the weights, (3 M, P)."""
         with torch.no_grad():
             tangents = problem.tangents(torch.from_numpy(theta).to(self.q))
             J = chain.geometry_jacobian(self.q, tangents).unflatten(1, (-1, 3))
-        J = J.numpy()[self.seen] * np.sqrt(self.weights)[:, None, None]
-        return J.reshape(-1, theta.size)
+        roots = np.sqrt(self.weights)[:, None, None]
+        weighted = roots * J.numpy()[self.seen]
+        return weighted.reshape(-1, theta.size)
 
     def rmse(self, chain: Chain) -> float:
         """Return the root mean square tip distance of a chain [m]."""
-        return float(
-            np.sqrt(np.average(_squares(self.residual(chain)), weights=self.weights))
-        )
+        squares = _squares(self.residual(chain))
+        return float(np.sqrt(np.average(squares, weights=self.weights)))
 
     def noise(self, residual: NDArray, robust: bool) -> float:
         """Return the standard deviation of one coordinate, from the median if robust."""
@@ -106,7 +107,8 @@ class Rows(NamedTuple):
         if not robust:
             return float(np.sqrt(np.average(squares, weights=weight) / 3.0))
         order = np.argsort(squares)
-        middle = np.searchsorted(np.cumsum(weight[order]), 0.5 * weight.sum())
+        counts = np.cumsum(weight[order])
+        middle = np.searchsorted(counts, 0.5 * weight.sum())
         return float(np.sqrt(squares[order][middle] / _MEDIAN))
 
 
@@ -125,9 +127,9 @@ def row_loss(z: NDArray, weight: NDArray, loss: str) -> NDArray:
     rows, prior = np.split(z, [3 * len(weight)])
     s = rows.reshape(-1, 3).sum(axis=1) / (3.0 * weight)
     rho, slope, bend = LOSSES[loss](s)
-    scales = np.repeat([weight * rho, slope, bend * s / 3.0], 3, axis=1)
-    scales[2] /= np.maximum(rows, np.finfo(np.float64).tiny)
-    return np.hstack([scales, [prior, np.ones_like(prior), np.zeros_like(prior)]])
+    of_rows = np.repeat([weight * rho, slope, bend * s / 3.0], 3, axis=1)
+    of_rows[2] /= np.maximum(rows, np.finfo(np.float64).tiny)
+    return np.hstack([of_rows, _linear(prior)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,11 +176,12 @@ def solve(
 
     def whitened(theta: NDArray, sigma: float) -> NDArray:
         _, residual = chain_and_residual(theta.tobytes())
-        prior = theta / problem.prior_std
-        return np.concatenate([(root * residual).ravel() / sigma, prior])
+        of_rows = (root * residual).ravel() / sigma
+        return np.concatenate([of_rows, theta / problem.prior_std])
 
     def slope(theta: NDArray, sigma: float) -> NDArray:
-        return np.vstack([jacobian(theta) / sigma, np.diag(1.0 / problem.prior_std)])
+        of_prior = np.diag(1.0 / problem.prior_std)
+        return np.vstack([jacobian(theta) / sigma, of_prior])
 
     functions: dict[str, Any] = {"jac": slope}
     if robust:

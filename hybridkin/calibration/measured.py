@@ -21,9 +21,11 @@ def check_finite(**arrays: ArrayLike) -> None:
     """Raise if rows of numbers hold NaN or infinity."""
     for name, values in arrays.items():
         rows = np.asarray(values)
-        if rows.ndim not in (1, 2) or rows.dtype.kind != "f" or countable(rows).all():
+        if rows.ndim not in (1, 2) or rows.dtype.kind != "f":
             continue
         bad = ~countable(rows.reshape(len(rows), -1)).all(axis=1)
+        if not bad.any():
+            continue
         raise ValueError(
             f"`{name}` must be finite, got NaN or infinity in {bad.sum()} of {len(rows)} rows "
             f"(first: row {bad.argmax()}); leave these rows out (np.isfinite finds them), or "
@@ -33,12 +35,15 @@ def check_finite(**arrays: ArrayLike) -> None:
 
 def points(x: NDArray) -> NDArray:
     """Return rows x (N, 3 K) of K points as (N, K, 3), rows of another length m as (N, 1, m)."""
-    return x.reshape(len(x), -1, 3 if x.shape[1] % 3 == 0 else x.shape[1])
+    n_columns = x.shape[1]
+    size = n_columns if n_columns % 3 else 3
+    return x.reshape(len(x), -1, size)
 
 
 def distances(a: NDArray, b: NDArray) -> NDArray:
     """Return the distances (N, K) of the points of two sets of rows (N, m) or (N,)."""
-    return np.linalg.norm(points((a - b).reshape(len(a), -1)), axis=2)
+    difference = (a - b).reshape(len(a), -1)
+    return np.linalg.norm(points(difference), axis=2)
 
 
 def distance(a: NDArray, b: NDArray) -> NDArray:
@@ -51,12 +56,13 @@ def with_missing_markers(x: NDArray, name: str) -> NDArray:
 
     Raise if a row has no complete marker, or if numbers are infinite.
     """
-    missing = np.any(np.isnan(points(x)), axis=2)
-    allowed = missing & ~np.all(missing, axis=1, keepdims=True)
-    check_finite(
-        **{name: np.where(allowed[..., None], 0.0, points(x)).reshape(x.shape)}
-    )
-    return np.where(missing[..., None], np.nan, points(x)).reshape(x.shape)
+    markers = points(x)
+    missing = np.isnan(markers).any(axis=2, keepdims=True)
+    # A marker may be missing where another one of the row is complete.
+    allowed = missing & ~missing.all(axis=1, keepdims=True)
+    required = np.where(allowed, 0.0, markers)
+    check_finite(**{name: required.reshape(x.shape)})
+    return np.where(missing, np.nan, markers).reshape(x.shape)
 
 
 def check_unscaled(name: str, values: NDArray, meant: str) -> None:
@@ -64,12 +70,13 @@ def check_unscaled(name: str, values: NDArray, meant: str) -> None:
     if len(values) < 3:
         return
     rows = values.astype(np.float64, copy=False)
-    low, high, mean, std = (f(rows, axis=0) for f in (np.min, np.max, np.mean, np.std))
-    standard = np.abs([mean, std - 1.0]).max() < 1e-3
-    if standard or (
-        np.isin(low, (0.0, -1.0)).all() and np.abs(high - 1.0).max() < 1e-6
-    ):
-        scaler = "StandardScaler" if standard else "MinMaxScaler"
+    mean = rows.mean(axis=0)
+    std = rows.std(axis=0)
+    is_standard = np.abs([mean, std - 1.0]).max() < 1e-3
+    from_low = np.isin(rows.min(axis=0), (0.0, -1.0)).all()
+    to_one = np.abs(rows.max(axis=0) - 1.0).max() < 1e-6
+    if is_standard or (from_low and to_one):
+        scaler = "StandardScaler" if is_standard else "MinMaxScaler"
         raise ValueError(
             f"`{name}` must hold {meant} for this mechanical model, but looks like the output of "
             f"{scaler}; take it out of the pipeline. Error models scale their inputs themselves; "
@@ -84,7 +91,10 @@ def folds(
 
     Rows are always shuffled, groups only if `shuffle`.
     """
-    n_folds = min(most, len(X) if groups is None else len(np.unique(groups)))
+    n_groups = len(X)
+    if groups is not None:
+        n_groups = len(np.unique(groups))
+    n_folds = min(most, n_groups)
     if n_folds < 2:
         raise ValueError(
             "`groups` must hold at least two motions, so that one can be held out, got one; record "
@@ -92,7 +102,8 @@ def folds(
         )
     if groups is None:
         return [*KFold(n_folds, shuffle=True, random_state=0).split(X)]
-    splitter = GroupKFold(n_folds, shuffle=shuffle, random_state=0 if shuffle else None)
+    random_state = 0 if shuffle else None
+    splitter = GroupKFold(n_folds, shuffle=shuffle, random_state=random_state)
     with TURNS.filters:
         return [*splitter.split(X, groups=groups)]
 
@@ -110,7 +121,8 @@ def inner_and_outer(X: NDArray) -> tuple[NDArray, NDArray]:
     """
     axes, spread, _ = np.linalg.svd(X - X.mean(axis=0), full_matrices=False)
     excited = spread > _EXCITED * spread.max(initial=0.0)
-    order = np.argsort(np.linalg.norm(axes[:, excited], axis=1), kind="stable")
-    return np.sort(order[: max(1, int(_INNER * len(X)))]), np.sort(
-        order[int(_BEYOND * len(X)) :]
-    )
+    distance_from_mean = np.linalg.norm(axes[:, excited], axis=1)
+    order = np.argsort(distance_from_mean, kind="stable")
+    n_inner = max(1, int(_INNER * len(X)))
+    first_outer = int(_BEYOND * len(X))
+    return np.sort(order[:n_inner]), np.sort(order[first_outer:])

@@ -89,14 +89,15 @@ def arc_geometry(
     S = radii.numel()
     counts = actuator_counts(n_actuators, S)
     warn_millimetres("radii", radii, 1.0)
+    each = gains
     if not _is_nested(gains) and np.shape(gains) == (S,):
-        gains = np.repeat(real_array(gains, "gains"), counts)
+        each = np.repeat(real_array(gains, "gains"), counts)
     geometry = {
         "radii": radii,
         "angles": flat_angles(angles, counts, dtype),
         "offsets": filled(offsets, "offsets", dtype, (S,)),
         "rest_bends": filled(rest_bends, "rest_bends", dtype, (S, 2)),
-        "gains": filled(gains, "gains", dtype, (sum(counts),)),
+        "gains": filled(each, "gains", dtype, (sum(counts),)),
         "base": pose(base, "base", dtype),
     }
     extensible = (lengths is None,) * S

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -175,11 +175,9 @@ class WithoutDerivative(torch.autograd.Function):
 
     @staticmethod
     def vmap(
-        info: VmapInfo,
-        in_dims: tuple[int | None, ...],
-        find: Callable[..., Tensor],
-        *tensors: Tensor,
+        info: VmapInfo, in_dims: tuple[int | None, ...], *args: Any
     ) -> tuple[Tensor, int]:
+        find, *tensors = args
         results = []
         for k in range(info.batch_size):
             parts = []

@@ -103,16 +103,20 @@ def misses(chain: ArcChain, qs: NDArray, x: NDArray, base_is_free: bool) -> NDAr
         turn, trace = nearest_rotation(measured.mT @ tips)
         size = tips.square().sum((-2, -1)).clamp(min=torch.finfo(tips.dtype).tiny)
         tips = (trace / size)[:, None, None] * tips @ turn.mT
-    squares = (tips - measured).square().sum(-1).mean(-1)
-    return (squares / measured.square().sum(-1).mean()).sqrt().numpy()
+    squared_error = (tips - measured).square().sum(-1).mean(-1)
+    squared_size = measured.square().sum(-1).mean()
+    return (squared_error / squared_size).sqrt().numpy()
 
 
 def base_turn(chain: ArcChain, q: NDArray, x: NDArray) -> tuple[float, float]:
     """Return the rotation of the base about its axis that fits the tips, and its tilt [deg]."""
     tips, measured = _centred(chain, q[None], x)
     base = chain.base[:3, :3].double()
-    turn = (base.mT @ rigid_motion(tips[0], measured)[:3, :3] @ base).numpy()
-    twist = np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
+    motion = rigid_motion(tips[0], measured)[:3, :3]
+    turn = (base.mT @ motion @ base).numpy()
+    sine = turn[1, 0] - turn[0, 1]
+    cosine = turn[0, 0] + turn[1, 1]
+    twist = np.arctan2(sine, cosine)
     tilt = np.arccos(np.clip(turn[2, 2], -1.0, 1.0))
     return float(np.degrees(twist)), float(np.degrees(tilt))
 
@@ -121,9 +125,10 @@ def _centred(chain: ArcChain, qs: NDArray, x: NDArray) -> tuple[Tensor, Tensor]:
     """Return the tips (K, N, 3) of the chain and the measured ones, each minus their mean."""
     rows = torch.from_numpy(np.ascontiguousarray(qs, dtype=np.float64))
     with torch.no_grad():
-        tips = chain(rows.flatten(0, 1)).double().reshape(*rows.shape[:2], 3)
+        tips = chain(rows).double()
     measured = torch.from_numpy(np.asarray(x, dtype=np.float64))
-    return tips - tips.mean(dim=1, keepdim=True), measured - measured.mean(dim=0)
+    centred_tips = tips - tips.mean(dim=1, keepdim=True)
+    return centred_tips, measured - measured.mean(dim=0)
 
 
 def better_way(

@@ -85,5 +85,7 @@ def _features(q: NDArray, chain: ArcChain | None) -> NDArray:
 
 def _left(features: NDArray, x: NDArray) -> float:
     """Return the rms residual of x by least squares over the rms of x about its mean."""
-    residual = x - features @ np.linalg.lstsq(features, x, rcond=None)[0]
-    return float(np.sqrt((residual**2).sum() / ((x - x.mean(axis=0)) ** 2).sum()))
+    weights, *_ = np.linalg.lstsq(features, x, rcond=None)
+    residual = x - features @ weights
+    centred = x - x.mean(axis=0)
+    return float(np.linalg.norm(residual) / np.linalg.norm(centred))

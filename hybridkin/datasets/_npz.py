@@ -7,11 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-# Bytes of content allowed in any file; or ratio to the file's size.
-_MOST, _RATIO = (
-    2**28,
-    100,
-)
+_MOST = 2**28  # bytes of content allowed in any file
+_RATIO = 100  # of larger content to the file's size
 
 
 def check_expansion(path: Path, size: int) -> None:
