@@ -94,6 +94,7 @@ def test_a_tied_log_warns_in_actuator_terms():
         model.fit(q, measured(nominal, q))
 
 
+@pytest.mark.slow
 def test_rows_held_out_of_a_long_log_are_predicted_from_evenly_spaced_others():
     """Of many rows 500 calibrate: with exact tips they give the robot, with noise nearly."""
     truth = bent(base=moved_base())

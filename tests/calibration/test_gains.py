@@ -116,6 +116,7 @@ def test_the_unit_of_q_changes_no_calibration(elastic):
     assert_close(ours.std_errors["radii"], theirs.std_errors["radii"], rtol=1e-6, atol=0)
 
 
+@pytest.mark.slow
 def test_auto_calibrates_the_gain_beside_the_radii():
     """A gain off by 27 % is not hidden in radii that count as identified."""
     q, x = measured(tendon_robot(), 0)

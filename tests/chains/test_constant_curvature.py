@@ -318,7 +318,7 @@ def test_splitting_a_segment_changes_nothing(rng):
     assert_close(halves(torch.cat([q / 2, q], 1)), whole(q), rtol=1e-13, atol=1e-14)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), turns=st.integers(0, 2), spread=st.sampled_from([1.0, 1e-6]))
 def test_a_third_of_a_turn_permutes_the_actuators(seed, turns, spread):
     rng = torch.Generator().manual_seed(seed)

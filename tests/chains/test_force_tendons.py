@@ -102,6 +102,7 @@ def test_first_and_second_derivatives_in_torch():
     assert torch.autograd.gradcheck(lambda q: chain(arcs=1).forward_and_jacobian(q)[1], rows)
 
 
+@pytest.mark.slow
 def test_geometry_jacobian_against_differences():
     body = chain(arcs=2).with_markers([(0, 0.4, (0.01, 0.0, 0.02)), (1, 1.0)])
     q = forces(1)

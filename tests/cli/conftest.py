@@ -7,6 +7,12 @@ from simulated_log import FIT, ROBOT, rows, write
 from hybridkin.cli.main import main
 
 
+def pytest_itemcollected(item):
+    """Mark what needs the one fit, which takes seconds."""
+    if "fitted" in item.fixturenames:
+        item.add_marker(pytest.mark.slow)
+
+
 @pytest.fixture
 def robot(tmp_path):
     path = tmp_path / "robot.toml"

@@ -165,6 +165,7 @@ def test_evaluate_knows_where_the_motions_of_play_begin(playful, tmp_path, capsy
     assert "order of time, but 14 rows" in errors
 
 
+@pytest.mark.slow
 def test_code_and_trackers_tell_unit_sign_and_backlash_of_q(playful, tmp_path, capsys):
     out = tmp_path / "c"
     export = ["export", playful, "--out", out, "--name", "robot", "--dt", "0.01"]

@@ -103,6 +103,7 @@ int main(void) {
 
 
 @needs_cc
+@pytest.mark.slow
 @pytest.mark.parametrize("start", [0.0, 0.005])  # straight; all tendons slack
 def test_on_tendons_that_only_pull_it_arrives_as_in_python(tmp_path, start):
     chain = ElasticTendonChain([0.01] * 3, [0.1] * 3)

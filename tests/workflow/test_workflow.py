@@ -77,6 +77,7 @@ def test_play_lowers_the_errors_of_auto_on_held_out_motions(playful):
     assert all(choice["hybrid, auto"].endswith("backlash 0.4 mm") for choice in choices)
 
 
+@pytest.mark.slow
 def test_play_is_tried_by_itself_where_the_order_of_the_rows_matters(playful):
     robot, log = playful
 
