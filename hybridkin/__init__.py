@@ -15,6 +15,10 @@ if TYPE_CHECKING:
     from hybridkin.chains.elastic_tendons import ElasticTendonChain
     from hybridkin.chains.force_tendons import ForceTendonChain
     from hybridkin.chains.play import PlayOperator, PlayState
+    from hybridkin.chains.prandtl_ishlinskii import (
+        HysteresisState,
+        PrandtlIshlinskiiOperator,
+    )
     from hybridkin.chains.rigid import RigidChain
     from hybridkin.hybrid.choose_rows import choose_rows
     from hybridkin.hybrid.estimator import HybridForwardModel
@@ -36,12 +40,14 @@ __all__ = [
     "ForceTendonChain",
     "ForwardModel",
     "HybridForwardModel",
+    "HysteresisState",
     "IKSolution",
     "IKStatus",
     "InverseKinematics",
     "PlayFit",
     "PlayOperator",
     "PlayState",
+    "PrandtlIshlinskiiOperator",
     "RigidChain",
     "Step",
     "Track",
@@ -72,6 +78,7 @@ _NAMES_OF = {
     "chains.elastic_tendons": ("ElasticTendonChain",),
     "chains.force_tendons": ("ForceTendonChain",),
     "chains.play": ("PlayOperator", "PlayState"),
+    "chains.prandtl_ishlinskii": ("HysteresisState", "PrandtlIshlinskiiOperator"),
     "chains.rigid": ("RigidChain",),
     "hybrid.choose_rows": ("choose_rows",),
     "hybrid.estimator": ("HybridForwardModel",),

@@ -39,9 +39,11 @@ from hybridkin import (
     ELMRegressorCV,
     ForceTendonChain,
     HybridForwardModel,
+    HysteresisState,
     InverseKinematics,
     PlayOperator,
     PlayState,
+    PrandtlIshlinskiiOperator,
     RigidChain,
     as_forward_model,
     calibrate,
@@ -234,6 +236,18 @@ ENTRIES = {
     "PlayOperator.apply_by_group": (
         PlayOperator(0.01).apply_by_group,
         {"q": Q, "groups": GROUPS},
+    ),
+    "PrandtlIshlinskiiOperator": (
+        PrandtlIshlinskiiOperator,
+        {"widths": np.array([0.0, 0.1, 0.2]), "slopes": np.array([0.3, 0.8])},
+    ),
+    "PrandtlIshlinskiiOperator.apply": (
+        PrandtlIshlinskiiOperator([0.0, 0.1], [0.3]).apply,
+        {"q": Q, "state": HysteresisState(Q[0], Q[0], Q[:2])},
+    ),
+    "PrandtlIshlinskiiOperator.command": (
+        PrandtlIshlinskiiOperator([0.0, 0.1], [0.3]).command,
+        {"y": Q, "state": HysteresisState(Q[0], Q[0], Q[:2])},
     ),
     "robots.from_toml": (robots.from_toml, {"path": ROBOT}),
     "robots.read_description": (robots.read_description, {"path": ROBOT}),

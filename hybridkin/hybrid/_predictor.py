@@ -21,7 +21,7 @@ from hybridkin._core.plausible import PlausibleRows
 from hybridkin._core.units import motion_message
 from hybridkin.calibration.calibrate import CalibrationResult
 from hybridkin.chains.chain import Chain
-from hybridkin.chains.play import PlayOperator
+from hybridkin.chains.hysteresis import HysteresisOperator
 from hybridkin.hybrid._adapt import Change
 from hybridkin.hybrid._drift import Drift
 from hybridkin.hybrid._fit import known_tips
@@ -51,7 +51,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     mechanical_model_: ForwardModel | None
     calibration_: CalibrationResult | None
     cv_results_: CvResults | None
-    play_: PlayOperator | None
+    play_: HysteresisOperator | None
     radius_: Radius | None
     _learned: Learned
     _noise: float

@@ -7,6 +7,7 @@ from typing import Any, cast
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from sklearn.base import BaseEstimator
 from sklearn.kernel_ridge import KernelRidge
 from sklearn.linear_model import LinearRegression
@@ -30,7 +31,9 @@ from hybridkin.chains import (  # noqa: F401
     force_tendons,
     rigid,
 )
+from hybridkin.chains.hysteresis import HysteresisOperator
 from hybridkin.chains.play import PlayOperator
+from hybridkin.chains.prandtl_ishlinskii import PrandtlIshlinskiiOperator
 from hybridkin.hybrid._adapt import Change
 from hybridkin.hybrid._drift import Drift
 from hybridkin.hybrid._radius import Radius
@@ -81,7 +84,7 @@ def stored_hybrid(model: HybridForwardModel) -> Stored:
             },
             **model.change_._asdict(),
             "training_range": model._fitted_range,
-            "play_width": None if model.play_ is None else model.play_.width,
+            **_stored_play(model.play_),
             "radius": model.radius_,
             "fitted_rows": model._fitted_rows,
         },
@@ -99,6 +102,27 @@ def stored_hybrid(model: HybridForwardModel) -> Stored:
         rejected=model._learned.rejected,
         held_out=model._learned.held_out,
     )
+
+
+def _stored_play(operator: HysteresisOperator | None) -> dict[str, NDArray]:
+    """Return the arrays of an operator; those of none if there is no hysteresis."""
+    if isinstance(operator, PlayOperator):
+        return {"play_width": operator.width}
+    if isinstance(operator, PrandtlIshlinskiiOperator):
+        widths = operator.widths[:, None]  # a matrix: not the widths of actuators
+        return {"play_width": widths, "play_slopes": operator.slopes}
+    return {}
+
+
+def _play_of(stored: Stored, n: int) -> HysteresisOperator:
+    """Return the operator of n actuators from its arrays, see `_stored_play`."""
+    n_dimensions = stored.array("play_width").ndim
+    if n_dimensions == 2:
+        widths = stored.array("play_width", ("K", 1))[:, 0]
+        slopes = stored.array("play_slopes", (len(widths) - 1, n))
+        return PrandtlIshlinskiiOperator(widths, slopes)
+    shape = () if n_dimensions == 0 else (n,)
+    return PlayOperator(stored.array("play_width", shape))
 
 
 def hybrid_of(stored: Stored, training: object) -> HybridForwardModel:
@@ -144,10 +168,7 @@ def hybrid_of(stored: Stored, training: object) -> HybridForwardModel:
     model.calibration_ = model.play_ = model.radius_ = model._play_state = None
     model.candidates_ = None
     if "play_width" in stored.arrays:
-        shape = (n,)
-        if stored.array("play_width").ndim == 0:
-            shape = ()
-        model.play_ = PlayOperator(stored.array("play_width", shape))
+        model.play_ = _play_of(stored, n)
     if "radius" in stored.arrays:
         radius = stored.array("radius", (3,), finite=False).tolist()
         inside, coverage, n_rows = radius

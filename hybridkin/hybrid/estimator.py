@@ -25,7 +25,6 @@ from hybridkin.calibration.measured import (
 )
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.markers import MarkedChain
-from hybridkin.chains.play import PlayState
 from hybridkin.hybrid._adapt import (
     PARAMETERS,
     Change,
@@ -96,7 +95,8 @@ class HybridForwardModel(HybridPredictor):
     play : float, array-like of shape (n,) or "auto", optional
         Backlash (also called play) of the actuators [unit of q]. Rows are then commands in order of
         time, and the model maps the motion of the actuators, see `PlayOperator`. "auto" takes the
-        width with the least held-out error of an `ELMRegressorCV`, or none. Each group starts anew.
+        width with the least held-out error of an `ELMRegressorCV`, or none, and replaces it by a
+        `PrandtlIshlinskiiOperator` if that lowers the error as clearly. Each group starts anew.
         Inverse kinematics finds the motion of the actuators; ``play_.command`` gives the commands
         for it. Default: no backlash, rows in any order.
     coverage : float, optional
@@ -143,7 +143,7 @@ class HybridForwardModel(HybridPredictor):
         `partial_fit` do not change them. A model from a file has none.
     calibration_ : CalibrationResult or None
         The result of the calibration.
-    play_ : PlayOperator or None
+    play_ : PlayOperator, PrandtlIshlinskiiOperator or None
         The backlash; None if there is none, or if "auto" found no significant gain.
     radius_ : Radius or None
         With `coverage`: the radius ``inside`` the domain [m], infinite with too few groups.
@@ -271,7 +271,7 @@ class HybridForwardModel(HybridPredictor):
         spec = settings.with_geometry_chosen(rows, geometry)
         self.play_, of_play = play_of(self.play, spec, log.in_runs())
         messages += of_play
-        self._play_state: PlayState | None = None
+        self._play_state: tuple | None = None
         if self.play_ is not None:
             settings = replace(settings, commanded=rows.directions)
             spec = replace(spec, commanded=rows.directions)

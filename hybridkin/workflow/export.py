@@ -94,5 +94,5 @@ def _about_q(loaded: LoadedModel) -> str:
     return (
         f"{about_q} The robot has backlash (play) of {loaded.play.width.tolist()}, in the unit of "
         "q, for which this code does not compensate: q is the motion of the actuators, and "
-        "`PlayOperator.command` in Python shows the commands to send."
+        "`model.play_.command` in Python shows the commands to send."
     )

@@ -16,7 +16,7 @@ from hybridkin._core.model import ForwardModel, as_forward_model
 from hybridkin.chains import robots
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
-from hybridkin.chains.play import PlayOperator
+from hybridkin.chains.hysteresis import HysteresisOperator
 from hybridkin.hybrid.estimator import HybridForwardModel
 from hybridkin.hybrid.log_distance import distances
 from hybridkin.learning.elm import ELMRegressor
@@ -95,7 +95,7 @@ class LoadedModel:
         return robots.Limits(*self.hybrid.training_range_)
 
     @property
-    def play(self) -> PlayOperator | None:
+    def play(self) -> HysteresisOperator | None:
         """The backlash of the actuators, None without."""
         if self.hybrid is None:
             return None

@@ -1,0 +1,156 @@
+"""Hysteresis of actuators as a weighted sum of play operators (Prandtl-Ishlinskii)."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hybridkin._core.arrays import real_array
+from hybridkin.chains.hysteresis import HysteresisOperator
+from hybridkin.chains.play import played
+
+__all__ = ["HysteresisState", "PrandtlIshlinskiiOperator"]
+
+
+class HysteresisState(NamedTuple):
+    """State of a Prandtl-Ishlinskii operator, passed from one call to the next.
+
+    Attributes
+    ----------
+    command : array or Tensor of shape (n,)
+        Last command q [m].
+    effective : array or Tensor of shape (n,)
+        Last effective change y [m].
+    plays : array or Tensor of shape (K, n)
+        Last results of the play operators [m].
+    """
+
+    command: Any
+    effective: Any
+    plays: Any
+
+
+class PrandtlIshlinskiiOperator(HysteresisOperator[HysteresisState]):
+    """A weighted sum of play operators, for friction whose loops have no sharp corners.
+
+    With the results P_k of play operators of K widths, ``y = P_K + sum_k s_k (P_k - P_{k+1})``.
+    After a reversal the first play moves first. While plays 1 to k move, y moves s_k times as far
+    as the command; once all move, just as far. One play of width w has the slopes 0 below w and 1
+    above it.
+
+    Parameters
+    ----------
+    widths : array-like of shape (K,)
+        Widths of the play operators, ascending from zero or more [unit of q].
+    slopes : array-like of shape (K - 1,) or (K - 1, n)
+        Slopes s_k of all actuators or of each, zero or more.
+
+    Attributes
+    ----------
+    width : ndarray of shape () or (n,)
+        Largest distance between two commands with the same effective change [unit of q].
+
+    References
+    ----------
+    Krasnosel'skii & Pokrovskii, Systems with Hysteresis, Springer 1989, section 34.
+    Kuhnen, Modeling, identification and compensation of complex hysteretic nonlinearities,
+    European Journal of Control 9, 2003: the inverse.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from hybridkin import PrandtlIshlinskiiOperator
+    >>> hysteresis = PrandtlIshlinskiiOperator([0.0, 1.0], [0.5])
+    >>> y, state = hysteresis.apply(np.array([[0.0], [0.5], [2.0], [1.5]]))
+    >>> y.ravel()
+    array([0.  , 0.25, 1.75, 1.5 ])
+    >>> hysteresis.command(y)[0].ravel()
+    array([0. , 0.5, 2. , 1.5])
+    """
+
+    def __init__(self, widths: ArrayLike, slopes: ArrayLike) -> None:
+        self.widths = real_array(widths, "widths").astype(float)
+        self.slopes = real_array(slopes, "slopes").astype(float)
+        ascending = _are_valid(self.widths, (1,)) and len(self.widths) > 0
+        if not ascending or not (np.diff(self.widths) > 0.0).all():
+            raise ValueError(
+                f"`widths` must be ascending finite numbers, zero or more, got {widths!r:.200}."
+            )
+        shape = f"({len(self.widths) - 1},)"
+        valid = _are_valid(self.slopes, (1, 2))
+        if not valid or len(self.slopes) + 1 != len(self.widths):
+            raise ValueError(
+                f"`slopes` must have shape {shape}, or one such column for each actuator, and be "
+                f"finite, zero or more, got {slopes!r:.200}."
+            )
+
+        # Bounds y = P_1 + sum_k (s_k - 1) (P_k - P_{k+1}).
+        self.width = self.widths[0] + np.diff(self.widths) @ np.abs(self.slopes - 1.0)
+
+    def __repr__(self) -> str:
+        return (
+            f"PrandtlIshlinskiiOperator(widths={self.widths.tolist()}, "
+            f"slopes={self.slopes.tolist()})"
+        )
+
+    @property
+    def _size(self) -> int | str:
+        return self.slopes.shape[1] if self.slopes.ndim == 2 else "n"
+
+    def _start(self, row: NDArray) -> HysteresisState:
+        return HysteresisState(row, row, np.tile(row, (len(self.widths), 1)))
+
+    def _steps(self, rows: NDArray) -> tuple[NDArray, NDArray]:
+        """Return half the widths (K, 1), and the slopes (K, n), of which the last are 1."""
+        slopes = np.ones((len(self.widths), rows.shape[1]), rows.dtype)
+        slopes[:-1] = self.slopes.reshape(len(self.slopes), -1)
+        return 0.5 * self.widths[:, None].astype(rows.dtype), slopes
+
+    def _applied(
+        self, rows: NDArray, start: HysteresisState
+    ) -> tuple[NDArray, HysteresisState]:
+        half, slopes = self._steps(rows)
+        plays = [
+            played(rows, start.command, effective, half_width)
+            for effective, half_width in zip(start.plays, half, strict=True)
+        ]
+        result = plays[-1].copy()
+        for k, (inner, outer) in enumerate(pairwise(plays)):
+            result += slopes[k] * (inner - outer)
+        if not len(rows):
+            return result, start
+        last = np.stack([effective[-1] for effective in plays])
+        return result, HysteresisState(rows[-1], result[-1].copy(), last)
+
+    def _commanded(
+        self, rows: NDArray, start: HysteresisState
+    ) -> tuple[NDArray, HysteresisState]:
+        command, effective, plays = start
+        half, slopes = self._steps(rows)
+        actuators = np.arange(rows.shape[1])
+        result = np.empty_like(rows)
+        for t, row in enumerate(rows):
+            direction = np.sign(row - effective)
+            # Along this direction, play k moves from this command on, at this effective change.
+            begins = direction * plays + half
+            levels = np.empty_like(begins)
+            levels[0] = direction * effective
+            levels[1:] = levels[0] + np.cumsum(slopes[:-1] * np.diff(begins, axis=0), 0)
+            moving = (levels < direction * row).sum(axis=0) - 1  # the widest one
+            at = moving, actuators
+            beyond = (direction * row - levels[at]) / slopes[at]
+            ahead = direction * (begins[at] + beyond)
+            command = np.where(direction == 0.0, command, ahead)
+            plays = np.clip(plays, command - half, command + half)
+            effective = row
+            result[t] = command
+        return result, HysteresisState(command, effective, plays)
+
+
+def _are_valid(numbers: NDArray, dimensions: tuple[int, ...]) -> bool:
+    """Return whether numbers are finite, zero or more, and have so many dimensions."""
+    positive = np.isfinite(numbers) & (numbers >= 0.0)
+    return numbers.ndim in dimensions and bool(positive.all())

@@ -1,0 +1,85 @@
+"""Hybrid models of robots whose actuators have hysteresis with smooth loops."""
+
+import numpy as np
+import pytest
+import torch
+from numpy.testing import assert_allclose, assert_array_equal
+
+from hybridkin import (
+    HybridForwardModel,
+    PlayOperator,
+    PrandtlIshlinskiiOperator,
+    load_model,
+    robots,
+    save_model,
+)
+
+CHAIN = robots.bionic_handling_assistant()
+
+
+def motions(n, seed):
+    """Return commands of n motions of 40 rows, back and forth [m], and their groups."""
+    rng = np.random.default_rng(seed)
+    time = np.linspace(0.0, 2.0 * np.pi, 40)
+    waves = np.stack([np.sin(time), np.sin(2.0 * time), np.cos(time) - 1.0])
+    q = 0.25 + (rng.uniform(-0.03, 0.03, (n, 9, 3)) @ waves).transpose(0, 2, 1).reshape(-1, 9)
+    return q, np.repeat(np.arange(n), 40)
+
+
+def smooth_friction(q, groups):
+    """Return the sum of 25 plays of all widths up to 8 cm."""
+    half = np.linspace(0.0, 0.04, 25)
+    density = np.exp(-half / 0.012)
+    parts = [PlayOperator(2.0 * r).apply_by_group(q, groups) for r in half]
+    return np.tensordot(density / density.sum(), parts, 1)
+
+
+def tips(y):
+    with torch.no_grad():
+        bent = torch.from_numpy(y) + 0.03 * torch.from_numpy(y[:, ::-1] - 0.25).square()
+        return CHAIN(bent).numpy()
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    q, groups = motions(16, seed=0)
+    x = tips(smooth_friction(q, groups))
+    x += 5e-4 * np.random.default_rng(1).standard_normal(x.shape)
+    model = HybridForwardModel(CHAIN, "quadratic", coupling="serial", play="auto")
+    return model.fit(q, x, groups=groups)
+
+
+@pytest.mark.slow
+def test_smooth_loops_take_more_than_one_play(fitted):
+    q, groups = motions(6, seed=2)
+    x = tips(smooth_friction(q, groups))
+    assert isinstance(fitted.play_, PrandtlIshlinskiiOperator)
+    error = np.linalg.norm(fitted.predict(q, groups=groups) - x, axis=1).mean()
+    train, train_groups = motions(16, seed=0)
+    single = HybridForwardModel(CHAIN, "quadratic", coupling="serial", play=0.02)
+    single.fit(train, tips(smooth_friction(train, train_groups)), groups=train_groups)
+    before = np.linalg.norm(single.predict(q, groups=groups) - x, axis=1).mean()
+    assert error < 0.25 * before
+
+
+@pytest.mark.slow
+def test_commands_of_the_fitted_operator(fitted):
+    y, _ = motions(1, seed=3)
+    q, _ = fitted.play_.command(y)
+    assert_allclose(fitted.play_.apply(q)[0], y, rtol=0.0, atol=1e-9)
+    reached = [tips(smooth_friction(sent, np.zeros(len(y)))) for sent in (q, y)]
+    with torch.no_grad():
+        promised = fitted.module_(torch.from_numpy(y)).numpy()
+    errors = [np.linalg.norm(x - promised, axis=1).mean() for x in reached]
+    assert errors[0] < 0.2 * errors[1]
+
+
+@pytest.mark.slow
+def test_a_file_holds_the_operator(fitted, tmp_path):
+    q, groups = motions(2, seed=4)
+    save_model(fitted, tmp_path / "model.safetensors")
+    loaded = load_model(tmp_path / "model.safetensors")
+    assert_array_equal(loaded.play_.slopes, fitted.play_.slopes)
+    assert_array_equal(loaded.play_.widths, fitted.play_.widths)
+    expected = fitted.predict(q, groups=groups)
+    assert_array_equal(loaded.predict(q, groups=groups), expected)
