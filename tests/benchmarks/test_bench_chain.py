@@ -1,10 +1,13 @@
 """Chains alone: tip and Jacobian in one pass against automatic derivation and another library."""
 
+from functools import partial
+
 import pytest
 import torch
 from torch.testing import assert_close
 
 from hybridkin import ConstantCurvatureChain, ElasticTendonChain, RigidChain, jacobian
+from hybridkin.native.library import evaluate
 
 
 @pytest.mark.slow
@@ -55,6 +58,19 @@ def test_tendons_that_can_only_pull(race, batch, what):
         lambda: peer(q),
         rows=batch,
         at_most=goal,
+    )
+
+
+def test_one_configuration(race, chain, draw, arm):
+    q = draw(1)[0]
+    x, J = chain.forward_and_jacobian(q)
+    assert_close(J, jacobian(lambda q: chain(q), q))
+    assert_close(x, chain(q))
+    race(
+        "chain: tip + J, NumPy",
+        "pytorch_kinematics (9 joints): J",
+        partial(evaluate, chain, q.numpy(), jacobian=True),
+        lambda: arm.jacobian(q),
     )
 
 
