@@ -15,6 +15,7 @@ _FACTORS = np.array(
     [0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0]
 )  # widths, relative to one backlash
 _ROUNDS = 5
+_LEAST_NOISE = 1e-5  # relative to the spread of the tips
 _COMMON = 0.5  # prior correlation of the slopes of two actuators
 
 
@@ -85,13 +86,16 @@ class HysteresisProblem:
         K, n = self.start.shape
         prior = spread**2 * ((1.0 - _COMMON) * np.eye(n) + _COMMON)
         precision = np.kron(np.eye(K), np.linalg.inv(prior))
+        least = _LEAST_NOISE**2 * self.x[rows].var()
         slopes = self.start
         weights: NDArray | None = None
         for _ in range(_ROUNDS):
             residual, by_weights, by_slopes, weights = self._linearised(
                 rows, slopes, weights
             )
-            noise = np.square(residual).mean()
+            if not np.isfinite(residual).all():
+                return self.start  # the model is not regular so far from the rows
+            noise = np.square(residual).mean() + least
             # One unit of the scaled weights moves the tips by 1 m; they may explain all errors.
             units = np.sqrt(np.square(by_weights).sum(axis=1).mean(axis=0))
             units = np.where(units > 0.0, units, 1.0)

@@ -46,7 +46,7 @@ class PrandtlIshlinskiiOperator(HysteresisOperator[HysteresisState]):
     widths : array-like of shape (K,)
         Widths of the play operators, ascending from zero or more [unit of q].
     slopes : array-like of shape (K - 1,) or (K - 1, n)
-        Slopes s_k of all actuators or of each, zero or more.
+        Slopes s_k of all actuators or of each, zero or more [1].
 
     Attributes
     ----------

@@ -144,7 +144,7 @@ class HybridForwardModel(HybridPredictor):
     calibration_ : CalibrationResult or None
         The result of the calibration.
     play_ : PlayOperator, PrandtlIshlinskiiOperator or None
-        The backlash; None if there is none, or if "auto" found no significant gain.
+        The hysteresis; None if there is none, or if "auto" found no significant gain.
     radius_ : Radius or None
         With `coverage`: the radius ``inside`` the domain [m], infinite with too few groups.
         `adapt` and `partial_fit` do not change it.

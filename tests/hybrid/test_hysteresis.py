@@ -1,14 +1,18 @@
 """Hybrid models of robots whose actuators have hysteresis with smooth loops."""
 
+import copy
+
 import numpy as np
 import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy.spatial.transform import Rotation
 
 from hybridkin import (
     HybridForwardModel,
     PlayOperator,
     PrandtlIshlinskiiOperator,
+    as_forward_model,
     load_model,
     robots,
     save_model,
@@ -83,3 +87,52 @@ def test_a_file_holds_the_operator(fitted, tmp_path):
     assert_array_equal(loaded.play_.widths, fitted.play_.widths)
     expected = fitted.predict(q, groups=groups)
     assert_array_equal(loaded.predict(q, groups=groups), expected)
+
+
+@pytest.mark.slow
+def test_measurements_go_on_where_the_last_ones_ended(fitted):
+    q, groups = motions(1, seed=5)
+    x = tips(smooth_friction(q, groups)) - 0.01
+    at_once = copy.deepcopy(fitted).partial_fit(q, x)
+    rows = copy.deepcopy(fitted)
+    for row, tip in zip(q, x, strict=True):
+        rows.partial_fit(row[None], tip[None])
+    assert_allclose(rows.predict(q), at_once.predict(q), rtol=0.0, atol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["markers", "pose", "function", "exact"])
+def test_every_kind_of_model_can_have_it(kind):
+    q, groups = motions(10, seed=0)
+    y = smooth_friction(q, groups)
+    chain = CHAIN
+    options = {}
+    if kind == "markers":
+        chain = CHAIN.with_markers([(1, 1.0), (2, 1.0)])
+    with torch.no_grad():
+        x = chain(torch.from_numpy(y)).numpy()
+        turns = CHAIN.pose(torch.from_numpy(y))[:, :3, :3].numpy()
+    if kind != "exact":
+        x = x + 5e-4 * np.random.default_rng(1).standard_normal(x.shape)
+    if kind == "markers":
+        x[::7, :3] = np.nan
+    if kind == "pose":
+        x = np.hstack([x, Rotation.from_matrix(turns).as_rotvec()])
+        options = {"output": "pose"}
+    if kind == "function":
+        chain = as_forward_model(lambda q: CHAIN(q))
+    model = HybridForwardModel(chain, "drop", play="auto", **options).fit(q, x, groups=groups)
+    assert isinstance(model.play_, PrandtlIshlinskiiOperator)
+    assert np.nanmax(np.abs(model.predict(q, groups=groups) - x)) < 0.1
+
+
+@pytest.mark.slow
+def test_a_backlash_stays_one_backlash():
+    q, groups = motions(12, seed=0)
+    x = tips(PlayOperator(0.02).apply_by_group(q, groups))
+    x += 5e-4 * np.random.default_rng(1).standard_normal(x.shape)
+    model = HybridForwardModel(CHAIN, "linear", coupling="serial", play="auto")
+    error = np.linalg.norm(model.fit(q, x, groups=groups).predict(q, groups=groups) - x, axis=1)
+    given = HybridForwardModel(CHAIN, "linear", coupling="serial", play=0.02)
+    least = np.linalg.norm(given.fit(q, x, groups=groups).predict(q, groups=groups) - x, axis=1)
+    assert error.mean() < 1.05 * least.mean()
