@@ -58,7 +58,11 @@ def compiler() -> list[str]:
 
 
 def compile_into(folder: Path, target: str, names: list[str]) -> list[Path]:
-    """Return the libraries of a platform, compiled side by side; at least one."""
+    """Return the libraries of a platform, at least one.
+
+    What the same compiler has made of the same sources, with the same options, stays. The others
+    are compiled side by side.
+    """
     windows, apple = target.startswith("win"), target.startswith("macos")
     suffix = ".dll" if windows else ".dylib" if apple else ".so"
     variants = X86 if target.endswith(("x86_64", "amd64")) else {"generic": ""}
@@ -70,32 +74,59 @@ def compile_into(folder: Path, target: str, names: list[str]) -> list[Path]:
         f"-DHK_SOURCES={stamp}u",
         *([] if windows else ["-fPIC"]),
     ]
+    compiler_version = version_of(compiler())
     folder.mkdir(parents=True, exist_ok=True)
+    libraries = []
     with tempfile.TemporaryDirectory(dir=folder) as work:
         Path(work, "kinds.h").write_text(shared["c_header"]())
-        command += ["-I", work]
         running = {}
         for name in names or variants:
-            path = Path(work, f"hk_{name}{suffix}")
-            options = [
-                *variants[name].split(),
-                "-o",
-                str(path),
-                str(NATIVE / "src/hk.c"),
-                "-lm",
-            ]
-            running[path] = subprocess.Popen(
-                [*command, *options], stderr=subprocess.PIPE, text=True
+            options = variants[name].split()
+            library = folder / f"hk_{name}{suffix}"
+            origin = "\n".join([compiler_version, shlex.join(command + options)])
+            if library.exists() and origin_of(library) == origin:
+                libraries.append(library)
+                continue
+            made = Path(work, library.name)
+            source = str(NATIVE / "src/hk.c")
+            process = subprocess.Popen(
+                [*command, "-I", work, *options, "-o", str(made), source, "-lm"],
+                stderr=subprocess.PIPE,
+                text=True,
             )
-        said = {path: process.communicate()[1] for path, process in running.items()}
-        made = [path for path, process in running.items() if process.returncode == 0]
-        sys.stderr.write("".join(said[path] for path in made))
-        if not made:
-            raise OSError(
-                f"the C compiler failed: {next(iter(said.values())).strip()[-500:]}"
-            )
-        # Replaced at once: another process may have the old one in use.
-        return [path.replace(folder / path.name) for path in made]
+            running[library] = (process, made, origin)
+        messages = ""
+        for library, (process, made, origin) in running.items():
+            message = process.communicate()[1]
+            messages += message
+            if process.returncode == 0:
+                sys.stderr.write(message)
+                # Replaced at once: another process may have the old one in use.
+                record(library).unlink(missing_ok=True)
+                libraries.append(made.replace(library))
+                record(library).write_text(origin)
+    if not libraries:
+        raise OSError(f"the C compiler failed: {messages.strip()[-500:]}")
+    return libraries
+
+
+def version_of(command: list[str]) -> str:
+    """Return what a compiler says about its version."""
+    done = subprocess.run([*command, "--version"], capture_output=True, text=True)
+    return done.stdout
+
+
+def record(library: Path) -> Path:
+    """Return the path of the file that says how a library was made."""
+    return library.with_suffix(".origin")
+
+
+def origin_of(library: Path) -> str:
+    """Return compiler and options that made a library, or an empty string."""
+    try:
+        return record(library).read_text()
+    except OSError:
+        return ""
 
 
 class KernelsHook(BuildHookInterface):  # pyright: ignore[reportGeneralTypeIssues]

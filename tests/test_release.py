@@ -146,6 +146,35 @@ def test_the_wheel_holds_kernels_for_this_platform(built, hatch_build, tmp_path)
     assert said.stdout.startswith(str(tmp_path)), said.stderr
 
 
+@pytest.mark.skipif(os.name == "nt", reason="the compiler is a shell script")
+def test_only_what_has_changed_is_compiled_again(hatch_build, tmp_path, monkeypatch):
+    compiler = tmp_path / "cc"
+    compiler.write_text("""#!/bin/sh
+        if [ "$*" = --version ]; then cat "$0.version"; exit; fi
+        while [ "$1" != -o ]; do shift; done
+        date +%s%N > "$2"
+    """)
+    compiler.chmod(0o755)
+    version = tmp_path / "cc.version"
+    monkeypatch.setenv("CC", str(compiler))
+
+    def compiled():
+        libraries = hatch_build.compile_into(tmp_path / "lib", "linux_x86_64", [])
+        return [path.read_text() for path in sorted(libraries)]
+
+    version.write_text("1")
+    first = compiled()
+    assert len(set(first)) == 3
+    assert compiled() == first
+    version.write_text("2")
+    second = compiled()
+    assert not set(first) & set(second)
+    (tmp_path / "lib" / "hk_v3.so").unlink()
+    assert [old == new for old, new in zip(second, compiled(), strict=True)] == [True, False, True]
+    monkeypatch.setitem(hatch_build.X86, "v2", "-O1")
+    assert compiled()[0] != second[0]
+
+
 @needs_compiler
 @pytest.mark.slow
 def test_miscompiled_kernels_are_refused(hatch_build, tmp_path, monkeypatch):
