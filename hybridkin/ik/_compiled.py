@@ -45,6 +45,7 @@ from hybridkin.ik.tasks import Task, Tolerance
 from hybridkin.native.library import (
     Call,
     Program,
+    ThreadCall,
     backend,
     in_chunks,
     opened_library,
@@ -124,7 +125,7 @@ class Core:
         self._made_of = (settings, models)
         self.n, self.m = self.plan.lengths(self.plan.root)
         self.width = math.prod(settings.task.shape)
-        self._call = Call(self.plan, opened_library())
+        self._call = ThreadCall(self.plan, opened_library())
         self.settings = dataclasses.replace(
             settings, task=_CoreTask(settings.task, self, models)
         )
@@ -263,6 +264,8 @@ class Core:
 class Follower:
     """Follows targets with the core; the state is one array of numbers.
 
+    Only one thread at a time may use it.
+
     Parameters
     ----------
     core : Core
@@ -273,6 +276,11 @@ class Follower:
         Bits of the mode of `ik_tick` that are always set.
     state : ndarray, optional
         State of a follower to continue.
+
+    Attributes
+    ----------
+    command : callable
+        Returns the present command (n,).
     """
 
     backend = "compiled"
@@ -296,13 +304,18 @@ class Follower:
         state[IK_MEMORY] = memory or 0.0
         self._parts = {name: state[place] for name, place in places.items()}
         self.q = self._parts["q"]
-        self._bytes = memoryview(state).cast("B")  # pyright: ignore[reportArgumentType]
+        self.command = self.q.copy
+        shape = core.settings.task.shape
         self._inputs = [
-            _Input(self._bytes, places["target"], state, core.settings.task.shape),
-            _Input(self._bytes, places["feed"], state, (core.m,)),
-            _Input(self._bytes, places["tip"], state, core.settings.task.shape),
+            _Input(places["target"], state, shape),
+            _Input(places["feed"], state, (core.m,)),
+            _Input(places["tip"], state, shape),
+        ]
+        self._put_target, self._put_feed, self._put_tip = [
+            place.put for place in self._inputs
         ]
         self._call = Call(core.plan, opened_library(), state.ctypes.data)  # ik_follower
+        self._place = self._call.place
         self._follow = opened_library().hk_ik_tick
         self._mode = -1
 
@@ -329,23 +342,22 @@ class Follower:
 
         Returns False, and does nothing, if one of them needs full checks.
         """
-        put_target, put_feed, put_tip = self._inputs
         mode = self._least | IK_HAS_TARGET
-        if not put_target(target):
+        if not self._put_target(target):
             return False
         if dx is not None:
-            if not put_feed(dx):
+            if not self._put_feed(dx):
                 return False
-            put_feed.numbers *= self._dt
+            self._parts["feed"] *= self._dt
             mode |= IK_HAS_FEED
         if tip is not None:
-            if not put_tip(tip):
+            if not self._put_tip(tip):
                 return False
             mode |= IK_HAS_TIP
         if mode != self._mode:
             self._mode = mode
             self.state[IK_MODE] = mode
-        return self._follow(self._call.place) > 0
+        return self._follow(self._place) > 0
 
     def advance(self, period: float | None, *inputs: Tensor | None) -> Tick:
         """Do a tick with checked rows: the target, its motion in the period, the measured tip."""
@@ -355,14 +367,9 @@ class Follower:
         self._mode = self._least | _mode(*inputs)
         self.state[IK_MODE] = self._mode
         self.state[IK_PERIOD] = period or self._dt
-        self._follow(self._call.place)
+        self._follow(self._place)
         self.state[IK_PERIOD] = self._dt
         return self.last()
-
-    @property
-    def command(self) -> NDArray:
-        """The present command (n,)."""
-        return self.q.copy()
 
     def last(self) -> Tick:
         """Return the results of the last tick."""
@@ -386,8 +393,6 @@ class _Input:
 
     Parameters
     ----------
-    memory : memoryview
-        The bytes of the state.
     place : slice
         The numbers in the state.
     state : ndarray
@@ -396,27 +401,33 @@ class _Input:
         Shape of the array.
     """
 
-    def __init__(
-        self, memory: memoryview, place: slice, state: NDArray, shape: tuple[int, ...]
-    ) -> None:
-        self._bytes = memory
-        self._at = 8 * place.start
+    def __init__(self, place: slice, state: NDArray, shape: tuple[int, ...]) -> None:
         self._shape = shape
         self.numbers = state[place].reshape(shape)
+        self._memory = memoryview(self.numbers)  # pyright: ignore[reportArgumentType]
+        self._bytes = self._memory.cast("B")
+        self._is_vector = len(shape) == 1
+        self._is_point = shape == (3,)
 
-    def __call__(self, point: object) -> bool:
+    def put(self, point: object) -> bool:
         """Write a point, and return whether it has the type and shape that need no checks."""
         if type(point) is np.ndarray:
+            if self._is_vector:
+                try:
+                    self._memory[:] = point  # refuses any other dtype or shape
+                except ValueError:
+                    return False
+                return True
             if point.dtype is not _FLOAT64 or point.shape != self._shape:
                 return False
             self.numbers[...] = point
             return True
-        if self._shape != (3,):
+        if not self._is_point:
             return False
         if type(point) is not list and type(point) is not tuple:
             return False
         try:
-            _write_point(self._bytes, self._at, *point)
+            _write_point(self._bytes, 0, *point)
         except (StructError, OverflowError):
             return False
         return True

@@ -95,7 +95,7 @@ class Tracker(Portable):
     def q(self) -> NDArray | Tensor:
         """The present command, shape (n,)."""
         with self._lock:
-            return self._robot.command
+            return self._robot.command()
 
     @property
     def x(self) -> NDArray | Tensor:
@@ -220,12 +220,12 @@ class Tracker(Portable):
         with self._lock:
             estimator = self._estimator
             if estimator is not None and estimator.module_ is not self._module:
-                q = as_tensor(self._robot.command, "q")
+                q = as_tensor(self._robot.command(), "q")
                 self._start(q, self._robot.last().step.dq[0])
             robot = self._robot
             if not robot.tick(x_target, dx, x_measured):
                 self._step(x_target, dx, x_measured)
-            return robot.command
+            return robot.command()
 
     def _step(
         self, x_target: Array, dx: Array | None, x_measured: Array | None
@@ -375,7 +375,8 @@ class _InTorch:
         """Return the results of the last tick."""
         return self._last
 
-    @property
     def command(self) -> NDArray | Tensor:
-        """The present command (n,)."""
-        return as_array(self._q[0]).copy() if self._as_numpy else self._q[0].clone()
+        """Return the present command (n,)."""
+        if self._as_numpy:
+            return as_array(self._q[0]).copy()
+        return self._q[0].clone()

@@ -146,10 +146,10 @@ def _three_units(plan: Plan) -> int:
     return plan.node("elm", 3, 3, numbers, 3, activation, 0, 0, aligned=True)
 
 
-class Call(threading.local):
+class Call:
     """A plan with memory to compute in: what functions of the library are called with.
 
-    Every thread has its own memory.
+    Only one thread at a time may use it.
 
     Parameters
     ----------
@@ -173,6 +173,10 @@ class Call(threading.local):
         self.place = self._pointers.ctypes.data
 
 
+class ThreadCall(threading.local, Call):
+    """A call that has memory of its own in every thread."""
+
+
 class Program:
     """A model that the compiled core evaluates.
 
@@ -189,7 +193,7 @@ class Program:
         self.plan = plan
         self._sizes = plan.n_inputs, plan.n_outputs
         self._evaluate = opened.hk_evaluate
-        self._call = Call(plan, opened)
+        self._call = ThreadCall(plan, opened)
 
     def __reduce__(self) -> tuple[type[Program], tuple[Plan]]:
         return Program, (self.plan,)

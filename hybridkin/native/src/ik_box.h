@@ -37,7 +37,8 @@ static inline real ik_norm(int n, const real *a) {
 
 /* r (m) = J step. */
 HK_INLINE void ik_rows_of(int m, int n, const real *J, const real *step, real *r) {
-    real sum[IK_MOST_ROWS] = {R(0.0)};
+    real sum[IK_MOST_ROWS];
+    for (int i = 0; i < m; i++) sum[i] = R(0.0);
     for (int j = 0; j < n; j++)
         for (int i = 0; i < m; i++) sum[i] += J[n * i + j] * step[j];
     for (int i = 0; i < m; i++) r[i] = sum[i];
@@ -54,7 +55,8 @@ HK_INLINE void ik_columns_of(int m, int n, const real *J, const real *mu, const 
 
 /* g = the columns of the lower half of the sum over actuators of keep J J^T, one after another. */
 HK_INLINE void ik_products(int m, int n, const real *J, const real *keep, real *g) {
-    real sum[IK_MOST_PAIRS] = {R(0.0)};
+    real sum[IK_MOST_PAIRS];
+    for (int i = 0; i < m * (m + 1) / 2; i++) sum[i] = R(0.0);
     for (int j = 0; j < n; j++)
         for (int k = 0, at = 0; k < m; k++) {
             const real a = keep ? keep[j] * J[n * k + j] : J[n * k + j];
@@ -91,24 +93,23 @@ HK_INLINE real ik_trace(int m, const real *g) {
     return sum;
 }
 
-HK_INLINE ik_factors ik_factor(int m, const real *g, real damping_sq) {
+HK_INLINE void ik_factor(int m, const real *g, real damping_sq, ik_factors *f) {
     const real least = R(8.0) * HK_EPS * (ik_trace(m, g) + (real)m * damping_sq);
     real scaled[IK_MOST_ROWS][IK_MOST_ROWS];
-    ik_factors f = {0};
     for (int k = 0, at = 0; k < m; k++)
         for (int i = k; i < m; i++) {
             real t = i == k ? g[at++] + damping_sq : g[at++];
-            for (int p = 0; p < k; p++) t -= f.l[i][p] * scaled[k][p];
+            for (int p = 0; p < k; p++) t -= f->l[i][p] * scaled[k][p];
             scaled[i][k] = t;
-            if (i == k) f.inverse[k] = t > least ? R(1.0) / t : R(0.0);
-            f.l[i][k] = t * f.inverse[k];
+            if (i == k) f->inverse[k] = t > least ? R(1.0) / t : R(0.0);
+            f->l[i][k] = t * f->inverse[k];
         }
-    return f;
 }
 
 /* Estimates of the least and the largest singular value of J from the pivots of g. */
 HK_INLINE void ik_pivots(int m, const real *g, real *low, real *high) {
-    const ik_factors f = ik_factor(m, g, R(0.0));
+    ik_factors f;
+    ik_factor(m, g, R(0.0), &f);
     real least = ik_trace(m, g);
     *high = HK_MATH(sqrt)(least);
     for (int k = 0; k < m; k++) {
@@ -211,7 +212,8 @@ HK_INLINE void ik_eigen_projection(int m, int n, const real *J, const ik_eigen *
 
 /* step <- (1 - J+ J) step, undamped; twice, which takes the rounding out again. */
 HK_INLINE void ik_null_projection(int m, int n, const real *J, const real *g, real *step) {
-    const ik_factors f = ik_factor(m, g, R(0.0));
+    ik_factors f;
+    ik_factor(m, g, R(0.0), &f);
     for (int twice = 0; twice < 2; twice++) {
         real moved[IK_MOST_ROWS], mu[IK_MOST_ROWS];
         ik_rows_of(m, n, J, step, moved);
@@ -286,7 +288,8 @@ HK_INLINE void ik_box_of(int m, int n, const real *J, const real *v, const real 
         if (!going) return;
         for (int j = 0; j < n; j++) free[j] = y[j] > lower[j] && y[j] < upper[j] ? R(1.0) : R(0.0);
         ik_products(m, n, J, free, g);
-        const ik_factors f = ik_factor(m, g, damping_sq);
+        ik_factors f;
+        ik_factor(m, g, damping_sq, &f);
         ik_solve(m, &f, residual, newton);
         real start = R(0.0), curvature = R(0.0);
         for (int i = 0; i < m; i++) {

@@ -191,7 +191,7 @@ HK_INLINE void ik_limited_step_of(int m, int n, const ik_settings *ik, const rea
     }
     ik_products(m, n, J, NULL, g);
     if (exact) {
-        ik_eigen e = {0};
+        ik_eigen e;
         ik_eigen_of(m, g, &e);
         ik_eigen_ends(m, &e, &low, &high);
         damping_sq = ik_damping_sq(ik, low, high);
@@ -207,7 +207,8 @@ HK_INLINE void ik_limited_step_of(int m, int n, const ik_settings *ik, const rea
                 ik_pivots(m, g, &low, &high);
             damping_sq = ik_damping_sq(ik, low, high);
         }
-        const ik_factors f = ik_factor(m, g, damping_sq);
+        ik_factors f;
+        ik_factor(m, g, damping_sq, &f);
         ik_solve(m, &f, v, mu);
         if (slides) ik_null_projection(m, n, J, g, z);
     }
