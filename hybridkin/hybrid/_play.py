@@ -20,7 +20,7 @@ from hybridkin.hybrid._spec import Spec, residuals
 from hybridkin.learning.elm_cv import ELMRegressorCV
 
 _LEAST = 0.0025  # first width, relative to the stroke
-_SPREADS = 0.2, 1.0  # standard deviations of slopes to try
+_SPREADS = 0.2, 1.0  # standard deviations of slopes to try, as long as errors fall
 _PLAIN: dict[str, Any] = {"relevance_rounds": 0, "max_hidden": 0, "random_state": 0}
 
 
@@ -123,12 +123,19 @@ def _smooth(log: _Log, width: float) -> HysteresisOperator | None:
             distance[test] = log.held_out_errors(problem.effective(slopes), train, test)
         return log.by_motion(distance)
 
-    errors = {spread: errors_by_motion(spread) for spread in (0.0, *_SPREADS)}
-    best = min(errors, key=lambda spread: errors[spread].mean())
-    gains = errors[0.0] - errors[best]
+    single = errors_by_motion(0.0)
+    chosen = 0.0
+    errors = single
+    for spread in _SPREADS:
+        tried = errors_by_motion(spread)
+        if tried.mean() >= errors.mean():
+            break
+        chosen = spread
+        errors = tried
+    gains = single - errors
     if gains.mean() <= gains.std(ddof=1) / np.sqrt(len(gains)):
         return None
-    return problem.operator(problem.fitted(log.counted, best))
+    return problem.operator(problem.fitted(log.counted, chosen))
 
 
 @dataclass(frozen=True)
