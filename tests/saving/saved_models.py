@@ -16,6 +16,7 @@ from hybridkin import (
     ELMRegressor,
     ELMRegressorCV,
     HybridForwardModel,
+    PrandtlIshlinskiiOperator,
     RigidChain,
     save_model,
 )
@@ -122,6 +123,11 @@ def _drifting():
     return model.partial_fit(q[:5], trunk_log()[1][:5] + 0.01), q
 
 
+def _with_smooth_hysteresis(model, q):
+    model.play_ = PrandtlIshlinskiiOperator([0.0, 0.01, 0.02], [[0.2, 0.3, 0.4], [0.7, 0.8, 1.1]])
+    return model, q
+
+
 def _adapted(model, q):
     """A robot on another day: the base has moved, the zeros are others; and a payload."""
     base = np.array([[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
@@ -167,6 +173,7 @@ def models() -> dict[str, tuple[Any, Any]]:
         ),
         "blend": _blend(),
         "play": _hybrid("linear", play=[0.01, 0.02, 0.0]),
+        "smooth_hysteresis": _with_smooth_hysteresis(*_hybrid("linear", play=0.02)),
         "tested_by_groups": _hybrid("linear", coupling="serial", guard="box"),
         "drift_and_radius": _drifting(),
         "adapted": _adapted(*_hybrid("quadratic", coupling="serial")),
