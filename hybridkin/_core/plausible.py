@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,14 @@ class PlausibleRows:
 
     def hold(self, q: NDArray) -> bool:
         """Return whether all rows of q (N, n) lie within the bounds."""
+        if len(q) == 1 and sum(map(abs, q[0].tolist())) <= self._small:
+            return True
         with np.errstate(all="ignore"):  # numbers too large for float64 are outside
             largest = np.abs((q - self.rest) @ self.weights.T).max(initial=0.0)
         return bool(largest <= 1.0)
+
+    @cached_property
+    def _small(self) -> float:
+        """A sum of absolute values of q up to which any row lies within the bounds."""
+        largest = float(np.abs(self.weights).max(initial=np.finfo(float).tiny))
+        return 1.0 / largest - float(np.abs(self.rest).sum())

@@ -343,7 +343,7 @@ class _Compiled:
                 for name in module.layout.settings:
                     self.settings.append((vars(module), name))
         self.parts = [dict(parts) for parts in self.dicts]
-        self.state = self._state()
+        self._remember()
         try:
             _check_classes(modules)
             tensors = [*model.buffers(), *model.parameters()]
@@ -354,23 +354,34 @@ class _Compiled:
             self.tensors = tensors
             self.views = [*map(_memory, tensors)]
             self.content = [*map(bytearray, self.views)]
-            self.state = self._state()
+            self._remember()
             self.program = Program(Plan(model.stored()))
         except (ValueError, TypeError) as error:
             self.reason = str(error).split(";")[0]
 
-    def _state(self) -> list[object]:
-        settings = [attributes.get(name) for attributes, name in self.settings]
-        places = map(Tensor.data_ptr, self.tensors)
-        return [*places, *map(Tensor.stride, self.tensors), *settings]
+    def _remember(self) -> None:
+        """Remember the places of the tensors and the settings."""
+        self.places = [*map(Tensor.data_ptr, self.tensors)]
+        self.strides = [*map(Tensor.stride, self.tensors)]
+        self.values = self._values()
+
+    def _values(self) -> list[object]:
+        """Return the present values of the settings."""
+        return [attributes.get(name) for attributes, name in self.settings]
 
     def holds(self) -> bool:
         """Return whether the model is still the same."""
         try:
-            same = self.dicts == self.parts  # identity first; else tensors are compared
+            if self.dicts != self.parts:  # identity first; else tensors are compared
+                return False
         except RuntimeError:
             return False
-        return same and self.state == self._state() and self.content == self.views
+        return (
+            self.values == self._values()
+            and self.content == self.views
+            and [*map(Tensor.data_ptr, self.tensors)] == self.places
+            and [*map(Tensor.stride, self.tensors)] == self.strides
+        )
 
 
 def _memory(a: Tensor) -> memoryview:

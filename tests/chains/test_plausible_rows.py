@@ -27,6 +27,7 @@ def test_rows_within_the_bounds_need_no_warning(kind):
     for size in np.geomspace(1e-4, 1e3, 60):
         q = unit * size * rng.uniform(-1.0, 1.0, (5, chain.n_actuators))
         rows = torch.from_numpy(q)
+        assert plausible.hold(q) == all(plausible.hold(row[None]) for row in q)
         if plausible.hold(q):
             tested += 1
             assert chain.unit_messages(rows, "q") == []
@@ -37,7 +38,9 @@ def test_rows_within_the_bounds_need_no_warning(kind):
 
 def test_numbers_without_a_product_are_outside():
     plausible = TENDONS.plausible_rows()
-    assert not plausible.hold(np.full((1, 6), 1e308))
+    for number in (1e308, np.inf, np.nan):
+        assert not plausible.hold(np.full((1, 6), number))
+        assert not plausible.hold(np.array([[number, 0.0, 0.0, 0.0, 0.0, 0.0]]))
     assert plausible.hold(np.zeros((0, 6)))
 
 
