@@ -414,7 +414,8 @@ class _Input:
         if type(point) is np.ndarray:
             if self._is_vector:
                 try:
-                    self._memory[:] = point  # refuses any other dtype or shape
+                    # Refuses any other dtype or shape.
+                    self._memory[:] = point  # pyright: ignore
                 except ValueError:
                     return False
                 return True

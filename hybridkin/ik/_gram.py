@@ -12,6 +12,18 @@ from hybridkin._core.arrays import identity
 from hybridkin._core.kernel_numbers import IK_HEALTHY
 
 
+class SingularValues(NamedTuple):
+    """The smallest and the largest singular value of a Jacobian, each of shape (...,)."""
+
+    sigma_min: Tensor
+    sigma_max: Tensor
+
+    @property
+    def is_singular(self) -> Tensor:
+        """Whether a direction is (nearly) lost, shape (...), bool."""
+        return self.sigma_min < IK_HEALTHY * self.sigma_max
+
+
 class RowGram(NamedTuple):
     """G = J J^T of a Jacobian in parts, and the singular values of J.
 
@@ -24,10 +36,13 @@ class RowGram(NamedTuple):
     sigma_min: Tensor
     sigma_max: Tensor
 
-    @property
-    def is_singular(self) -> Tensor:
-        """Whether a direction is (nearly) lost, shape (...), bool."""
-        return self.sigma_min < IK_HEALTHY * self.sigma_max
+
+def singular_values(J: Tensor) -> SingularValues:
+    """Return the smallest and the largest singular value of J (..., m, n), as `row_gram`."""
+    if J.shape[-2] != 3:
+        squares = torch.linalg.eigvalsh(_finite_gram(J))
+        return SingularValues(*_roots(squares[..., 0], squares[..., -1]))
+    return SingularValues(*_roots(*_extreme_eigenvalues(*_entries_3x3(J))))
 
 
 def row_gram(J: Tensor) -> RowGram:
@@ -46,13 +61,21 @@ def row_gram(J: Tensor) -> RowGram:
         Parts of G and singular values, each of shape (...,).
     """
     if J.shape[-2] != 3:
-        gram = torch.nan_to_num(J @ J.mT)
-        squares, vectors = torch.linalg.eigh(gram)
-        roots = squares.clamp_min(0.0).sqrt()
-        return RowGram((squares, vectors), roots[..., 0], roots[..., -1])
+        squares, vectors = torch.linalg.eigh(_finite_gram(J))
+        roots = _roots(squares[..., 0], squares[..., -1])
+        return RowGram((squares, vectors), *roots)
     entries = _entries_3x3(J)
-    low, high = _extreme_eigenvalues(*entries)
-    return RowGram(entries, low.clamp_min(0.0).sqrt(), high.clamp_min(0.0).sqrt())
+    return RowGram(entries, *_roots(*_extreme_eigenvalues(*entries)))
+
+
+def _finite_gram(J: Tensor) -> Tensor:
+    """Return J J^T, with numbers in place of NaN, which LAPACK refuses."""
+    return torch.nan_to_num(J @ J.mT)
+
+
+def _roots(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the square roots of eigenvalues that are negative at most by rounding."""
+    return low.clamp_min(0.0).sqrt(), high.clamp_min(0.0).sqrt()
 
 
 def _extreme_eigenvalues(
@@ -151,7 +174,7 @@ def solve_rows(J: Tensor, v: Tensor, damping_sq: Tensor) -> Tensor:
     """
     if J.shape[-2] == 3:
         return _solve_3x3(_entries_3x3(J), v, damping_sq)
-    gram = torch.nan_to_num(J @ J.mT)
+    gram = _finite_gram(J)
     limits = torch.finfo(gram.dtype)
     trace = torch.diagonal(gram, dim1=-2, dim2=-1).sum(-1)
     least = 16.0 * limits.eps * trace + limits.tiny

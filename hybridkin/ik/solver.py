@@ -22,7 +22,7 @@ from hybridkin._core.arrays import (
 from hybridkin._core.html import html_table
 from hybridkin._core.stored import Stored
 from hybridkin.ik._compiled import Core, core_of
-from hybridkin.ik._gram import row_gram
+from hybridkin.ik._gram import singular_values
 from hybridkin.ik._half_spaces import half_spaces
 from hybridkin.ik._implicit import differentiable as with_derivatives
 from hybridkin.ik._search import Search
@@ -439,10 +439,10 @@ class InverseKinematics:
         x, J = settings.evaluate(q_plain)
         e = task.difference(x, target)
         error = e.norm(dim=-1)
-        gram = row_gram(J)
+        singular = singular_values(J)
         reached = task.reached(e, tolerance)
         status = statuses(
-            task, q_plain, error, reached, solution.held, gram.is_singular
+            task, q_plain, error, reached, solution.held, singular.is_singular
         )
         missed = ~reached & torch.isfinite(error)
         status[missed & solution.stationary] = IKStatus.MAX_ITER
@@ -457,7 +457,7 @@ class InverseKinematics:
             status,
             solution.n_iter,
             solution.n_starts,
-            gram.sigma_min,
+            singular.sigma_min,
             settings.margin(q_plain),
         )
         with torch.set_grad_enabled(differentiable):
