@@ -383,7 +383,7 @@ def as_forward_model(model: object) -> ForwardModel:
             "HybridForwardModel(None, error_model=regressor).fit(q, x) and pass that; "
             "for a search pass its `best_estimator_`, for a robot description its `chain`."
         )
-    return FunctionModel(model)
+    return FunctionModel(model)  # pyright: ignore[reportArgumentType]
 
 
 def jacobian(model: object, q: Tensor) -> Tensor:

@@ -57,7 +57,7 @@ def with_missing_markers(x: NDArray, name: str) -> NDArray:
     Raise if a row has no complete marker, or if numbers are infinite.
     """
     markers = points(x)
-    missing = np.isnan(markers).any(axis=2, keepdims=True)
+    missing = np.any(np.isnan(markers), axis=2, keepdims=True)
     # A marker may be missing where another one of the row is complete.
     allowed = missing & ~missing.all(axis=1, keepdims=True)
     required = np.where(allowed, 0.0, markers)

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from hybridkin._core.stumpff import stumpff
 
-Vector = Sequence[Tensor]  # x, y, z
+Vector = Sequence[Tensor] | Tensor  # x, y, z
 
 fma = torch.addcmul
 fms = partial(torch.addcmul, value=-1.0)
@@ -68,7 +68,7 @@ def _tips(segments: list[Segments], beside: Vector) -> list[Vector]:
     """Return the tip in the start frame of every segment, and in the frame at the end."""
     zero = torch.zeros_like(segments[0].length)
     tip: Vector = [zero + component for component in beside]
-    tips = [tip]
+    tips: list[Vector] = [tip]
     for segment in reversed(segments):
         x, y, z = tip
         tip = _in_start_frame((x, y, z + segment.offset), segment, segment.length)
@@ -190,7 +190,7 @@ class WorkOfGravity:
 
         arcs = torch.stack([self.segments.length, self.segments.x, self.segments.y])
         # Backward: in forward mode torch decomposes addcmul in Python, which is slow.
-        _, backward = torch.func.vjp(slope, arcs)
+        backward = torch.func.vjp(slope, arcs)[1]
         seconds = []
         for kind in range(3):
             chosen = torch.zeros_like(arcs)

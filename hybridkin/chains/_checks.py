@@ -28,8 +28,9 @@ _TURNS = 4.0 * math.pi  # [rad]; the angle of a tendon is never larger
 
 def float_dtype(dtype: object) -> torch.dtype:
     """Return a caller's dtype of torch."""
-    if dtype is torch.float64 or dtype is torch.float32:
-        return dtype
+    for supported in (torch.float64, torch.float32):
+        if dtype is supported:
+            return supported
     raise ValueError(f"`dtype` must be torch.float64 or torch.float32, got {dtype!r}.")
 
 

@@ -418,7 +418,8 @@ class ConstantCurvatureChain(ArcChain):
     ) -> tuple[Tensor, Change]:
         by_matrix, by_rest = self._changes_of_map(tangents)  # (P, 3 S, n), (P, 3 S)
         arcs = self._linear(rows)
-        slope = torch.tensordot(rows, by_matrix, ([1], [2])) + by_rest  # (N, P, 3 S)
+        by_rows = torch.tensordot(rows, by_matrix, ([1], [2]))  # pyright: ignore[reportArgumentType]
+        slope = by_rows + by_rest  # (N, P, 3 S)
         slope = slope.permute(2, 1, 0)
         if self.stage is not None:
             arcs, slope = turned_by_first(arcs, slope)

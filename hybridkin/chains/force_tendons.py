@@ -15,7 +15,7 @@ from hybridkin.chains._checks import filled, float_dtype, numeric, stiffness
 from hybridkin.chains._slack import WithoutDerivative, applied
 from hybridkin.chains.arc_chain import STRUCTURE, ArcChain
 from hybridkin.chains.chain import Chain
-from hybridkin.chains.markers import Marker
+from hybridkin.chains.markers import MarkedChain, Marker
 
 __all__ = ["ForceTendonChain"]
 
@@ -206,7 +206,7 @@ class ForceTendonChain(ArcChain):
     axial_stiffness: Tensor
     weight: Tensor
     taper: Tensor
-    lengths: Tensor
+    lengths: Tensor  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def __init__(
         self,
@@ -289,10 +289,10 @@ class ForceTendonChain(ArcChain):
         """Upper bound of the length of rigid offsets and of the way to a marker, shape () [m]."""
         return self.offsets.abs().sum() + self.marker_offsets.abs().sum()
 
-    def tips(self) -> list[ForceTendonChain]:
+    def tips(self) -> list[MarkedChain]:
         """Return one chain per marker, each mapping q (..., n) to x (..., 3)."""
         offsets = self.marker_offsets.tolist()
-        tips = []
+        tips: list[MarkedChain] = []
         for (at, *_), (x, y, z) in zip(self.markers, offsets, strict=True):
             tips.append(self._marked([(at, x, y, z)]))
         return tips
@@ -314,7 +314,7 @@ class ForceTendonChain(ArcChain):
         """Return no warning: forces have no plausible size that the geometry gives."""
         return []
 
-    def plausible_rows(self) -> None:
+    def plausible_rows(self) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Return None: every force is plausible."""
 
     def longest(self, largest: Tensor) -> float:
