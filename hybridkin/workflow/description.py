@@ -30,9 +30,9 @@ class Description:
     n_actuators : int
         Size of q.
     geometry : dict of str to Tensor
-        That of its chain, see `Chain.geometry`.
+        That of its chain, see ``Chain.geometry``.
     auto : dict or None
-        The choices of "auto", see `HybridForwardModel.cv_results_`.
+        The choices of "auto", see ``HybridForwardModel.cv_results_``.
     play : list of float or None
         Backlash of every actuator [m].
     domain : Limits or None

@@ -101,7 +101,7 @@ class FitRecord(Training):
     markers : list of Errors
         Errors of every marker of the saved model, base to tip; empty for a single one.
     auto : dict or None
-        The choices of "auto", see `HybridForwardModel.cv_results_`.
+        The choices of "auto", see ``HybridForwardModel.cv_results_``.
     words : list of str
         What the saved model chose, its error radius, and motions that the log lacks.
     tried : dict of str to dict
