@@ -8,7 +8,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from hybridkin._core.arrays import identity
 from hybridkin._core.kernel_numbers import IK_HEALTHY
 
 
@@ -176,11 +175,10 @@ def solve_rows(J: Tensor, v: Tensor, damping_sq: Tensor) -> Tensor:
         return _solve_3x3(_entries_3x3(J), v, damping_sq)
     gram = _finite_gram(J)
     limits = torch.finfo(gram.dtype)
-    trace = torch.diagonal(gram, dim1=-2, dim2=-1).sum(-1)
-    least = 16.0 * limits.eps * trace + limits.tiny
-    damping_sq = torch.maximum(damping_sq, least)
-    diagonal = identity(gram.shape[-1], gram) * damping_sq[..., None, None]
-    factor, _ = torch.linalg.cholesky_ex(gram + diagonal)
+    diagonal = torch.diagonal(gram, dim1=-2, dim2=-1)
+    least = 16.0 * limits.eps * diagonal.sum(-1) + limits.tiny
+    diagonal += torch.maximum(damping_sq, least)[..., None]
+    factor, _ = torch.linalg.cholesky_ex(gram)
     return torch.cholesky_solve(v[..., None], factor)[..., 0]
 
 
