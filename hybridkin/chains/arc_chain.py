@@ -264,6 +264,7 @@ class ArcChain(MarkedChain):
         tensor([0., 0., 1.], dtype=torch.float64)
         """
         self._check_tangents(tangents)
+        self._check_shape(q)
         changes = {name: value.to(q) for name, value in tangents.items()}
         (J,) = self._by_rows(partial(self._along_geometry, tangents=changes), q)
         return J
