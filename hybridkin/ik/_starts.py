@@ -94,9 +94,8 @@ def _even_points(n: int, count: int, device: torch.device) -> Tensor:
     ratio = 2.0
     for _ in range(64):
         ratio = (1.0 + ratio) ** (1.0 / (n + 2))
-    numbers = {"dtype": torch.float64, "device": device}
-    dimension = torch.arange(n + 1, **numbers)
-    index = torch.arange(count, **numbers)
+    dimension = torch.arange(n + 1, dtype=torch.float64, device=device)
+    index = torch.arange(count, dtype=torch.float64, device=device)
     steps = ratio ** -(dimension + 1.0)
     points = (0.5 + index[:, None] * steps) % 1.0
     beside_middle = points[:, :n] - 0.5
