@@ -362,8 +362,8 @@ class ForceTendonChain(ArcChain):
         base = self.base.double()
 
         # Outer radius in the middle of each arc over that at the start of the segment, (S, k).
-        at = (torch.arange(k).to(base) + 0.5) / k
-        outer = 1.0 - self.taper.double()[:, None] * at
+        middles = torch.arange(k, dtype=base.dtype, device=base.device) + 0.5
+        outer = 1.0 - self.taper.double()[:, None] * middles / k
 
         length = self.lengths.double()[:, None].expand(-1, k) / k
         weights = self.weight.double()[:, None] * outer**2 * length
