@@ -423,6 +423,7 @@ COSTLY = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("entry", ENTRIES)
 def test_any_argument_gives_an_answer_or_an_error_of_ours(entry):
     fuzz(*ENTRIES[entry])
