@@ -2,9 +2,10 @@
 
     python examples/studies/systems.py
 
-Prints a table of the largest differences of commands over a run of targets, and of sizes. Needs
-fmpy (pip install fmpy), Octave with mkoctfile, and for the last columns what
-examples/microcontroller needs; columns without their program are empty.
+Prints a table of the largest differences of commands over a run of targets, of sizes, and the
+time of a step with the call from Python (median) or Octave (mean). Needs fmpy (pip install fmpy),
+Octave with mkoctfile, and for the last columns what examples/microcontroller needs; columns
+without their program are empty.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 import numpy as np
@@ -125,6 +127,13 @@ for k = 1:rows(T)
   [q, s, e] = robot('step', s, T(k, :));
   C = [C; q' e];
 end
+s = robot('reset', Q(1, :));
+clock = tic;
+for k = 1:rows(T)
+  [q, s, e] = robot('step', s, T(k, :));
+end
+seconds = toc(clock) / rows(T);
+save("-ascii", "-double", "seconds.txt", "seconds");
 save("-ascii", "-double", "X.txt", "X"); save("-ascii", "-double", "C.txt", "C");
 function said(varargin)
   try
@@ -139,7 +148,10 @@ said(1:3); said('step', 5, [1 2 3]); said('go', 5); said(single(1:9)); said();
 
 
 def in_octave(controller, q, targets, folder):
-    """Return models (N, ...) and steps (T, n + 1) that Octave computes, and what errors say."""
+    """Return what Octave computes: models (N, ...) and steps (T, n + 1), and what errors say.
+
+    The file seconds.txt in the folder gets the mean time of a step.
+    """
     native.export_mex(controller, folder, name="robot")
     subprocess.run(["mkoctfile", "--mex", "robot.c"], cwd=folder, check=True)
     np.savetxt(folder / "Q.txt", q, fmt="%.17g")
@@ -172,40 +184,46 @@ def run_of_targets(controller, n_steps=60):
 
 
 def in_unit(controller, q, targets, folder):
-    """Return the commands (T, n) of a functional mock-up unit, and the bytes of its library."""
+    """Return what a functional mock-up unit gives: commands (T, n), bytes, seconds of a step."""
     path = native.export_fmu(controller, folder / "a.fmu")
     unit = Unit(path, folder / "unpacked")
     unit.start(start=q)
     commands = []
+    seconds = []
     for target in targets:
         unit.set(target=target)
+        begin = time.perf_counter()
         unit.step(controller.settings.dt)
+        seconds.append(time.perf_counter() - begin)
         commands.append(unit.get("command"))
     (library,) = (folder / "unpacked").glob("binaries/*/*")
-    return np.array(commands), library.stat().st_size
+    return np.array(commands), library.stat().st_size, float(np.median(seconds))
 
 
 def main():
     """Print the table."""
     import run as microcontroller
 
-    print(
-        "| controller | FMU: difference | library [kB] | Octave: difference | Cortex-M4F, float32 |"
-    )
-    print("| --- | --- | --- | --- | --- |")
+    columns = ("controller", "FMU: difference", "library [kB]", "step [us]")
+    columns += ("Octave: difference", "step [us]", "Cortex-M4F, float32")
+    print(f"| {' | '.join(columns)} |")
+    print("| --- " * len(columns) + "|")
     for kind, make in CONTROLLERS.items():
         controller = make()
         q, targets, commands = run_of_targets(controller)
         cells = [kind]
         with tempfile.TemporaryDirectory() as home:
-            steps, size = in_unit(controller, q, targets, Path(home))
-            cells += [f"{np.abs(steps - commands).max():.0e}", f"{size / 1e3:.0f}"]
+            steps, size, seconds = in_unit(controller, q, targets, Path(home))
+            difference = np.abs(steps - commands).max()
+            cells += [f"{difference:.0e}", f"{size / 1e3:.0f}", f"{1e6 * seconds:.1f}"]
         if shutil.which("mkoctfile") and np.ndim(targets[0]) == 1:
             with tempfile.TemporaryDirectory() as home:
                 _, steps, _ = in_octave(controller, q[None], targets, Path(home))
-                cells.append(f"{np.abs(steps[:, :-1] - commands).max():.0e}")
+                seconds = float(np.loadtxt(Path(home) / "seconds.txt"))
+            difference = np.abs(steps[:, :-1] - commands).max()
+            cells += [f"{difference:.0e}", f"{1e6 * seconds:.0f}"]
         else:
-            cells.append("")
+            cells += ["", ""]
         if microcontroller.missing():
             cells.append("")
         else:

@@ -47,7 +47,7 @@ def test_a_unit_of_a_model_computes_as_python(kind, tmp_path):
 def test_a_unit_of_a_controller_steps_as_python(kind, tmp_path):
     controller = systems.CONTROLLERS[kind]()
     q, targets, commands = systems.run_of_targets(controller)
-    steps, _ = systems.in_unit(controller, q, targets, tmp_path)
+    steps, *_ = systems.in_unit(controller, q, targets, tmp_path)
     np.testing.assert_allclose(steps, commands, rtol=0, atol=1e-12)
 
 

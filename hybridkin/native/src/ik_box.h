@@ -140,6 +140,7 @@ typedef struct {
 HK_INLINE void ik_eigen_of(int m, const real *g, ik_eigen *e) {
     real a[IK_ROWS][IK_ROWS];
     const real trace = ik_trace(m, g);
+    e->square[0] = R(0.0); /* compilers do not see that m > 0 */
     for (int k = 0, at = 0; k < m; k++)
         for (int i = k; i < m; i++) {
             a[i][k] = a[k][i] = g[at++];
