@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hybridkin._core.arrays import as_array
 from hybridkin._core.kernel_numbers import (
     IK_AT_REST,
     IK_DAMPING,
@@ -331,11 +332,11 @@ class Follower:
         self.state[[IK_SIGMA_MIN, IK_DISTANCE]] = math.nan
         self.state[[IK_DAMPING, IK_STOPPED]] = 0.0
         x, _ = self.core.settings.evaluate(q)
-        parts["x"][:] = x.flatten()
+        parts["x"][:] = as_array(x).ravel()
         self.state[IK_LAST] = self._dt
-        parts["dq"][:] = dq[0]
-        parts["q"][:] = q[0]
-        parts["before"][:] = q[0]
+        parts["dq"][:] = as_array(dq[0])
+        parts["q"][:] = as_array(q[0])
+        parts["before"][:] = parts["q"]
 
     def tick(self, target: object, dx: object, tip: object) -> bool:
         """Do a tick with plain arrays: the target, its velocity, the measured tip.

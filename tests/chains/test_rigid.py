@@ -362,7 +362,7 @@ def test_floating_and_planar_joints_are_moves_and_turns():
     first[:3, :3] = Rotation.from_euler("ZYX", q[3:6]).as_matrix()
     first[:3, 3] = q[:3].numpy() + np.array([1.0, 0.0, 0.0])
     second[:3, :3] = Rotation.from_euler("Z", float(q[8])).as_matrix()
-    second[:2, 3] = q[6:8]
+    second[:2, 3] = q[6:8].numpy()
     assert_close(arm.pose(q), torch.from_numpy(first @ second), rtol=0, atol=1e-15)
     with pytest.raises(ValueError, match="'o_x' is free"):
         arm.to_urdf(LINKS.format('<link name="c"/>' + both), "c")
