@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -102,6 +102,8 @@ class MarkedChain(Chain):
             "`markers` must be tuples (segment, fraction) or (segment, fraction, offset), with a "
             f"segment from 0 to {self.n_segments - 1} and a fraction in (0, 1]"
         )
+        if not isinstance(markers, Iterable):
+            raise TypeError(f"{need}, got {markers!r:.80}.")
         places: list[Marker] = []
         for marker in markers:
             try:
