@@ -11,9 +11,8 @@ from hybridkin._core.model import ForwardModel
 from hybridkin.chains.play import PlayOperator
 from hybridkin.chains.prandtl_ishlinskii import PrandtlIshlinskiiOperator
 
-_FACTORS = np.array(
-    [0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0]
-)  # widths, relative to one backlash
+# Widths of the plays, relative to one backlash.
+_FACTORS = np.array([0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0])
 _ROUNDS = 5
 _LEAST_NOISE = 1e-5  # relative to the spread of the tips
 _COMMON = 0.5  # prior correlation of the slopes of two actuators
@@ -102,19 +101,13 @@ class HysteresisProblem:
             A = (by_weights / units).reshape(len(rows) * self.x.shape[1], -1)
             B = by_slopes.reshape(len(A), -1)
             deviation = (slopes - self.start).ravel()
-            flat = weights.T.ravel() * units
-            y = residual.ravel() + A @ flat + B @ deviation
-            gram = A.T @ A + np.eye(A.shape[1])
-            explained = np.linalg.solve(gram, np.column_stack([A.T @ B, A.T @ y]))
-            system = B.T @ B - (B.T @ A) @ explained[:, :-1] + noise * precision
-            moment = B.T @ y - (B.T @ A) @ explained[:, -1]
-            # Slopes of zero and more: system (slopes - start) = moment with non-negative slopes.
-            factor = np.linalg.cholesky(system)
-            target = np.linalg.solve(factor, moment + system @ self.start.ravel())
-            slopes = nnls(factor.T, target)[0].reshape(K, n)
-            deviation = (slopes - self.start).ravel()
-            flat = explained[:, -1] - explained[:, :-1] @ deviation
-            weights = (flat / units).reshape(weights.T.shape).T
+            scaled_weights = weights.T.ravel() * units
+            y = residual.ravel() + A @ scaled_weights + B @ deviation
+            new_slopes, scaled_weights = _least_squares(
+                A, B, y, noise * precision, self.start.ravel()
+            )
+            slopes = new_slopes.reshape(K, n)
+            weights = (scaled_weights / units).reshape(weights.T.shape).T
         return slopes
 
     def _linearised(
@@ -139,3 +132,22 @@ class HysteresisProblem:
         by_slopes = by_actuators[:, :, None] * self.steps[rows][:, None]
         by_weights = by_weights.reshape(*residual.shape, -1)
         return residual, by_weights, by_slopes, weights
+
+
+def _least_squares(
+    A: NDArray, B: NDArray, y: NDArray, penalty: NDArray, start: NDArray
+) -> tuple[NDArray, NDArray]:
+    """Return the slopes s >= 0 and weights w of least |y - A w - B (s - start)|^2 + penalties.
+
+    The penalties are |w|^2 and (s - start)' penalty (s - start). The weights are eliminated first.
+    """
+    gram = A.T @ A + np.eye(A.shape[1])
+    explained = np.linalg.solve(gram, np.column_stack([A.T @ B, A.T @ y]))
+    system = B.T @ B - (B.T @ A) @ explained[:, :-1] + penalty
+    moment = B.T @ y - (B.T @ A) @ explained[:, -1]
+    # system (slopes - start) = moment, with slopes of zero and more.
+    factor = np.linalg.cholesky(system)
+    target = np.linalg.solve(factor, moment + system @ start)
+    slopes, _ = nnls(factor.T, target)
+    weights = explained[:, -1] - explained[:, :-1] @ (slopes - start)
+    return slopes, weights
