@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from hybridkin.calibration.play_fit import PlayFit, fit_play
     from hybridkin.chains import robots
     from hybridkin.chains.constant_curvature import ConstantCurvatureChain
+    from hybridkin.chains.creep import CreepOperator, CreepState
     from hybridkin.chains.elastic_tendons import ElasticTendonChain
     from hybridkin.chains.force_tendons import ForceTendonChain
     from hybridkin.chains.play import PlayOperator, PlayState
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
         PrandtlIshlinskiiOperator,
     )
     from hybridkin.chains.rigid import RigidChain
+    from hybridkin.chains.series import HysteresisSeries
     from hybridkin.hybrid.choose_rows import choose_rows
     from hybridkin.hybrid.estimator import HybridForwardModel
     from hybridkin.ik import tasks, trajectories
@@ -34,12 +36,15 @@ if TYPE_CHECKING:
 __all__ = [
     "CalibrationResult",
     "ConstantCurvatureChain",
+    "CreepOperator",
+    "CreepState",
     "ELMRegressor",
     "ELMRegressorCV",
     "ElasticTendonChain",
     "ForceTendonChain",
     "ForwardModel",
     "HybridForwardModel",
+    "HysteresisSeries",
     "HysteresisState",
     "IKSolution",
     "IKStatus",
@@ -75,11 +80,13 @@ _NAMES_OF = {
     "calibration.calibrate": ("CalibrationResult", "calibrate"),
     "calibration.play_fit": ("PlayFit", "fit_play"),
     "chains.constant_curvature": ("ConstantCurvatureChain",),
+    "chains.creep": ("CreepOperator", "CreepState"),
     "chains.elastic_tendons": ("ElasticTendonChain",),
     "chains.force_tendons": ("ForceTendonChain",),
     "chains.play": ("PlayOperator", "PlayState"),
     "chains.prandtl_ishlinskii": ("HysteresisState", "PrandtlIshlinskiiOperator"),
     "chains.rigid": ("RigidChain",),
+    "chains.series": ("HysteresisSeries",),
     "hybrid.choose_rows": ("choose_rows",),
     "hybrid.estimator": ("HybridForwardModel",),
     "ik.results": ("IKSolution", "IKStatus", "Step", "Track"),

@@ -18,18 +18,21 @@ _State = TypeVar("_State", bound=tuple)
 class HysteresisOperator(ABC, Generic[_State]):
     """Hysteresis between commanded and effective changes; the operator itself has no state.
 
-    The result depends on the order of the commands, not on their speed. The state is passed and
-    returned, so several robots or branches of a plan can share one operator.
+    The result depends on the order of the commands, with creep on their times as well. The state is
+    passed and returned, so several robots or branches of a plan can share one operator.
 
     Attributes
     ----------
     width : ndarray of shape () or (n,)
-        Largest distance between two commands with the same effective change [unit of q].
+        Largest distance between two commands with the same effective change, if actuators stay at
+        each of them [unit of q].
     """
 
     width: NDArray
 
-    def apply(self, q: Any, state: _State | None = None) -> tuple[Any, _State]:
+    def apply(
+        self, q: Any, state: _State | None = None, dt: ArrayLike = 1.0
+    ) -> tuple[Any, _State]:
         """Return the effective changes of a motion, and the state at its end.
 
         Parameters
@@ -38,6 +41,9 @@ class HysteresisOperator(ABC, Generic[_State]):
             Commanded tendon length changes in order of time [m].
         state : tuple, optional
             State at the end of the previous motion. None: start without hysteresis, y_0 = q_0.
+        dt : float or array-like of shape (T,), default=1.0
+            Time since the row before, of every row [s]. Only creep needs it. Without `state` the
+            first one has no effect.
 
         Returns
         -------
@@ -52,13 +58,15 @@ class HysteresisOperator(ABC, Generic[_State]):
             For a wrong shape, for entries that are not finite, or for no rows without a state.
         """
         rows, start = self._checked(q, state, "q")
-        result, end = self._applied(rows, start)
-        return _like(result, q), _like_caller(end, q)
+        result, end = self._applied(rows, start, _checked_steps(dt, len(rows)))
+        return _like(result, q), self._state_for(end, q)
 
-    def command(self, y: Any, state: _State | None = None) -> tuple[Any, _State]:
+    def command(
+        self, y: Any, state: _State | None = None, dt: ArrayLike = 1.0
+    ) -> tuple[Any, _State]:
         """Return the commands that give the effective changes y: the inverse of `apply`.
 
-        An actuator whose effective change stays the same keeps its command.
+        An actuator without creep whose effective change stays the same keeps its command.
 
         Parameters
         ----------
@@ -66,6 +74,8 @@ class HysteresisOperator(ABC, Generic[_State]):
             Desired effective changes in order of time [m].
         state : tuple, optional
             State at the end of the previous motion. None: start without hysteresis, q_0 = y_0.
+        dt : float or array-like of shape (T,), default=1.0
+            Time since the row before, of every row, as in `apply` [s].
 
         Returns
         -------
@@ -80,10 +90,12 @@ class HysteresisOperator(ABC, Generic[_State]):
             For a wrong shape, for entries that are not finite, or for no rows without a state.
         """
         rows, start = self._checked(y, state, "y")
-        result, end = self._commanded(rows, start)
-        return _like(result, y), _like_caller(end, y)
+        result, end = self._commanded(rows, start, _checked_steps(dt, len(rows)))
+        return _like(result, y), self._state_for(end, y)
 
-    def apply_by_group(self, q: Any, groups: ArrayLike) -> Any:
+    def apply_by_group(
+        self, q: Any, groups: ArrayLike, time: ArrayLike | None = None
+    ) -> Any:
         """Return the effective changes of a log of several motions, each with a new state.
 
         Parameters
@@ -92,6 +104,8 @@ class HysteresisOperator(ABC, Generic[_State]):
             Commanded tendon length changes, the rows of each motion in order of time [m].
         groups : array-like of shape (N,)
             Motion of every row.
+        time : array-like of shape (N,), optional
+            Time of every row, ascending in each motion [s]. Default: one second from row to row.
 
         Returns
         -------
@@ -101,14 +115,19 @@ class HysteresisOperator(ABC, Generic[_State]):
         Raises
         ------
         ValueError
-            For wrong shapes or entries that are not finite.
+            For wrong shapes, entries that are not finite or times that decrease.
         """
         rows = real_array(q, "q")
         check_shape(rows, "q", ("N", "n"))
         names = labels(groups, len(rows))
+        times = None if time is None else checked_times(time, names)
         effective = np.empty_like(rows)
         for name in np.unique(names):
-            effective[names == name], _ = self.apply(rows[names == name])
+            motion = names == name
+            steps: ArrayLike = 1.0
+            if times is not None:
+                steps = np.diff(times[motion], prepend=times[motion][:1])
+            effective[motion], _ = self.apply(rows[motion], dt=steps)
         return _like(effective, q)
 
     @property
@@ -121,12 +140,16 @@ class HysteresisOperator(ABC, Generic[_State]):
         """Return the state without hysteresis at a row (n,)."""
 
     @abstractmethod
-    def _applied(self, rows: NDArray, start: _State) -> tuple[NDArray, _State]:
-        """Return the effective changes of commands (T, n), and the last state."""
+    def _applied(
+        self, rows: NDArray, start: _State, steps: NDArray
+    ) -> tuple[NDArray, _State]:
+        """Return the effective changes of commands (T, n) after steps (T,), and the last state."""
 
     @abstractmethod
-    def _commanded(self, rows: NDArray, start: _State) -> tuple[NDArray, _State]:
-        """Return the commands of effective changes (T, n), and the last state."""
+    def _commanded(
+        self, rows: NDArray, start: _State, steps: NDArray
+    ) -> tuple[NDArray, _State]:
+        """Return the commands of effective changes (T, n) after steps (T,), and the last state."""
 
     def _checked(
         self, motion: Any, state: _State | None, name: str
@@ -139,29 +162,65 @@ class HysteresisOperator(ABC, Generic[_State]):
         if not np.isfinite(rows).all():
             raise ValueError(f"`{name}` must be finite, got NaN or infinity.")
         if state is not None:
-            return rows, _checked_state(state, self._start(np.zeros(rows.shape[1])))
+            return rows, self._checked_state(state, rows.shape[1])
         if not len(rows):
             need = "must hold at least one row if `state` is not given"
             raise ValueError(f"`{name}` {need}.")
         return rows, self._start(rows[0])
 
+    def _checked_state(self, state: Any, n: int) -> _State:
+        """Return a caller's state of n actuators, of the kind and the shapes of this operator."""
+        expected = self._start(np.zeros(n))
+        kind = type(expected)
+        if not isinstance(state, tuple) or len(state) != len(expected):
+            raise TypeError(f"`state` must be a {kind.__name__}, got {state!r:.80}.")
+        arrays = [real_array(part, "state") for part in state]
+        shapes = [part.shape for part in expected]
+        finite = all(np.isfinite(array).all() for array in arrays)
+        if not finite or [array.shape for array in arrays] != shapes:
+            need = f"must hold finite arrays of shapes {', '.join(map(str, shapes))}"
+            raise ValueError(f"`state` {need}, got {state!r:.200}.")
+        return kind(*arrays)
 
-def _checked_state(state: Any, expected: _State) -> _State:
-    """Return a caller's state, which must have the kind and the shapes of the expected one."""
-    kind = type(expected)
-    if not isinstance(state, tuple) or len(state) != len(expected):
-        raise TypeError(f"`state` must be a {kind.__name__}, got {state!r:.80}.")
-    arrays = [real_array(part, "state") for part in state]
-    shapes = [part.shape for part in expected]
-    finite = all(np.isfinite(array).all() for array in arrays)
-    if not finite or [array.shape for array in arrays] != shapes:
-        need = f"must hold finite arrays of shapes {', '.join(map(str, shapes))}"
-        raise ValueError(f"`state` {need}, got {state!r:.200}.")
-    return kind(*arrays)
+    def _state_for(self, state: _State, caller: NDArray | Tensor) -> _State:
+        """Return a state in tensors if the caller gave one."""
+        return type(state)(*(_like(part, caller) for part in state))
 
 
-def _like_caller(state: _State, caller: NDArray | Tensor) -> _State:
-    return type(state)(*(_like(part, caller) for part in state))
+def checked_times(time: ArrayLike, names: NDArray) -> NDArray:
+    """Return the times (N,) of rows [s], which must not decrease within a motion.
+
+    Parameters
+    ----------
+    time : array-like of shape (N,)
+        Times of a caller.
+    names : ndarray of shape (N,)
+        Motion of every row.
+    """
+    times = real_array(time, "time").astype(np.float64)
+    check_shape(times, "time", (len(names),), "one time for each row")
+    if not np.isfinite(times).all():
+        raise ValueError("`time` must be finite, got NaN or infinity.")
+    for name in np.unique(names):
+        if (np.diff(times[names == name]) < 0.0).any():
+            raise ValueError(
+                f"`time` must not decrease within a motion, but does in {name!r:.80}. Sort its "
+                "rows by time, or give other motions other names."
+            )
+    return times
+
+
+def _checked_steps(dt: ArrayLike, n_rows: int) -> NDArray:
+    """Return the time since the row before, of every row (T,) [s]."""
+    steps = real_array(dt, "dt").astype(np.float64)
+    if steps.shape not in ((), (n_rows,)):
+        raise ValueError(
+            f"`dt` must be a number or have shape ({n_rows},), one time for each row, got shape "
+            f"{steps.shape}."
+        )
+    if not (np.isfinite(steps) & (steps >= 0.0)).all():
+        raise ValueError(f"`dt` must be finite, zero or more, got {dt!r:.200}.")
+    return np.broadcast_to(steps, n_rows)
 
 
 def _like(values: NDArray, caller: NDArray | Tensor) -> Any:

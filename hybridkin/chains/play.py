@@ -77,10 +77,14 @@ class PlayOperator(HysteresisOperator[PlayState]):
     def _start(self, row: NDArray) -> PlayState:
         return PlayState(row, row)
 
-    def _applied(self, rows: NDArray, start: PlayState) -> tuple[NDArray, PlayState]:
+    def _applied(
+        self, rows: NDArray, start: PlayState, steps: NDArray
+    ) -> tuple[NDArray, PlayState]:
         return _moved(rows, start, self.width / 2, lead=False)
 
-    def _commanded(self, rows: NDArray, start: PlayState) -> tuple[NDArray, PlayState]:
+    def _commanded(
+        self, rows: NDArray, start: PlayState, steps: NDArray
+    ) -> tuple[NDArray, PlayState]:
         return _moved(rows, start, self.width / 2, lead=True)
 
 

@@ -103,16 +103,16 @@ class PrandtlIshlinskiiOperator(HysteresisOperator[HysteresisState]):
     def _start(self, row: NDArray) -> HysteresisState:
         return HysteresisState(row, row, np.tile(row, (len(self.widths), 1)))
 
-    def _steps(self, rows: NDArray) -> tuple[NDArray, NDArray]:
+    def _half_and_slopes(self, rows: NDArray) -> tuple[NDArray, NDArray]:
         """Return half the widths (K, 1), and the slopes (K, n), of which the last are 1."""
         slopes = np.ones((len(self.widths), rows.shape[1]), rows.dtype)
         slopes[:-1] = self.slopes.reshape(len(self.slopes), -1)
         return 0.5 * self.widths[:, None].astype(rows.dtype), slopes
 
     def _applied(
-        self, rows: NDArray, start: HysteresisState
+        self, rows: NDArray, start: HysteresisState, steps: NDArray
     ) -> tuple[NDArray, HysteresisState]:
-        half, slopes = self._steps(rows)
+        half, slopes = self._half_and_slopes(rows)
         plays = [
             played(rows, start.command, effective, half_width)
             for effective, half_width in zip(start.plays, half, strict=True)
@@ -126,10 +126,10 @@ class PrandtlIshlinskiiOperator(HysteresisOperator[HysteresisState]):
         return result, HysteresisState(rows[-1], result[-1].copy(), last)
 
     def _commanded(
-        self, rows: NDArray, start: HysteresisState
+        self, rows: NDArray, start: HysteresisState, steps: NDArray
     ) -> tuple[NDArray, HysteresisState]:
         command, effective, plays = start
-        half, slopes = self._steps(rows)
+        half, slopes = self._half_and_slopes(rows)
         actuators = np.arange(rows.shape[1])
         result = np.empty_like(rows)
         for t, row in enumerate(rows):

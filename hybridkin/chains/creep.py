@@ -1,0 +1,148 @@
+"""Creep of actuators or of the body: part of a change comes only with time."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hybridkin._core.arrays import real_array
+from hybridkin.chains.hysteresis import HysteresisOperator
+
+__all__ = ["CreepOperator", "CreepState"]
+
+_ROUNDING = 16.0  # of a command, in units of the precision
+
+
+class CreepState(NamedTuple):
+    """State of a creep operator, passed from one call to the next.
+
+    Attributes
+    ----------
+    command : array or Tensor of shape (n,)
+        Last command q [m].
+    slow : array or Tensor of shape (J, n)
+        Last slow states s_j [m].
+    """
+
+    command: Any
+    slow: Any
+
+
+class CreepOperator(HysteresisOperator[CreepState]):
+    """Creep between commanded and effective changes, as of polymers.
+
+    A share g_j of every change comes with the time constant tau_j, the rest at once::
+
+        s_j,t = q_t + exp(-dt_t / tau_j) (s_j,t-1 - q_t)
+        y_t = (1 - sum_j g_j) q_t + sum_j g_j s_j,t
+
+    At rest y = q, so a static model is the limit of the model with creep.
+
+    Parameters
+    ----------
+    gains : array-like of shape (J,) or (J, n)
+        Shares g_j of all actuators or of each, zero or more, with a sum below 1 [1].
+    times : array-like of shape (J,)
+        Time constants tau_j [s].
+
+    Attributes
+    ----------
+    width : ndarray of shape ()
+        Zero: commands of effective changes at rest are these changes. The commands of a motion lead
+        by more, the faster it is.
+
+    References
+    ----------
+    Kuhnen & Krejci, Compensation of complex hysteresis and creep effects in piezoelectrically
+    actuated systems, IEEE Transactions on Automatic Control 54, 2009: linear creep in series.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from hybridkin import CreepOperator
+    >>> creep = CreepOperator([0.2], [10.0])
+    >>> y, state = creep.apply(np.array([[0.0], [1.0], [1.0]]), dt=[0.0, 1.0, 30.0])
+    >>> y.ravel().round(3)
+    array([0.   , 0.819, 0.991])
+    >>> creep.command(y, dt=[0.0, 1.0, 30.0])[0].ravel()
+    array([0., 1., 1.])
+    """
+
+    def __init__(self, gains: ArrayLike, times: ArrayLike) -> None:
+        self.gains = real_array(gains, "gains").astype(float)
+        self.times = real_array(times, "times").astype(float)
+        positive = np.isfinite(self.times) & (self.times > 0.0)
+        if self.times.ndim != 1 or not self.times.size or not positive.all():
+            raise ValueError(
+                f"`times` must be (J,) finite positive numbers, got {times!r:.200}."
+            )
+        shaped = self.gains.ndim in (1, 2) and len(self.gains) == len(self.times)
+        if not shaped or not _are_shares(self.gains):
+            raise ValueError(
+                f"`gains` must have shape ({len(self.times)},), or one such column for each "
+                f"actuator, and be zero or more with a sum below 1, got {gains!r:.200}."
+            )
+        self.width = np.zeros(())
+
+    def __repr__(self) -> str:
+        return (
+            f"CreepOperator(gains={self.gains.tolist()}, times={self.times.tolist()})"
+        )
+
+    @property
+    def _size(self) -> int | str:
+        return self.gains.shape[1] if self.gains.ndim == 2 else "n"
+
+    def _start(self, row: NDArray) -> CreepState:
+        return CreepState(row, np.tile(row, (len(self.times), 1)))
+
+    def _applied(
+        self, rows: NDArray, start: CreepState, steps: NDArray
+    ) -> tuple[NDArray, CreepState]:
+        gains = self._gains(rows)
+        at_once = 1.0 - gains.sum(axis=0)
+        command, slow = start
+        result = np.empty_like(rows)
+        decays = slow_shares(steps, self.times).astype(rows.dtype)
+        for t, decay in enumerate(decays):
+            command = rows[t]
+            slow = command + decay[:, None] * (slow - command)
+            result[t] = at_once * command + (gains * slow).sum(axis=0)
+        return result, CreepState(command, slow)
+
+    def _commanded(
+        self, rows: NDArray, start: CreepState, steps: NDArray
+    ) -> tuple[NDArray, CreepState]:
+        gains = self._gains(rows)
+        command, slow = start
+        result = np.empty_like(rows)
+        decays = slow_shares(steps, self.times).astype(rows.dtype)
+        for t, decay in enumerate(decays):
+            # y = (1 - sum of late) q + late @ slow, with the shares that have not come yet.
+            late = gains * decay[:, None]
+            at_once = 1.0 - late.sum(axis=0)
+            moved = (rows[t] - (late * slow).sum(axis=0)) / at_once
+            # Rounding is no reversal, after which a backlash before this operator would jump.
+            size = np.abs(rows[t]) + (late * np.abs(slow)).sum(axis=0)
+            rounding = _ROUNDING * np.finfo(rows.dtype).eps * size / at_once
+            command = np.where(np.abs(moved - command) <= rounding, command, moved)
+            slow = command + decay[:, None] * (slow - command)
+            result[t] = command
+        return result, CreepState(command, slow)
+
+    def _gains(self, rows: NDArray) -> NDArray:
+        """Return the gains (J, 1) or (J, n) in the precision of rows."""
+        return self.gains.reshape(len(self.gains), -1).astype(rows.dtype)
+
+
+def slow_shares(steps: NDArray, times: NDArray) -> NDArray:
+    """Return what is left of a change after steps (T,) for time constants (J,), (T, J)."""
+    with np.errstate(over="ignore", under="ignore"):  # far longer or shorter steps
+        return np.exp(-steps[:, None] / times)
+
+
+def _are_shares(gains: NDArray) -> bool:
+    """Return whether gains are zero or more and leave a part that comes at once."""
+    return bool((gains >= 0.0).all() and (gains.sum(axis=0) < 1.0).all())

@@ -1,0 +1,192 @@
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from torch.testing import assert_close
+
+from hybridkin import (
+    CreepOperator,
+    HysteresisSeries,
+    PlayOperator,
+    PrandtlIshlinskiiOperator,
+)
+
+TIMES = [0.5, 10.0, 200.0]
+ROWS = st.integers(1, 12).flatmap(
+    lambda T: arrays(np.float64, (T, 3), elements=st.floats(-0.01, 0.01))
+)
+STEPS = arrays(np.float64, (12,), elements=st.sampled_from([0.0, 0.1, 1.0, 7.0, 1e6]))
+CREEPS = arrays(np.float64, (3, 3), elements=st.sampled_from([0.0, 0.05, 0.3])).map(
+    lambda gains: CreepOperator(gains, TIMES)
+)
+OPERATORS = CREEPS | st.tuples(
+    st.sampled_from(
+        [
+            PlayOperator(0.004),
+            PlayOperator([0.0, 0.001, 0.01]),
+            PrandtlIshlinskiiOperator([0.0, 0.001, 0.009], [0.3, 1.2]),
+        ]
+    ),
+    CREEPS,
+).map(HysteresisSeries)
+CHECKS = settings(max_examples=100, deadline=None)
+
+
+def close(a, b, atol=1e-14):
+    assert_close(torch.as_tensor(a), torch.as_tensor(b), rtol=0.0, atol=atol)
+
+
+def parts(state):
+    """Return the arrays of a state, or of the states of a series."""
+    if isinstance(state, tuple):
+        return [array for part in state for array in parts(part)]
+    return [state]
+
+
+def test_a_step_by_hand():
+    creep = CreepOperator([0.3, 0.2], [2.0, 50.0])
+    time = np.array([0.0, 0.5, 0.7, 3.0, 100.0, 1e5])
+    y, state = creep.apply(np.array([[0.0], *[[1.0]] * 5]), dt=np.diff(time, prepend=0.0))
+    expected = 1.0 - 0.3 * np.exp(-time / 2.0) - 0.2 * np.exp(-time / 50.0)
+    close(y[1:, 0], expected[1:])
+    close(state.slow, np.ones((2, 1)))
+
+
+@CHECKS
+@given(past=ROWS, y=ROWS, steps=STEPS, operator=OPERATORS)
+def test_commanding_is_the_inverse(past, y, steps, operator):
+    _, state = operator.apply(past)
+    for before in (None, state):
+        q, sent = operator.command(y, before, steps[: len(y)])
+        reached, state = operator.apply(q, before, steps[: len(y)])
+        close(reached, y, atol=1e-12)
+        for array, expected in zip(parts(state), parts(sent), strict=True):
+            close(array, expected, atol=1e-12)
+
+
+@CHECKS
+@given(q=ROWS, steps=STEPS, operator=OPERATORS, data=st.data())
+def test_chunks_with_the_state_carried_are_the_whole(q, steps, operator, data):
+    steps = steps[: len(q)]
+    at = data.draw(st.integers(0, len(q)))
+    for run in (operator.apply, operator.command):
+        whole, end = run(q, None, steps)
+        state = run(q[:1])[1] if at == 0 else None
+        first, state = run(q[:at], state, steps[:at])
+        second, last = run(q[at:], state, steps[at:])
+        close(np.concatenate([first, second]), whole)
+        for array, expected in zip(parts(last), parts(end), strict=True):
+            close(array, expected)
+
+
+@CHECKS
+@given(q=ROWS, operator=CREEPS)
+def test_at_rest_the_result_is_the_command(q, operator):
+    _, state = operator.apply(q)
+    close(operator.apply(q[-1:], state, 1e5)[0], q[-1:], atol=1e-12)
+
+
+def test_time_matters_only_by_what_lies_between():
+    # A command that stays for three steps is one that stays as long in one.
+    creep = CreepOperator([0.4], [3.0])
+    q = np.array([[0.0], [1.0], [1.0], [1.0], [0.2]])
+    y, _ = creep.apply(q, dt=[0.0, 0.5, 1.0, 1.5, 2.0])
+    close(creep.apply(q[[0, 1, 4]], dt=[0.0, 3.0, 2.0])[0], y[[0, 3, 4]])
+
+
+def test_each_motion_starts_at_rest_and_has_its_times():
+    operator = HysteresisSeries([PlayOperator(0.3), CreepOperator([0.4], [3.0])])
+    rng = np.random.default_rng(0)
+    q = rng.normal(size=(30, 2))
+    groups = np.arange(30) % 3
+    time = np.cumsum(rng.uniform(0.1, 5.0, 30))
+    y = operator.apply_by_group(q, groups, time)
+    for name in range(3):
+        rows = groups == name
+        steps = np.diff(time[rows], prepend=0.0)
+        close(y[rows], operator.apply(q[rows], dt=steps)[0])
+        close(operator.apply_by_group(q, groups)[rows], operator.apply(q[rows])[0])
+
+
+def test_commands_of_a_target_that_stays_do_not_jump_by_the_backlash():
+    # In rounding the inverse of creep goes to and fro; a backlash must not follow it.
+    series = HysteresisSeries([PlayOperator(0.5), CreepOperator([0.2, 0.7], [2.0, 9.0])])
+    _, state = series.apply(np.random.default_rng(0).normal(size=(20, 3)))
+    for target in np.random.default_rng(1).normal(size=(5, 3)):
+        y = np.tile(target, (1000, 1))
+        q, state = series.command(y, state)
+        turns = np.abs(np.diff(np.sign(np.diff(q, axis=0)), axis=0))[1:] > 1.0
+        assert not turns.any()
+
+
+def test_a_series_is_one_operator_after_the_other():
+    friction = PrandtlIshlinskiiOperator([0.0, 0.5, 2.0], [0.25, 0.5])
+    creep = CreepOperator([[0.1, 0.3], [0.2, 0.0]], [2.0, 9.0])
+    q = np.random.default_rng(0).normal(size=(20, 2))
+    series = HysteresisSeries([friction, creep])
+    y, (of_friction, of_creep) = series.apply(q, dt=0.7)
+    moved, end = friction.apply(q)
+    expected, slow = creep.apply(moved, dt=0.7)
+    close(y, expected)
+    close(of_friction.plays, end.plays)
+    close(of_creep.slow, slow.slow)
+    assert series.width == friction.width
+
+
+def test_single_precision_and_tensors_come_back_as_they_came():
+    series = HysteresisSeries([PlayOperator(0.5), CreepOperator([0.2, 0.3], [2.0, 9.0])])
+    q = torch.randn(20, 3, generator=torch.Generator().manual_seed(0))
+    for run in (series.apply, series.command):
+        y, state = run(q)
+        assert y.dtype == state[0].command.dtype == state[1].slow.dtype == torch.float32
+        assert_close(y.double(), run(q.double())[0], rtol=0.0, atol=2e-6)
+        again, _ = run(q, state)
+        assert again.dtype == torch.float32
+
+
+@pytest.mark.parametrize(
+    ("gains", "times", "name"),
+    [
+        ([0.2], [0.0], "times"),
+        ([0.2], [np.inf], "times"),
+        ([], [], "times"),
+        ([0.2], 1.0, "times"),
+        ([-0.1], [1.0], "gains"),
+        ([np.nan], [1.0], "gains"),
+        ([0.5, 0.5], [1.0, 2.0], "gains"),
+        ([0.1, 0.1], [1.0], "gains"),
+        (0.1, [1.0], "gains"),
+    ],
+)
+def test_bad_gains_and_times_are_named(gains, times, name):
+    with pytest.raises(ValueError, match=f"`{name}` must"):
+        CreepOperator(gains, times)
+
+
+def test_bad_rows_steps_and_states_are_named():
+    creep = CreepOperator([[0.5, 0.5]], [1.0])
+    q = np.zeros((3, 2))
+    with pytest.raises(ValueError, match=r"`q` must have shape \(T, 2\), got \(3, 3\)"):
+        creep.apply(np.zeros((3, 3)))
+    for dt in (-1.0, np.nan, [1.0, 1.0], [[1.0], [1.0], [1.0]]):
+        with pytest.raises(ValueError, match="`dt` must"):
+            creep.command(q, dt=dt)
+    with pytest.raises(ValueError, match="`time` must not decrease within a motion"):
+        creep.apply_by_group(q, [0, 1, 1], [5.0, 4.0, 3.0])
+    assert creep.apply_by_group(q, [0, 1, 1], [5.0, 4.0, 4.0]).shape == (3, 2)
+    with pytest.raises(ValueError, match="`time` must"):
+        creep.apply_by_group(q, [0, 1, 1], [5.0, 4.0])
+    series = HysteresisSeries([PlayOperator(0.1), creep])
+    _, state = series.apply(q)
+    with pytest.raises(TypeError, match="`state` must be a tuple of the states of 2 operators"):
+        series.apply(q, state[:1])
+    with pytest.raises(TypeError, match="`state` must be a CreepState"):
+        series.apply(q, (state[0], "slow"))
+    with pytest.raises(ValueError, match="`operators` must be for equally many actuators"):
+        HysteresisSeries([PlayOperator([0.1, 0.1, 0.1]), creep])
+    with pytest.raises(ValueError, match="`operators` must hold at least one"):
+        HysteresisSeries([])
+    with pytest.raises(TypeError, match="`operators` must hold operators"):
+        HysteresisSeries([0.1])
