@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
+from scipy.linalg import eigh, solve_triangular
 from torch import Tensor, nn
 
 from hybridkin._core.arrays import identity
@@ -23,7 +23,12 @@ from hybridkin._core.plan import Plan
 from hybridkin._core.stored import Layout, Stored
 from hybridkin.calibration.choice import split_by_effect
 from hybridkin.hybrid._features import center_and_scale
-from hybridkin.learning.network import LeverageModule, lever_numbers, write_network
+from hybridkin.learning.network import (
+    ELM,
+    LeverageModule,
+    lever_numbers,
+    write_network,
+)
 
 GUARDS = ("leverage", "box", None)
 _AS_IF = 0.1  # of half the range: the spread assumed in a direction that the log does not move
@@ -33,6 +38,10 @@ _TESTED = 0.98  # share of these rows whose distances from other groups count as
 _STEP = 0.2  # least tested distance, and the domain without data; the range of an actuator is 2
 _OFF = 0.02  # domain off the plane of a log; the range of an actuator is 2
 _AS_LOGGED = 3.0  # plus so many times its rms there
+_BESIDE = 1000  # rows of the log, and as many beside them, for which distances are kept
+_BEYOND = 1.5  # how far beside, in ranges of the log
+_CHANGE = 5e-4  # largest relative change of their distances; of weights it is less than twice this
+_ROUNDING = 1e-9  # largest rounding of their distances
 
 
 class Guard(PortableModule):
@@ -166,9 +175,59 @@ class LeverageGuard(Guard):
         h = in_blocks(lambda rows: (model.leverage(rows)[:, None],), q)[0][:, 0]
         return cls(model, (h / (1.0 - counts * h).clamp(min=1e-9)).max(), largest)
 
+    def of_low_rank(self, q: Tensor) -> LeverageGuard:
+        """Return the guard with a network whose leverage has a prior and few columns.
+
+        With A = R R' the inverse of the Gram matrix plus lambda, and p its largest eigenvalue, the
+        leverage is p |v|^2 - v' (p - A) v. The eigenvectors of p - A are sorted: those along which
+        the features of the training rows vary most come first, so most rows need only a few for an
+        upper bound. Eigenvectors are left out if this does not change the distances of rows in the
+        log and beside it. Where p is so large that the difference cancels digits, nothing changes.
+
+        Parameters
+        ----------
+        q : Tensor of shape (N, n)
+            The training rows.
+        """
+        network = self.model
+        if not isinstance(network, ELM):
+            return self
+        factor = network.leverage_factor.numpy(force=True)
+        eigenvalues, axes = eigh(factor @ factor.T)
+        prior = eigenvalues[-1]
+        columns = axes * np.sqrt(prior - eigenvalues)
+        rows = _rows_beside(q)
+        with torch.no_grad():
+            v = (network.features(rows) - network.leverage_center.to(rows)).numpy()
+            least = self.domain_distance(rows).clamp(min=1.0) * self.limit
+        squares = np.square(v @ columns) / least.numpy()[:, None]
+        rounding = np.square(v).sum(1) * prior / least.numpy() * np.finfo(float).eps
+        if not rounding.max() < _ROUNDING:
+            return self
+        left_out = np.cumsum(squares[:, ::-1], axis=1)[:, ::-1].max(0)
+        count = int(np.sum(left_out > _CHANGE))
+        count += -count % HK_GROUP  # a kernel takes so many at once
+        arrays = {name: a.cpu() for name, a in network.state_dict().items()}
+        arrays |= {"leverage_factor": columns[:, :count], "leverage_prior": prior}
+        model = ELM(network.activation, **arrays).to(network.leverage_factor.device)
+        return LeverageGuard(model, self.limit, self.largest)
+
     def domain_distance(self, q: Tensor) -> Tensor:
         """Return the leverage of q divided by the limit, shape (...)."""
         return self.model.leverage(q) / self.limit.to(q)
+
+
+def _rows_beside(q: Tensor) -> Tensor:
+    """Return rows of the log q (N, n), and rows beside them in random directions."""
+    rows = q[:: max(1, len(q) // _BESIDE)].numpy()
+    random = np.random.default_rng(0)
+    start = rows[random.integers(len(rows), size=_BESIDE)]
+    direction = random.normal(size=start.shape)
+    direction[::3] = np.where(np.abs(direction[::3]) < 1.0, 0.0, direction[::3])
+    direction /= np.abs(direction).max(1, keepdims=True).clip(min=1e-300)
+    far = random.uniform(0.0, _BEYOND, (_BESIDE, 1))
+    beside = start + far * direction * np.ptp(rows, axis=0)
+    return torch.from_numpy(np.concatenate([rows, beside]))
 
 
 def _write_box_guard(plan: Plan, stored: Stored) -> int:
@@ -217,7 +276,8 @@ def _write_quadratic_leverage(plan: Plan, stored: Stored) -> int:
     # |L^-1 phi|^2 in the form of a network's leverage: R = L^-T is upper triangular.
     identity_matrix = np.eye(2 * len(center) + 1)
     factor = solve_triangular(stored.array("factor"), identity_matrix, lower=True).T
-    _, lever = lever_numbers(plan, np.zeros(1), np.zeros(len(factor)), np.triu(factor))
+    zeros = np.zeros(1), np.zeros(1), np.zeros(len(factor))
+    _, lever = lever_numbers(plan, *zeros, np.triu(factor))
     numbers = [center, 1.0 / half_width, *lever]
     return plan.node("quadratic_leverage", len(center), 0, numbers, aligned=True)
 

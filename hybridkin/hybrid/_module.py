@@ -83,6 +83,12 @@ class TipCorrection(PortableModule):
         self.module = module
         self.guard = guard
 
+    def take_low_rank(self, q: Tensor) -> None:
+        """Give the network and its guard a leverage of low rank, for training rows q (N, n)."""
+        if isinstance(self.guard, LeverageGuard) and self.guard.model is self.module:
+            self.guard = self.guard.of_low_rank(q)
+            self.module = self.guard.model
+
     def value(self, q: Tensor, inside: Inside | None) -> Tensor:
         """Return c(q) at rows q (N, n), shape (N, m) [m]."""
         return self.module(q)

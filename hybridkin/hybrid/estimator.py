@@ -34,6 +34,7 @@ from hybridkin.hybrid._adapt import (
 from hybridkin.hybrid._drift import Drift
 from hybridkin.hybrid._fit import few_rows, fit_hybrid, fit_messages
 from hybridkin.hybrid._html import fitted_rows
+from hybridkin.hybrid._module import TipCorrection
 from hybridkin.hybrid._play import play_of
 from hybridkin.hybrid._predictor import HybridPredictor
 from hybridkin.hybrid._radius import Radius, conformal_radius
@@ -277,6 +278,9 @@ class HybridForwardModel(HybridPredictor):
             spec = replace(spec, commanded=rows.directions)
             rows = replace(log, X=self._effective(log.X, log.groups)).distinct()
         fitted = fit_hybrid(replace(spec, progress=progress), rows)
+        for part in [*fitted.module.modules()]:
+            if isinstance(part, TipCorrection):
+                part.take_low_rank(rows.q)
         self.calibration_ = fitted.spec.calibration
         self.error_model_ = fitted.error.result
         self._learned = fitted.error.learned

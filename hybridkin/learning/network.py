@@ -1,5 +1,7 @@
 """A random hidden layer with a readout as a torch module, with closed-form derivatives."""
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from torch import nn
@@ -53,32 +55,39 @@ def write_units(plan, kind, activation, scaling, readout, hidden, lever=()):
     units[:n_hidden] = np.column_stack([W, b, output.T])
     groups = units.reshape(-1, HK_GROUP, n + 1 + m).swapaxes(1, 2)
     numbers = [center, 1.0 / scale, intercept, direct, groups]
-    n_features = 0
-    full = False
+    entries = [n_hidden, KERNELS.index(activation)]
     if lever:
-        n_features = len(lever[1])
-        full, leverage = lever_numbers(plan, *lever)
+        sizes, leverage = lever_numbers(plan, *lever)
         numbers += leverage
-    entries = (n_hidden, KERNELS.index(activation), n_features, full)
+        entries += sizes
     return plan.node(kind, n, m, numbers, *entries, aligned=True)
 
 
-def lever_numbers(plan, offset, center, factor):
-    """Return whether a factor R (f, f) is full, and the numbers of |R' (phi - center)|^2 + offset.
+def lever_numbers(plan, offset, prior, center, factor):
+    """Return sizes and numbers of the leverage, see `ELM`.
 
-    R is stored in blocks of columns; the first block starts with zeros as padding. An upper
-    triangular R is stored down to its diagonal.
+    Parameters
+    ----------
+    plan : Plan
+        The plan.
+    offset, prior : ndarray of shape ()
+        Offset and prior.
+    center : ndarray of shape (f,)
+        The features' center.
+    factor : ndarray of shape (f, k)
+        The factor R. If it is upper triangular, kernels skip the zeros.
+
+    Returns
+    -------
+    sizes : tuple of int
+        f, k, and whether R is full.
+    numbers : list of ndarray
+        The columns of R come last, one after the other.
     """
-    n_features = len(center)
+    n_features, n_columns = factor.shape
     plan.limit("features", n_features)
-    full = bool(np.tril(factor, -1).any())
-    padded = np.pad(factor, ((0, 0), (-n_features % HK_GROUP, 0)))
-    ends = range(n_features, 0, -HK_GROUP)[::-1]
-    columns = np.split(padded, len(ends), axis=1)
-    numbers = [offset, center, np.zeros(-(1 + n_features) % HK_GROUP)]
-    if not full:
-        columns = [block[:end] for block, end in zip(columns, ends, strict=True)]
-    return full, numbers + columns
+    full = n_columns < n_features or np.tril(factor, -1).any()
+    return (n_features, n_columns, full), [offset, prior, center, factor.T]
 
 
 def write_network(plan, stored, leverage=False):
@@ -94,9 +103,8 @@ def write_network(plan, stored, leverage=False):
     readout = stored.array("intercept"), direct.T, weights[:n_hidden].T
     lever = ()
     if leverage:
-        lever = [
-            stored.array(f"leverage_{name}") for name in ("offset", "center", "factor")
-        ]
+        names = "offset", "prior", "center", "factor"
+        lever = [stored.array(f"leverage_{name}") for name in names]
     activation = stored.value("activation", str)
     return write_units(plan, "elm", activation, scaling, readout, (W, b), lever)
 
@@ -131,8 +139,11 @@ class ELM(LeverageModule):
         - input_center, input_scale (n_inputs,): affine map of the inputs [unit of q];
         - output_weights (n_features, n_outputs), intercept (n_outputs,): the readout [unit of
           eps], where `n_features` is `n_hidden`, plus `n_inputs` with a direct link;
-        - leverage_center (n_features,), leverage_factor (n_features, n_features), leverage_offset
-          (): ``leverage = |(phi - leverage_center) @ leverage_factor|^2 + leverage_offset``.
+        - leverage_center (n_features,), leverage_factor (n_features, k), leverage_offset (),
+          leverage_prior (): with v = phi - leverage_center, the leverage is
+          ``|v @ leverage_factor|^2 + leverage_offset``. If the prior is not 0, it is
+          ``leverage_prior |v|^2 - |v @ leverage_factor|^2 + leverage_offset``: the leverage without
+          training rows, less what these rows reduce it by. Missing: 0.
     """
 
     layout = Layout(
@@ -146,7 +157,8 @@ class ELM(LeverageModule):
             "intercept": "m",
             "leverage_offset": "",
             "leverage_center": "f",
-            "leverage_factor": "ff",
+            "leverage_factor": "fk",
+            "leverage_prior": "",
         },
         {"activation": str},
         write_plan=write_network,
@@ -156,7 +168,8 @@ class ELM(LeverageModule):
         super().__init__()
         self.activation = activation
         one_of(activation, "activation", ACTIVATIONS)
-        for name in LAYER + READOUT:
+        arrays = {"leverage_prior": np.zeros(()), **arrays}
+        for name in (*LAYER, *READOUT, "leverage_prior"):
             array = np.asarray(arrays[name], order="C")
             self.register_buffer(name, torch.tensor(array, device="cpu"))
         n_hidden, self.n_actuators = self.input_weights.shape
@@ -169,6 +182,12 @@ class ELM(LeverageModule):
         w_in = self.input_weights / self.input_scale
         w_out = self.output_weights[:n_hidden]
         self.register_buffer("tangent", (w_out.T[:, None] * w_in.T).flatten(0, 1))
+
+    @classmethod
+    def from_stored(cls, stored, restore):
+        """Return the module built from a description; that of an old file has no prior."""
+        arrays = {"leverage_prior": np.zeros(()), **stored.arrays}
+        return super().from_stored(replace(stored, arrays=arrays), restore)
 
     def extra_repr(self):
         """Return the layer sizes and the activation, for printing."""
@@ -253,5 +272,8 @@ class ELM(LeverageModule):
         return self._leverage(self.features(q))
 
     def _leverage(self, phi):
-        r = (phi - self.leverage_center.to(phi)) @ self.leverage_factor.to(phi)
-        return (r * r).sum(-1) + self.leverage_offset.to(phi)
+        v = phi - self.leverage_center.to(phi)
+        prior = self.leverage_prior.to(phi)
+        squares = (v @ self.leverage_factor.to(phi)).square().sum(-1)
+        reduced = prior * v.square().sum(-1) - squares
+        return torch.where(prior > 0.0, reduced, squares) + self.leverage_offset.to(phi)

@@ -7,7 +7,7 @@ from numpy.testing import assert_array_equal
 from sklearn.linear_model import LinearRegression
 from torch.testing import assert_close
 
-from hybridkin import ConstantCurvatureChain, HybridForwardModel
+from hybridkin import ConstantCurvatureChain, ELMRegressor, HybridForwardModel
 from hybridkin.hybrid._guards import GroupDistance, LeverageGuard, QuadraticLeverage
 
 LONGEST = torch.tensor(0.01).double()
@@ -44,6 +44,36 @@ def test_weight_is_smooth_at_the_limit(factor):
     q = at[(guard.domain_distance(at) - factor).abs().argmin()][None].requires_grad_()
     assert torch.autograd.gradcheck(guard, q, atol=1e-7)
     assert torch.autograd.gradgradcheck(guard, q, atol=1e-4)
+
+
+def network_guard(alpha, n_rows=200, n=3):
+    q = rows(n_rows, n)
+    elm = ELMRegressor(120, alpha=alpha, random_state=0).fit(q.numpy(), q.numpy())
+    return q, LeverageGuard.fit(elm.module_, q, LONGEST, torch.ones(n_rows).double())
+
+
+@pytest.mark.parametrize("alpha", [1.0, 1e-2, 1e-4])
+def test_a_leverage_of_low_rank_keeps_distances_and_weights(alpha):
+    q, full = network_guard(alpha)
+    guard = full.of_low_rank(q)
+    n_features, n_columns = guard.model.leverage_factor.shape
+    assert n_columns <= 0.6 * n_features
+    assert_close(guard.model(q), full.model(q), rtol=0, atol=0)
+    far = q + 3.0 * torch.rand(len(q), 1).double() * rows(len(q), 3, seed=5)
+    for at in (q, far, rows(500, 3, seed=6) * 2.5):
+        distance = full.domain_distance(at)
+        change = (guard.domain_distance(at) - distance) / distance.clamp(min=1.0)
+        # Columns that are left out only reduced the leverage.
+        assert -1e-9 < change.min()
+        assert change.max() < 1e-3
+        assert_close(guard(at), full(at), rtol=0, atol=1e-3)
+    assert distance.min() < 1.0
+    assert distance.max() > 6.0
+
+
+def test_a_leverage_whose_low_rank_would_cancel_digits_stays_as_it_is():
+    q, full = network_guard(1e-9)
+    assert full.of_low_rank(q) is full
 
 
 def two_lines(n_rows=11):

@@ -15,99 +15,109 @@ static inline HK(seen) HK(seen_of)(const hk_plan *p, V **work) {
     return seen;
 }
 
-/* Where R begins: offset and center are filled up, so that its blocks are aligned as their node. */
-#define HK_LEVER(f) ((1 + (f) + HK_GROUP - 1) / HK_GROUP * HK_GROUP)
-
-/* How many rows the block of R that begins at white number `at` has. */
-static inline int HK(lever_rows)(int f, int full, int at) {
-    return full ? f : at + HK_GROUP - (HK_GROUP - f % HK_GROUP) % HK_GROUP;
-}
-
-/* The leverage |white|^2 + offset, white = R' (phi - center). `lever` holds offset, center (f) and
-   R (f, f) in blocks of HK_GROUP columns, the first filled up by zeros in front; of an upper
-   triangular R only the rows down to the diagonal of a block. */
-#if HK_LANES == 1 && defined(HK_ROW_LANES)
-static real hkr_leverage(int f, int full, const real *lever, const real *phi, real *white);
-#endif
-#if HK_LANES > 1
-static real hkr_leverage(int f, int full, const real *lever, const real *phi, real *white) {
-    const real *block = lever + HK_LEVER(f);
-    real sum = lever[0];
-    for (int at = 0; at < f; at += HK_GROUP) {
-        const int rows = HK(lever_rows)(f, full, at);
-        for (int l = 0; l < HK_GROUP; l += HK_LANES) {
-            V r = SPLAT(0.0), s = r, t = r, v = r;
-            int i = 0;
-            for (; i + 4 <= rows; i += 4) { /* four sums: none waits for the one before */
-                r = r + HK(load)(block + HK_GROUP * i + l) * phi[i];
-                s = s + HK(load)(block + HK_GROUP * (i + 1) + l) * phi[i + 1];
-                t = t + HK(load)(block + HK_GROUP * (i + 2) + l) * phi[i + 2];
-                v = v + HK(load)(block + HK_GROUP * (i + 3) + l) * phi[i + 3];
-            }
-            for (; i < rows; i++) r = r + HK(load)(block + HK_GROUP * i + l) * phi[i];
-            r = (r + s) + (t + v);
-            __builtin_memcpy(white + at + l, &r, sizeof r);
-            sum += HK(sum)(r * r);
-        }
-        block += HK_GROUP * rows;
-    }
-    return sum;
-}
-#endif
-
-static inline V HK(leverage)(int f, int full, const real *lever, V *phi, V *white) {
-    for (int i = 0; i < f; i++) phi[i] = phi[i] - lever[1 + i];
-#if HK_LANES == 1 && defined(HK_ROW_LANES)
-    return hkr_leverage(f, full, lever, phi, white);
-#else
-    const real *block = lever + HK_LEVER(f);
-    V sum = SPLAT(lever[0]);
-    for (int at = 0; at < f; at += HK_GROUP) {
-        const int rows = HK(lever_rows)(f, full, at);
-        V r[HK_GROUP];
-        for (int l = 0; l < HK_GROUP; l++) r[l] = SPLAT(0.0);
-        for (int i = 0; i < rows; i++)
-            for (int l = 0; l < HK_GROUP; l++) r[l] = r[l] + phi[i] * block[HK_GROUP * i + l];
-        for (int l = 0; l < HK_GROUP; l++) sum = sum + r[l] * r[l];
-        for (int l = 0; l < HK_GROUP; l++) white[at + l] = r[l];
-        block += HK_GROUP * rows;
-    }
-    return sum;
-#endif
-}
-
-/* The slope (n) of the leverage by the features, slope = 2 R white. */
-static inline void HK(leverage_slope)(int f, int full, const real *lever, const V *white,
-                                      V *slope) {
-    const real *block = lever + HK_LEVER(f);
-    for (int i = 0; i < f; i++) slope[i] = SPLAT(0.0);
-    for (int at = 0; at < f; at += HK_GROUP) {
-        const int rows = HK(lever_rows)(f, full, at);
-        for (int i = 0; i < rows; i++) {
-            V sum = white[at] * block[HK_GROUP * i];
-            for (int l = 1; l < HK_GROUP; l++) sum = sum + white[at + l] * block[HK_GROUP * i + l];
-            slope[i] = slope[i] + R(2.0) * sum;
-        }
-        block += HK_GROUP * rows;
-    }
-}
-
-/* Where the numbers of a model's leverage begin, how many features it has, and whether R is full.
- */
-static inline const real *HK(lever)(const hk_plan *p, int at, int *f, int *full) {
+/* The leverage of a model. */
+static inline hk_factor HK(lever)(const hk_plan *p, int at) {
     const int32_t *node = p->code + at, *more = node + HK_MORE;
     const int n = node[HK_N], m = node[HK_M], network = HK_IS(p, at, HK_ELM);
     const int groups = network ? (more[0] + HK_GROUP - 1) / HK_GROUP : 0;
-    *f = network ? more[2] : 2 * n + 1;
-    *full = network && more[3];
-    return hk_numbers(p, at) + 2 * n + m + m * n + groups * HK_GROUP * (n + 1 + m);
+    const real *numbers = hk_numbers(p, at) + 2 * n + m + m * n + groups * HK_GROUP * (n + 1 + m);
+    const int f = network ? more[2] : 2 * n + 1;
+    hk_factor lever = {f, f, 0, numbers[0], numbers[1], numbers + 2, numbers + 2 + f};
+    if (network) {
+        lever.k = more[3];
+        lever.full = more[4];
+    }
+    return lever;
 }
 
-/* The leverage of q by the features of a network, or by [1, u, u^2]. */
-static inline V HK(leverage_at)(const hk_plan *p, int at, const V *q, HK(seen) * seen, V *work) {
+/* Columns `at` to `at + HK_GROUP` of R, and how many of their numbers are not zero. After the last
+   column they repeat the first of them. */
+static inline int HK(columns)(const hk_factor *lever, int at, const real **column) {
+    const int f = lever->f, to = at + HK_GROUP;
+    for (int l = 0; l < HK_GROUP; l++) column[l] = lever->R + f * (at + l < lever->k ? at + l : at);
+    return lever->full || to > f ? f : to;
+}
+
+#if HK_LANES == 1 && defined(HK_ROW_LANES)
+static void hkr_products(int rows, const real *const *column, const real *v, real *r);
+#endif
+#if HK_LANES > 1
+/* The products r of a vector v (rows) with HK_GROUP columns, with lanes over the rows. */
+static void hkr_products(int rows, const real *const *column, const real *v, real *r) {
+    V sum[HK_GROUP];
+    for (int l = 0; l < HK_GROUP; l++) sum[l] = SPLAT(0.0);
+    int i = 0;
+    for (; i + HK_LANES <= rows; i += HK_LANES) {
+        const V some = HK(load)(v + i);
+        for (int l = 0; l < HK_GROUP; l++) sum[l] = sum[l] + HK(load)(column[l] + i) * some;
+    }
+    for (int l = 0; l < HK_GROUP; l++) {
+        r[l] = HK(sum)(sum[l]);
+        for (int j = i; j < rows; j++) r[l] += column[l][j] * v[j];
+    }
+}
+#endif
+
+static inline void HK(products)(int rows, const real *const *column, const V *v, V *r) {
+#if HK_LANES == 1 && defined(HK_ROW_LANES)
+    hkr_products(rows, column, v, r);
+#else
+    V sum[HK_GROUP];
+    for (int l = 0; l < HK_GROUP; l++) sum[l] = SPLAT(0.0);
+    for (int i = 0; i < rows; i++)
+        for (int l = 0; l < HK_GROUP; l++) sum[l] = sum[l] + v[i] * column[l][i];
+    for (int l = 0; l < HK_GROUP; l++) r[l] = sum[l];
+#endif
+}
+
+/* The leverage of features phi, which become v, and its r in `white`. With a prior it only falls
+   from column to column: returns 0 as soon as it is at most `enough` for all rows, else 1. */
+static inline int HK(leverage)(const hk_factor *lever, real enough, V *phi, V *white, V *leverage) {
+    const int falls = lever->prior > R(0.0);
+    const real *column[HK_GROUP];
+    V sum = SPLAT(0.0);
+    for (int i = 0; i < lever->f; i++) {
+        phi[i] = phi[i] - lever->center[i];
+        sum = sum + phi[i] * phi[i];
+    }
+    sum = sum * lever->prior + lever->offset;
+    for (int at = 0; at < lever->k; at += HK_GROUP) {
+        const int rows = HK(columns)(lever, at, column);
+        HK(products)(rows, column, phi, white + at);
+        for (int l = 0; l < HK_GROUP; l++) {
+            if (at + l >= lever->k) white[at + l] = SPLAT(0.0);
+            const V square = white[at + l] * white[at + l];
+            sum = falls ? sum - square : sum + square;
+        }
+        *leverage = sum;
+        if (falls && !HK(any)(NOT(sum <= SPLAT(enough)))) return 0;
+    }
+    return 1;
+}
+
+/* Its slope (f) by the features, 2 R r or 2 prior v - 2 R r; in place of v. */
+static inline void HK(leverage_slope)(const hk_factor *lever, const V *white, V *v) {
+    const int falls = lever->prior > R(0.0);
+    const real *column[HK_GROUP];
+    for (int i = 0; i < lever->f; i++) v[i] = v[i] * (R(2.0) * lever->prior);
+    for (int at = 0; at < lever->k; at += HK_GROUP) {
+        const int rows = HK(columns)(lever, at, column);
+        V r[HK_GROUP];
+        for (int l = 0; l < HK_GROUP; l++) r[l] = white[at + l] * (falls ? R(-2.0) : R(2.0));
+        for (int i = 0; i < rows; i++) {
+            V sum = v[i];
+            for (int l = 0; l < HK_GROUP; l++) sum = sum + r[l] * column[l][i];
+            v[i] = sum;
+        }
+    }
+}
+
+/* The leverage of q by the features of a network, or by [1, u, u^2]; an upper bound if that is at
+   most `enough`. */
+static inline V HK(leverage_at)(const hk_plan *p, int at, real enough, const V *q, HK(seen) * seen,
+                                V *work) {
     const int n = p->code[at + HK_N];
-    int f, full;
-    const real *lever = HK(lever)(p, at, &f, &full);
+    const hk_factor lever = HK(lever)(p, at);
     if (seen->white_of == at) return seen->leverage;
     if (seen->phi_of != at && HK_IS(p, at, HK_ELM)) {
         V *x = HK(take)(&work, p->code[at + HK_M]);
@@ -117,8 +127,8 @@ static inline V HK(leverage_at)(const hk_plan *p, int at, const V *q, HK(seen) *
         HK(scaled)(n, hk_numbers(p, at), q, seen->phi + 1);
         for (int j = 1; j <= n; j++) seen->phi[n + j] = seen->phi[j] * seen->phi[j];
     }
-    seen->leverage = HK(leverage)(f, full, lever, seen->phi, seen->white);
-    seen->white_of = at;
+    const int exact = HK(leverage)(&lever, enough, seen->phi, seen->white, &seen->leverage);
+    seen->white_of = exact ? at : -1;
     seen->phi_of = -1;
     return seen->leverage;
 }
@@ -130,13 +140,12 @@ static inline void HK(leverage_slope_at)(const hk_plan *p, int at, const V *q, H
     const int n = node[HK_N], m = node[HK_M];
     const real *center = hk_numbers(p, at), *w = center + 2 * n + m + m * n;
     V *u = HK(take)(&work, n), *back = seen->phi;
-    int f, full;
-    const real *lever = HK(lever)(p, at, &f, &full);
-    HK(leverage_slope)(f, full, lever, seen->white, back);
+    const hk_factor lever = HK(lever)(p, at);
+    HK(leverage_slope)(&lever, seen->white, back);
     HK(scaled)(n, center, q, u);
     if (HK_IS(p, at, HK_ELM)) {
         const int n_hidden = node[HK_MORE];
-        for (int j = 0; j < n; j++) slope[j] = f > n_hidden ? back[n_hidden + j] : SPLAT(0.0);
+        for (int j = 0; j < n; j++) slope[j] = lever.f > n_hidden ? back[n_hidden + j] : SPLAT(0.0);
         for (int h = 0; h < n_hidden; h++) {
             const real *unit = w + h / HK_GROUP * HK_GROUP * (n + 1 + m) + h % HK_GROUP;
             V a = SPLAT(unit[HK_GROUP * n]), d;
@@ -150,12 +159,15 @@ static inline void HK(leverage_slope_at)(const hk_plan *p, int at, const V *q, H
     for (int j = 0; j < n; j++) slope[j] = slope[j] * center[n + j];
 }
 
-/* How far q is from the training rows of a guard, at most 1 among them. */
-static inline V HK(guard_distance)(const hk_plan *p, int at, const V *q, HK(seen) * seen, V *work) {
+/* How far q is from the training rows of a guard, at most 1 among them; an upper bound if that is
+   at most `enough`. */
+static inline V HK(guard_distance)(const hk_plan *p, int at, real enough, const V *q,
+                                   HK(seen) * seen, V *work) {
     const int n = p->code[at + HK_N];
     const real *numbers = hk_numbers(p, at), *low = numbers + 1, *high = low + n;
     if (HK_IS(p, at, HK_LEVERAGE_GUARD))
-        return HK(leverage_at)(p, p->code[at + HK_MORE], q, seen, work) / numbers[1];
+        return HK(leverage_at)(p, p->code[at + HK_MORE], enough * numbers[1], q, seen, work) /
+               numbers[1];
     V sum = SPLAT(1.0);
     for (int j = 0; j < n; j++) {
         const V below = HK(max)(low[j] - q[j], SPLAT(0.0)),
@@ -185,12 +197,13 @@ static inline void HK(guard_slope)(const hk_plan *p, int at, const V *q, HK(seen
 
 /* The weight g = 1 / (1 + excess^3) of a guard, and its slope (n) where not NULL. By a leverage the
    excess begins farther out than by a box. Returns whether any row fades; else g is 1
-   and the slope is not written. */
-static inline int HK(fading)(const hk_plan *p, int at, const V *q, HK(seen) * seen, V *distance,
-                             V *g, V *slope, V *work) {
+   and the slope is not written, and the distance may be an upper bound if not `exact`. */
+static inline int HK(fading)(const hk_plan *p, int at, int exact, const V *q, HK(seen) * seen,
+                             V *distance, V *g, V *slope, V *work) {
     const real full = HK_IS(p, at, HK_LEVERAGE_GUARD) ? HK_FULL_LEVERAGE : HK_FULL;
+    const real enough = exact ? R(-1.0) : full * (R(1.0) - R(8.0) * HK_EPS);
     *g = SPLAT(1.0);
-    *distance = HK(guard_distance)(p, at, q, seen, work);
+    *distance = HK(guard_distance)(p, at, enough, q, seen, work);
     if (!HK(any)(NOT(*distance <= SPLAT(full)))) return 0;
     const V excess = HK(max)(*distance / full - R(1.0), SPLAT(0.0));
     *g = R(1.0) / (R(1.0) + excess * excess * excess);

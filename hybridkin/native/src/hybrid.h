@@ -10,7 +10,7 @@ typedef struct {
     V *C;            /* the total derivative (3, k) by z */
     V trust, *slope; /* of the drift, (n) */
     V farthest;      /* distance of any guard */
-    int has_C0, fades;
+    int has_C0, fades, measures; /* whether `farthest` is asked for */
     HK(inside) in;
     HK(seen) seen;
 } HK(total);
@@ -50,7 +50,7 @@ static inline int HK(guarded)(const hk_plan *p, int guard, const V *q, real w, H
     V distance;
     if (guard < 0) return 0;
     const int fades =
-        HK(fading)(p, guard, q, &sum->seen, &distance, g, sum->J ? slope : NULL, work);
+        HK(fading)(p, guard, sum->measures, q, &sum->seen, &distance, g, sum->J ? slope : NULL, work);
     /* NaN is the farthest. */
     sum->farthest = SELECT(NOT(distance <= sum->farthest), distance, sum->farthest);
     if (!fades) return 0;
@@ -139,6 +139,7 @@ static inline void HK(hybrid)(const hk_plan *p, int at, const V *q, V *x, V *J, 
     if (inner) sum.in = HK(inside_of)(p, base, &work);
     sum.seen = HK(seen_of)(p, &work);
     sum.has_C0 = sum.fades = 0;
+    sum.measures = distance != NULL;
     sum.trust = SPLAT(1.0);
     sum.farthest = SPLAT(0.0);
     for (int i = 0; i < m; i++) sum.x[i] = SPLAT(0.0);
@@ -183,7 +184,7 @@ static inline void HK(farthest)(const hk_plan *p, int at, const V *q, V *distanc
     for (int j = 0; slope && j < n; j++) slope[j] = SPLAT(0.0);
     for (int c = 0; c < count; c++, part += HK_STRIDE) {
         if (part[HK_GUARD] < 0) continue;
-        const V here = HK(guard_distance)(p, part[HK_GUARD], q, &seen, work);
+        const V here = HK(guard_distance)(p, part[HK_GUARD], R(-1.0), q, &seen, work);
         const M farther = NOT(here <= *distance);
         *distance = SELECT(farther, here, *distance);
         if (!slope || !HK(any)(farther)) continue;

@@ -65,6 +65,14 @@ typedef struct {
     const real *data;
 } hk_plan;
 
+/* A leverage: with v = phi - center and r = R' v it is |r|^2 + offset, or with a prior
+   prior |v|^2 - |r|^2 + offset. R has its columns (k) one after the other, f numbers each. */
+typedef struct {
+    int f, k, full; /* not full: R is upper triangular */
+    real offset, prior;
+    const real *center, *R;
+} hk_factor;
+
 static inline const real *hk_numbers(const hk_plan *p, int at) {
     return p->data + p->code[at + HK_DATA];
 }
