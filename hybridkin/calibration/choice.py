@@ -19,7 +19,6 @@ from hybridkin.calibration._least_squares import LOSSES, ROUGH, Rows, solve
 from hybridkin.calibration._search import Start, search, widened
 from hybridkin.calibration.calibrate import check_data
 from hybridkin.calibration.measured import evenly_spaced, folds, inner_and_outer
-from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
 from hybridkin.chains.elastic_tendons import ElasticTendonChain
@@ -48,31 +47,6 @@ _MOVES = 0.05  # of the largest motion of the tip
 
 _RIVAL = "elastic tendons: "  # prefix of sets that replace those of a plain chain
 _STIFF = ("bending_stiffness", "axial_stiffness")
-_EXTENSIBLE = (
-    ("radii", "base"),
-    ("radii", "rest_bends", "base"),
-    ("radii", "turns", "offsets", "rest_bends", "base"),
-    ("radii", "angles", "rest_bends", "offsets", "actuator_zeros", "base"),
-)
-_TENDONS = (
-    ("radii", "base"),
-    ("radii", "turns", "rest_bends", "base"),
-    ("radii", "turns", "rest_bends", "lengths", "tool", "base"),
-)
-_ELASTIC = (
-    ("base", *_STIFF),
-    ("turns", "rest_bends", "tool", "base", *_STIFF, "tendon_zeros"),
-    (
-        "turns",
-        "rest_bends",
-        "tool",
-        "base",
-        *_STIFF,
-        "tendon_zeros",
-        "radii",
-        "lengths",
-    ),
-)
 
 
 class Errors(NamedTuple):
@@ -271,28 +245,17 @@ def _candidates(
     if isinstance(chain, ConstantCurvatureChain) and not any(chain.extensible):
         if chain.contradictory(q).any():
             elastic = ElasticTendonChain.from_chain(chain)
-    elastic_sets = _ELASTIC
+    sets = chain.parameter_sets
     if parameters is not None:
         sets = [tuple(parameters)]
-        if elastic is not None:
-            elastic_sets = [_elastic_parameters(chain, elastic, sets[0])]
-    elif not isinstance(chain, ArcChain):
-        sets = [(), chain.default_parameters]
-    else:
-        sets = [(), ("base",)]
-        if isinstance(chain, ElasticTendonChain):
-            sets += _ELASTIC
-        elif chain.lengths is None:
-            sets += _EXTENSIBLE
-        else:
-            sets += _TENDONS
-        if not chain.in_metres:
-            sets = _with_gain(sets)
-            elastic_sets = _with_gain(elastic_sets)
     candidates = [_Candidate(_name(names), chain, names) for names in sets]
-    if elastic is not None:
-        for names in elastic_sets:
-            candidates.append(_Candidate(_RIVAL + _name(names), elastic, names))
+    if elastic is None:
+        return candidates
+    elastic_sets = [names for names in elastic.parameter_sets if len(names) > 1]
+    if parameters is not None:
+        elastic_sets = [_elastic_parameters(chain, elastic, sets[0])]
+    for names in elastic_sets:
+        candidates.append(_Candidate(_RIVAL + _name(names), elastic, names))
     return candidates
 
 
@@ -308,14 +271,6 @@ def _elastic_parameters(
     both = dict.fromkeys((*names, *elastic.default_parameters))
     plain = ("radii", "lengths", "actuator_zeros")
     return tuple(name for name in both if name not in plain)
-
-
-def _with_gain(sets: Sequence[tuple[str, ...]]) -> list[tuple[str, ...]]:
-    """Return the sets with the gain beside the radii.
-
-    Tips of tendons determine only their ratio: without the gain, its error moves into the radii.
-    """
-    return [(*names, "gain") if "radii" in names else names for names in sets]
 
 
 def _name(names: tuple[str, ...]) -> str:

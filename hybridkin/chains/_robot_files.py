@@ -15,8 +15,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hybridkin._core.units import METRES, UNITS
+from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
 from hybridkin.chains.elastic_tendons import ElasticTendonChain
+from hybridkin.chains.force_tendons import ForceTendonChain
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -26,6 +28,20 @@ else:
 _STIFFNESS = ("bending_stiffness", "axial_stiffness")
 _PLAIN = "constant-curvature"
 _ELASTIC = "elastic-tendon"
+_FORCES = "force-tendon"
+_CHAINS: dict[str, type[ArcChain]] = {
+    _PLAIN: ConstantCurvatureChain,
+    _ELASTIC: ElasticTendonChain,
+    _FORCES: ForceTendonChain,
+}
+# Keys of a segment that only some models have.
+_MODELS = {
+    "stage": (_PLAIN,),
+    **dict.fromkeys(_STIFFNESS, (_ELASTIC, _FORCES)),
+    **dict.fromkeys(("weight", "taper"), (_FORCES,)),
+    **dict.fromkeys(("zeros", "spool_radius"), (_PLAIN, _ELASTIC)),
+}
+_NEEDED = {_ELASTIC: ("length",), _FORCES: ("length", *_STIFFNESS)}
 _MOST = 64  # segments of a robot, actuators of a segment
 
 # of positive numbers, and of all; others are mistakes
@@ -73,7 +89,7 @@ _WHOLE = (
 # Tables, their keys, and the requirement on the value of a key, in words and as a test.
 _ROWS: list[tuple[str, str, str, _Test]] = [
     ("file", "name", *_TEXT),
-    ("file", "model", *_among(_PLAIN, _ELASTIC)),
+    ("file", "model", *_among(*_CHAINS)),
     ("file", "routing", *_among("segment", "base")),
     (
         "file",
@@ -95,13 +111,20 @@ _ROWS: list[tuple[str, str, str, _Test]] = [
         _is_positive,
     ),
     ("segment", "angle_deg offset", "be a number", _is_number),
+    ("segment", "weight", "be zero or more", lambda v: _is_number(v) and v >= 0),
+    ("segment", "taper", "lie in [0, 1)", lambda v: _is_number(v) and 0 <= v < 1),
     ("segment", "angles_deg zeros", "hold numbers", _many(_is_number)),
     ("segment", "gain spool_radius", *_POSITIVE),
     ("segment", "rest_bend_deg", "hold 2 numbers", _many(_is_number, 2)),
     ("segment", "stage", *_among("insertion", "rotation")),
     ("segment", "clockwise", "be true or false", lambda value: isinstance(value, bool)),
     ("segment", "actuators repeat", *_WHOLE),
-    ("base", "position rotation_vector_deg", "hold 3 numbers", _many(_is_number, 3)),
+    (
+        "base",
+        "position rotation_vector_deg gravity",
+        "hold 3 numbers",
+        _many(_is_number, 3),
+    ),
     ("log", "q", "hold names of columns", _many(_is_text)),
     ("log", "x", "hold names of columns", _many(_is_text)),
     (
@@ -164,14 +187,17 @@ def _check(table: Mapping[str, Any], kind: str, where: str) -> None:
             raise ValueError(f"`{key}` in {where} must {words}, got {got}.")
 
 
-def chain_of(tables: Mapping[str, Any]) -> ConstantCurvatureChain | ElasticTendonChain:
+def chain_of(tables: Mapping[str, Any]) -> ArcChain:
     """Return the chain of a description with segments."""
-    elastic = tables.get("model", _PLAIN) == _ELASTIC
+    model = tables.get("model", _PLAIN)
+    base = tables.get("base", {})
     # Without a unit in [log], angles are in radians and others are unknown.
     unit = tables.get("log", {"q_unit": "rad"}).get("q_unit", "1")
     segments: list[dict[str, Any]] = []
     for i, table in enumerate(tables["segment"]):
-        segment = _segment(table, f"[[segment]] {i + 1}", elastic, unit)
+        where = f"[[segment]] {i + 1}"
+        _check_keys_of_model(table, where, model)
+        segment = _segment(table, where, model, unit)
         segments += [segment] * table.get("repeat", 1)
     if len(segments) > _MOST:
         raise ValueError(
@@ -186,11 +212,6 @@ def chain_of(tables: Mapping[str, Any]) -> ConstantCurvatureChain | ElasticTendo
             arguments[key] = _all_or_none(arguments[key], key)
     if arguments["gains"] is None:
         arguments["gains"] = 1.0
-    if elastic and None in arguments["lengths"]:
-        missing = arguments["lengths"].index(None) + 1
-        raise ValueError(
-            f"`length` must be in every [[segment]], but is missing for segment {missing}."
-        )
     stages = arguments.pop("stage")
     if "rotation" in stages[1:]:
         raise ValueError('`stage` "rotation" is only allowed in the first [[segment]].')
@@ -199,12 +220,31 @@ def chain_of(tables: Mapping[str, Any]) -> ConstantCurvatureChain | ElasticTendo
     # The radius of a stage has no effect.
     any_radius = next(filter(None, arguments["radii"]), 1.0)
     arguments["radii"] = [radius or any_radius for radius in arguments["radii"]]
-    arguments["base"] = _base(tables.get("base", {}))
+    arguments["base"] = _base(base)
     if "routing" in tables:
         arguments["routing"] = tables["routing"]
-    if elastic:
-        return ElasticTendonChain(**arguments)
-    return ConstantCurvatureChain(**arguments)
+    if "gravity" in base:
+        if model != _FORCES:
+            raise ValueError(
+                f'`gravity` in [base] belongs to model = "{_FORCES}"; remove it.'
+            )
+        arguments["gravity"] = base["gravity"]
+    return _CHAINS[model](**arguments)
+
+
+def _check_keys_of_model(table: Mapping[str, Any], where: str, model: str) -> None:
+    for key in table:
+        models = _MODELS.get(key, _CHAINS)
+        if model not in models:
+            known = " or ".join(f'"{name}"' for name in models)
+            raise ValueError(
+                f"`{key}` in {where} belongs to another model; remove it, or set model = {known}."
+            )
+    for key in _NEEDED.get(model, ()):
+        if key not in table:
+            raise ValueError(
+                f"`{key}` is missing in {where}; model {model!r} needs it in every [[segment]]."
+            )
 
 
 def _all_or_none(values: list[Any], key: str) -> list[Any] | None:
@@ -221,21 +261,13 @@ def _all_or_none(values: list[Any], key: str) -> list[Any] | None:
 
 
 def _segment(
-    table: Mapping[str, Any], where: str, elastic: bool, unit: str
+    table: Mapping[str, Any], where: str, model: str, unit: str
 ) -> dict[str, Any]:
     """Return the constructor arguments of one segment; None for optional ones."""
     stage = table.get("stage")
-    if stage is not None and (
-        elastic or not {*table} <= {"stage", "offset", "zeros", "gain"}
-    ):
+    if stage is not None and not {*table} <= {"stage", "offset", "zeros", "gain"}:
         raise ValueError(
-            f"`stage` in {where} can only be combined with `offset`, `zeros` and `gain`, and not "
-            f"with model {_ELASTIC!r}."
-        )
-    if not elastic and {*_STIFFNESS} & {*table}:
-        raise ValueError(
-            f"`bending_stiffness` and `axial_stiffness` in {where} belong to another model; remove "
-            f'them, or set model = "{_ELASTIC}".'
+            f"`stage` in {where} can only be combined with `offset`, `zeros` and `gain`."
         )
     if "radius" not in table and stage is None:
         raise ValueError(
@@ -253,9 +285,6 @@ def _segment(
         angles = math.radians(table.get("angle_deg", 0.0)) + step * np.arange(n)
     n = len(angles)
     gains = _gains(table, where, n, unit)
-    zeros = each(table, "zeros", where, n)
-    if gains is not None and not elastic:  # in the unit of the log
-        zeros *= UNITS.get(unit, 1.0)
     arguments = {
         "radii": table.get("radius"),
         "stage": stage,
@@ -266,12 +295,17 @@ def _segment(
         "rest_bends": np.radians(table.get("rest_bend_deg", [0.0, 0.0])),
         "gains": gains,
     }
-    if elastic:
-        arguments["tendon_zeros"] = zeros
+    if model != _PLAIN:
         arguments |= {key: table.get(key) for key in _STIFFNESS}
-    else:
-        arguments["actuator_zeros"] = zeros
-    return arguments
+    if model == _FORCES:
+        arguments |= {key: table.get(key, 0.0) for key in ("weight", "taper")}
+        return arguments
+    zeros = each(table, "zeros", where, n)
+    if model == _ELASTIC:
+        return arguments | {"tendon_zeros": zeros}
+    if gains is not None:  # in the unit of the log
+        zeros *= UNITS.get(unit, 1.0)
+    return arguments | {"actuator_zeros": zeros}
 
 
 def _gains(

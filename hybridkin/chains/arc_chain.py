@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -107,6 +107,8 @@ class ArcChain(MarkedChain):
         "starts",
     )
 
+    takes_lengths: ClassVar[bool] = True  # q holds lengths or their changes, not forces
+
     actuators_per_segment: tuple[int, ...]
     routing: str
     extensible: tuple[bool, ...]  # for each segment; the others have lengths
@@ -168,6 +170,16 @@ class ArcChain(MarkedChain):
     def _free_gain(self) -> tuple[str, ...]:
         """The gain as a parameter that a calibration fits by default, if q is not in metres."""
         return () if self.in_metres else ("gain",)
+
+    def _with_gain(self, sets: Sequence[tuple[str, ...]]) -> list[tuple[str, ...]]:
+        """Return sets of parameters, after the smallest, with the gain beside the radii.
+
+        Tips of tendons determine only their ratio: without the gain, its error moves into the
+        radii.
+        """
+        gain = self._free_gain
+        both = [(*names, *gain) if "radii" in names else names for names in sets]
+        return [(), ("base",), *both]
 
     def _checked(
         self, routing: str, *, without_lengths: bool = True, **arguments: Any

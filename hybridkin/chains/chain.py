@@ -21,16 +21,6 @@ if TYPE_CHECKING:
 __all__ = ["Chain"]
 
 _Values = TypeVar("_Values", bound=Tensor | tuple[Tensor, ...])
-_UNITS = {
-    "angles": "rad",
-    "rest_bends": "rad",
-    "gains": "m per unit of q",
-    "axial_stiffness": "-",
-    "bending_stiffness": "m²/rad²",
-    "actuator_zeros": "unit of q",
-    "joint_zeros": "unit of q",
-}
-"""Units of entries of the geometry; others are in metres."""
 _FAR = 50.0  # robot sizes; some extensible robots are long and thin
 
 
@@ -47,6 +37,15 @@ class Chain(PoseModel):
 
     _entries: ClassVar[tuple[str, ...]]
     _structure: ClassVar[tuple[str, ...]]
+    _units: ClassVar[dict[str, str]] = {
+        "angles": "rad",
+        "rest_bends": "rad",
+        "gains": "m/unit of q",
+        "axial_stiffness": "-",
+        "bending_stiffness": "m²/rad²",
+        "actuator_zeros": "unit of q",
+        "joint_zeros": "unit of q",
+    }
 
     base: Tensor
 
@@ -54,6 +53,11 @@ class Chain(PoseModel):
     def default_parameters(self) -> tuple[str, ...]:
         """Names of the parameters that a calibration fits by default."""
         raise NotImplementedError
+
+    @property
+    def parameter_sets(self) -> list[tuple[str, ...]]:
+        """Sets of parameters that ``calibrate="auto"`` compares, the smaller ones first."""
+        return [(), self.default_parameters]
 
     @property
     def reach(self) -> Tensor:
@@ -70,12 +74,15 @@ class Chain(PoseModel):
         entries = {name: self._buffers[name] for name in self._entries}
         return {name: value for name, value in entries.items() if value is not None}
 
+    def unit_of(self, name: str) -> str:
+        """Return the unit of an entry of the geometry: "m", "rad", "-" or another one."""
+        return self._units.get(name, "m")
+
     def html_rows(self) -> dict[str, object]:
         """Return names and values that a notebook shows of the chain."""
         rows = super().html_rows()
         for name, value in self.geometry().items():
-            unit = _UNITS.get(name, "m")
-            rows[f"{name} [{unit}]"] = numbers(value.detach())
+            rows[f"{name} [{self.unit_of(name)}]"] = numbers(value.detach())
         return rows
 
     def with_geometry(self, **geometry: Tensor) -> Self:

@@ -30,6 +30,17 @@ from hybridkin.chains.arc_chain import (
 
 __all__ = ["ConstantCurvatureChain"]
 
+_EXTENSIBLE = (
+    ("radii", "base"),
+    ("radii", "rest_bends", "base"),
+    ("radii", "turns", "offsets", "rest_bends", "base"),
+    ("radii", "angles", "rest_bends", "offsets", "actuator_zeros", "base"),
+)
+_TENDONS = (
+    ("radii", "base"),
+    ("radii", "turns", "rest_bends", "base"),
+    ("radii", "turns", "rest_bends", "lengths", "tool", "base"),
+)
 _CONTRADICTED = 0.3  # share of the readings that the arcs explain, in one segment
 _NOTICED = 0.1  # share of the radius: the reading of a bend of 0.1 rad
 
@@ -203,6 +214,11 @@ class ConstantCurvatureChain(ArcChain):
         if self.lengths is None:
             return ("radii", *self._free_gain, "base")
         return ("radii", "turns", "rest_bends", "lengths", *self._free_gain, "base")
+
+    @property
+    def parameter_sets(self) -> list[tuple[str, ...]]:
+        """Sets of parameters that ``calibrate="auto"`` compares, the smaller ones first."""
+        return self._with_gain(_EXTENSIBLE if self.lengths is None else _TENDONS)
 
     @property
     def rest(self) -> Tensor:

@@ -282,6 +282,13 @@ class ElasticTendonChain(ArcChain):
         return (*geometry, *tendons, *self._free_gain)
 
     @property
+    def parameter_sets(self) -> list[tuple[str, ...]]:
+        """Sets of parameters that ``calibrate="auto"`` compares, the smaller ones first."""
+        stiffnesses = ("base", "bending_stiffness", "axial_stiffness")
+        shape = ("turns", "rest_bends", "tool", *stiffnesses, "tendon_zeros")
+        return self._with_gain([stiffnesses, shape, (*shape, "radii", "lengths")])
+
+    @property
     def pulls(self) -> Tensor:
         """Sign of q in which a tendon pulls, shape (n,)."""
         return -self.gains.sign()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -200,6 +200,16 @@ class ForceTendonChain(ArcChain):
     )
     _structure = (*ArcChain._structure, "arcs_per_segment", "gravity")
 
+    _units: ClassVar[dict[str, str]] = {
+        **Chain._units,
+        "gains": "N/unit of q",
+        "axial_stiffness": "N",
+        "bending_stiffness": "N m²",
+        "weight": "N/m",
+        "taper": "-",
+    }
+    takes_lengths = False
+
     gravity: tuple[float, ...]
     marker_offsets: Tensor  # (K, 3)
     bending_stiffness: Tensor  # (S,)
@@ -275,9 +285,21 @@ class ForceTendonChain(ArcChain):
         return (*statics, "rest_bends", "turns", "base")
 
     @property
+    def parameter_sets(self) -> list[tuple[str, ...]]:
+        """Sets of parameters that ``calibrate="auto"`` compares, the smaller ones first."""
+        statics = ("base", "bending_stiffness", "axial_stiffness", "weight")
+        shape = (*statics, "taper", "rest_bends")
+        return [(), ("base",), statics, shape, (*shape, "turns", "marker_offsets")]
+
+    @property
     def in_metres(self) -> bool:
         """Whether q is in metres: False, it holds forces."""
         return False
+
+    @property
+    def units(self) -> str:
+        """Unit of q."""
+        return "N" if (self.gains == 1.0).all() else "as in training"
 
     @property
     def reach(self) -> Tensor:

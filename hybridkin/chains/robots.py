@@ -15,7 +15,6 @@ from hybridkin._core.units import METRES, UNITS
 from hybridkin.chains._robot_files import chain_of, each, read_tables
 from hybridkin.chains.arc_chain import ALIASES, ArcChain
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
-from hybridkin.chains.elastic_tendons import ElasticTendonChain
 
 __all__ = [
     "BHA_LENGTH_LIMITS",
@@ -181,7 +180,7 @@ class RobotDescription:
     ----------
     name : str
         Name of the robot.
-    chain : ConstantCurvatureChain, ElasticTendonChain or None
+    chain : ConstantCurvatureChain, ElasticTendonChain, ForceTendonChain or None
         Its nominal model; None for a robot without segments (a model of data alone).
     calibrate : tuple of str or "auto"
         Parameters to fit to data; "auto": chosen by errors on held-out data.
@@ -194,7 +193,7 @@ class RobotDescription:
     """
 
     name: str
-    chain: ConstantCurvatureChain | ElasticTendonChain | None
+    chain: ArcChain | None
     calibrate: tuple[str, ...] | str
     log: LogFormat | None
     limits: Limits = Limits()
@@ -228,7 +227,7 @@ class RobotDescription:
         return self.calibrate == "auto" or "base" in self.calibrate
 
 
-def from_toml(path: str | Path) -> ConstantCurvatureChain | ElasticTendonChain:
+def from_toml(path: str | Path) -> ArcChain:
     r"""Return the chain that a TOML file describes.
 
     Parameters
@@ -238,7 +237,7 @@ def from_toml(path: str | Path) -> ConstantCurvatureChain | ElasticTendonChain:
 
     Returns
     -------
-    ConstantCurvatureChain or ElasticTendonChain
+    ConstantCurvatureChain, ElasticTendonChain or ForceTendonChain
         The nominal model, lengths in metres.
 
     Raises
@@ -275,8 +274,9 @@ def read_description(path: str | Path) -> RobotDescription:
         A file like this one::
 
             name = "my trunk"
-            model = "constant-curvature"    # the default, or "elastic-tendon"
-            routing = "base"                # or "segment" (default; "base" for elastic tendons)
+            model = "constant-curvature"    # the default, or "elastic-tendon", or "force-tendon"
+                                            # where q holds tendon forces
+            routing = "base"                # or "segment" (default for constant curvature)
             calibrate = ["radii", "base"]   # optional, else "auto": chosen by cross-validated
                                             # errors; "default": the chain's own list
 
@@ -297,12 +297,16 @@ def read_description(path: str | Path) -> RobotDescription:
                                             # one number or one each; in all segments or in none
             spool_radius = 0.006            # or for motors [m], with a q_unit of "deg" or "rad"
             bending_stiffness = 2.0e-7      # elastic tendons only, in all segments or in none
-            axial_stiffness = 10.0          # likewise; units and defaults: `ElasticTendonChain`
+            axial_stiffness = 10.0          # likewise; units and defaults: `ElasticTendonChain`.
+                                            # With forces both are needed: [N m^2] and [N]
+            weight = 2.0                    # with forces only: of the body [N/m], see
+            taper = 0.5                     # `ForceTendonChain`, as for the next key
             repeat = 2                      # number of segments like this one
 
             [base]                          # optional
             position = [0.0, 0.0, 0.0]      # [m]
             rotation_vector_deg = [0.0, 0.0, 0.0]
+            gravity = [0.0, 0.0, -1.0]      # its direction in the measuring frame, with forces only
 
             [log]                           # format of its logs, optional
             q = ["servo_1", "servo_2", "servo_3"]
@@ -310,7 +314,8 @@ def read_description(path: str | Path) -> RobotDescription:
                                             # and their places: segment (counted from 0), fraction
                                             # of its arc, and offset in the frame there [m]:
                                             # markers = [[0, 1.0, 0, 0, 0], [1, 1.0, 0, 0, 0.01]]
-            q_unit = "mm"                   # "m", "cm", "mm", "um", "in"; with a gain another name
+            q_unit = "mm"                   # "m", "cm", "mm", "um", "in"; with a gain or forces
+                                            # another name
             x_unit = "mm"
             q_sign = -1                     # -1: a pulled tendon counts as positive; or one each
             groups = "motion"               # column with the motion of each row, optional
@@ -415,6 +420,11 @@ def _log_format(table: Mapping[str, Any], chain: ArcChain | None) -> LogFormat:
     in_metres = chain is None or chain.in_metres
     unit = settings.setdefault("q_unit", "m" if in_metres else "1")
     units = [*UNITS] if chain is None else [*METRES]
+    if chain is not None and not chain.takes_lengths and unit in METRES:
+        raise ValueError(
+            f'`q_unit` in [log] must not be a length, as q holds forces, got {unit!r}; give "N", '
+            "or another name with a `gain` [N per unit] in every [[segment]]."
+        )
     if in_metres and unit not in units:
         raise ValueError(
             f'`q_unit` in [log] must be one of {units}; for motors "deg" or "rad", with a '

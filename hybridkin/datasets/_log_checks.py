@@ -47,9 +47,10 @@ def check_log(
     ----------
     log : Log
         As from `load_log`; from arrays ``Log(q, x, groups)``.
-    chain : ConstantCurvatureChain or ElasticTendonChain, optional
+    chain : ConstantCurvatureChain, ElasticTendonChain or ForceTendonChain, optional
         Nominal kinematics, or a calibrated chain (``calibrate(...).chain``), which distinguishes
-        orders of the columns better. None: units, order, signs and axes are not checked.
+        orders of the columns better. None, or forces as q: units,
+        order, signs and axes are not checked.
     base_is_free : bool, default=True
         Whether the pose of the base will be fitted. For tendons on a backbone of fixed length, a
         wrong sign of q then looks like a half turn of the base. It is reported if the base must
@@ -95,7 +96,7 @@ def check_log(
         rows = LogRows(log.rows(valid), np.flatnonzero(valid))
         for check in COLUMN_CHECKS:
             findings += check(rows)
-        if chain is not None:
+        if chain is not None and chain.takes_lengths:
             findings += geometry_findings(rows.log, chain, base_is_free)
         if not any(finding.kind in MISREAD for finding in findings):
             findings += residual_findings(rows.log, chain, rows.same_motion)

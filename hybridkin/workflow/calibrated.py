@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from hybridkin._core.arrays import as_array
 from hybridkin.calibration.calibrate import CalibrationResult
-from hybridkin.chains.arc_chain import ArcChain
+from hybridkin.chains.arc_chain import ALIASES, ArcChain
 from hybridkin.chains.chain import Chain
 from hybridkin.workflow.report import Report, millimetres
 
@@ -22,15 +22,7 @@ it and the others of its kind stay physical."""
 _Unit = tuple[float, str]  # factor from SI, and name
 _MILLIMETRES: _Unit = (1e3, "mm")
 _DEGREES: _Unit = (180.0 / np.pi, "deg")
-_UNITS: dict[str, _Unit] = {
-    "bending_stiffness": (1e6, "mm²/rad²"),
-    "axial_stiffness": (1.0, "-"),
-    "gains": (1.0, "m/unit of q"),
-    "gain": (1.0, "m/unit of q"),
-    "angles": _DEGREES,
-    "turns": _DEGREES,
-    "rest_bends": _DEGREES,
-}
+_SHOWN = {"m": _MILLIMETRES, "rad": _DEGREES, "m²/rad²": (1e6, "mm²/rad²")}
 _SIZES = ("radii", "lengths", "gain", "gains")
 _FAR = 0.15  # of a size; more than the error of a ruler
 # [deg]
@@ -47,7 +39,7 @@ class CalibratedParameter:
     name : str
         As in `CalibrationResult.names`.
     unit : str
-        "mm", "deg", "mm²/rad²" or "-", for gains "m/unit of q".
+        "mm", "deg", "mm²/rad²", "-" or another one, for gains "m/unit of q".
     start, value, std_error : float
         Before and after the calibration, in that unit; of the base its rotation from the start and
         its position.
@@ -144,9 +136,10 @@ def _unit(start: Chain, name: str, k: int) -> _Unit:
     """Return the unit of the k-th number of a parameter."""
     if name == "base" and k < 3:
         return _DEGREES
-    if name == "actuator_zeros" and isinstance(start, ArcChain) and not start.in_metres:
-        return (1.0, "units of q")
-    return _UNITS.get(name, _MILLIMETRES)
+    if name == "actuator_zeros" and isinstance(start, ArcChain) and start.in_metres:
+        return _MILLIMETRES
+    unit = start.unit_of(ALIASES.get(name, name))
+    return _SHOWN.get(unit, (1.0, unit))
 
 
 def write_parameters(report: Report, parameters: Sequence[CalibratedParameter]) -> None:

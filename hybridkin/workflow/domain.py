@@ -172,10 +172,10 @@ class Domain:
 
     @property
     def tendons(self) -> ArcChain | None:
-        """The chain if all its actuators are tendons, else None."""
+        """The chain if all its actuators are tendons of given lengths, else None."""
         chain = self.loaded.chain
-        if isinstance(chain, ArcChain) and not any(chain.extensible):
-            return chain
+        if isinstance(chain, ArcChain) and chain.takes_lengths:
+            return None if any(chain.extensible) else chain
         return None
 
     @property

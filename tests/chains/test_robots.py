@@ -6,7 +6,7 @@ import torch
 from numpy.testing import assert_allclose
 from torch.testing import assert_close
 
-from hybridkin import ConstantCurvatureChain, ElasticTendonChain, robots
+from hybridkin import ConstantCurvatureChain, ElasticTendonChain, ForceTendonChain, robots
 
 TENDONS = """
 name = "three by three"
@@ -204,6 +204,13 @@ SPOOL, GAIN = SEGMENT + "spool_radius = 0.006\n", SEGMENT + "gain = 2e-5\n"
 LOG = "[log]\nq = ['a', 'b', 'c']\nx = ['x', 'y', 'z']\n"
 
 
+FORCES = """model = "force-tendon"
+[[segment]]
+radius = 0.01
+length = 0.3
+bending_stiffness = 0.02
+axial_stiffness = 100
+"""
 ELASTIC_SEGMENT = "model = 'elastic-tendon'\n" + SEGMENT
 
 
@@ -216,7 +223,7 @@ ELASTIC_SEGMENT = "model = 'elastic-tendon'\n" + SEGMENT
         ("name = ", "not a TOML file"),
         ("[[segment]]\nlength = 1.0", "`radius` is missing"),
         ("[[segment]]\nradius = 0.1\nlenght = 0.2", "did you mean `length`"),
-        (ELASTIC_SEGMENT.replace("length = 1\n", ""), "`length` .* missing for segment 1"),
+        (ELASTIC_SEGMENT.replace("length = 1\n", ""), "`length` is missing in ..segment.. 1"),
         (ELASTIC_SEGMENT + "axial_stiffness = 4\n" + SEGMENT, "`axial_stiffness` .* for segment 2"),
         (GAIN + SEGMENT, "`gains` must be in every"),
         (SEGMENT + "[log]\nq = ['a', 'b', 'c']", "`q` or `x` is missing in .log."),
@@ -250,7 +257,13 @@ ELASTIC_SEGMENT = "model = 'elastic-tendon'\n" + SEGMENT
         # what does not fit together
         (SEGMENT + "axial_stiffness = 4", "`axial_stiffness` .* another model"),
         ("[[segment]]\nstage = 'rotation'\nlength = 1", "can only be combined"),
-        (ELASTIC_SEGMENT + "[[segment]]\nstage = 'rotation'", "not with model"),
+        (ELASTIC_SEGMENT + "[[segment]]\nstage = 'rotation'", "`stage` .* another model"),
+        (SEGMENT + "weight = 1", '`weight` .* model = "force-tendon"'),
+        (FORCES + "zeros = [0, 0, 0]", '`zeros` .* "constant-curvature" or "elastic-tendon"'),
+        (FORCES.replace("axial_stiffness = 100", ""), "`axial_stiffness` is missing"),
+        (FORCES + "taper = 1.0", "`taper`"),
+        (FORCES + LOG + "q_unit = 'mm'", "not be a length"),
+        (SEGMENT + "[base]\ngravity = [0, 0, 1]", "`gravity`"),
         (SEGMENT + "[[segment]]\nstage = 'rotation'", "in the first"),
         (SEGMENT + LOG.replace(", 'c'", ""), "`q` in .log. must name 3"),
         (LOG.replace("z'", "'").replace(", '']", "]"), "`x` in .log. must hold 3"),
@@ -272,6 +285,19 @@ ELASTIC_SEGMENT = "model = 'elastic-tendon'\n" + SEGMENT
 def test_bad_descriptions_name_the_key(write, text, message):
     with pytest.raises(ValueError, match=message):
         robots.read_description(write(text))
+
+
+def test_tendon_forces(write):
+    text = FORCES + "weight = 2\ntaper = 0.5\n" + LOG + "q_unit = 'N'\n"
+    robot = robots.read_description(write(text + "[base]\ngravity = [0, 2, 0]\n"))
+    expected = ForceTendonChain(
+        [0.01], [0.3], 0.02, 100.0, weight=2.0, taper=0.5, gravity=[0, 1, 0]
+    )
+    forces = torch.tensor([[0.0, 0.0, 0.0], [3.0, 1.0, 0.0]], dtype=torch.float64)
+    assert_close(robot.chain(forces), expected(forces))
+    assert robot.chain.units == "N"
+    assert robot.calibrate == "auto"
+    assert robot.log.q_factor == 1.0
 
 
 def test_spools_scales_and_signs(write):
