@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import cache, partial
 from itertools import product
 from typing import NamedTuple, TypeVar
 
 import torch
+from torch import Tensor
 
 from hybridkin._core.rotations import rigid_motion
 from hybridkin.calibration._least_squares import Rows
@@ -64,57 +66,67 @@ def initial_guesses(chain: Chain, rows: Rows, names: tuple[str, ...]) -> list[Gu
 
 def aligned(chain: _Chain, rows: Rows) -> _Chain:
     """Return the chain at the base pose that aligns predicted and measured tips."""
+    motion, _ = _alignment(chain, rows)
+    return chain.with_geometry(base=motion @ chain.geometry()["base"])
+
+
+def _alignment(chain: Chain, rows: Rows) -> tuple[Tensor, float]:
+    """Return the motion of the base that aligns the tips, and their rms distance after it."""
     x = torch.from_numpy(points(rows.x.numpy())[rows.seen])
     tips = x + torch.from_numpy(rows.residual(chain)).to(x)
-    motion = rigid_motion(tips, x, torch.from_numpy(rows.weights).to(x))
-    return chain.with_geometry(base=motion @ chain.geometry()["base"])
+    weights = torch.from_numpy(rows.weights).to(x)
+    motion = rigid_motion(tips, x, weights)
+    squares = (tips @ motion[:3, :3].mT + motion[:3, 3] - x).square().sum(1)
+    return motion, float(weights @ squares / weights.sum()) ** 0.5
 
 
 def _best_rings(
     chain: ArcChain, rows: Rows, free_base: bool, scales: tuple[float, ...]
 ) -> list[Guess]:
     """Return the best guesses of a search ring by ring, for several scales of the radii."""
-    best: dict[_Rings, tuple[float, Guess]] = {}
+    error_of = cache(partial(_error, chain, rows, free_base))
+    best: dict[_Rings, tuple[float, float]] = {}  # least error, and its scale
     n_segments = len(chain.actuators_per_segment)
     for scale, mirrored in product(scales, (False, True)):
-        rings = [(mirrored, 0.0)] * n_segments
+        rings: _Rings = ((mirrored, 0.0),) * n_segments
         error = math.inf
         for _, k in product(range(_SWEEPS), range(n_segments)):
             for ring in product((mirrored, not mirrored), _TURNS):
-                changed = [*rings[:k], ring, *rings[k + 1 :]]
-                tried = _guess(chain, changed, scale, rows, free_base)[0]
+                changed = (*rings[:k], ring, *rings[k + 1 :])
+                tried = error_of(changed, scale)
                 if tried < error * (1.0 - 1e-9):
                     error = tried
                     rings = changed
-        key = tuple(rings)
-        if key not in best or error < best[key][0]:
-            best[key] = _guess(chain, rings, scale, rows, free_base)
-    ranked = sorted(best.values(), key=lambda pair: pair[0])
-    limit = _HOPELESS * ranked[0][0]
-    guesses = []
-    for mirrored in (False, True):
-        alike = [g for error, g in ranked if g.mirrored == mirrored and error < limit]
-        guesses += alike[:_MOST]
-    return guesses
+        if rings not in best or error < best[rings][0]:
+            best[rings] = error, scale
+    ranked = sorted(best, key=lambda rings: best[rings][0])
+    limit = _HOPELESS * best[ranked[0]][0]
+    likely: dict[bool, list[Guess]] = {False: [], True: []}
+    for rings in ranked:
+        error, scale = best[rings]
+        mirrored = any(mirrored for mirrored, _ in rings)
+        if error < limit and len(likely[mirrored]) < _MOST:
+            guess = _with_rings(chain, rings)
+            if free_base:
+                base = aligned(_scaled(guess, scale), rows).geometry()["base"]
+                guess = guess.with_geometry(base=base)
+            likely[mirrored].append(Guess(guess, scale, mirrored))
+    return [*likely[False], *likely[True]]
 
 
-def _guess(
-    chain: ArcChain,
-    rings: Sequence[tuple[bool, float]],
-    scale: float,
-    rows: Rows,
-    align: bool,
-) -> tuple[float, Guess]:
-    """Return the root mean square tip distance of a guess with scaled radii, and the guess."""
-    changed = _with_rings(chain, rings)
-    scaled = changed
-    if scale != 1.0:
-        scaled = changed.with_geometry(radii=scale * changed.geometry()["radii"])
-    if align:
-        scaled = aligned(scaled, rows)
-        changed = changed.with_geometry(base=scaled.geometry()["base"])
-    is_mirrored = any(mirrored for mirrored, _ in rings)
-    return rows.rmse(scaled), Guess(changed, scale, is_mirrored)
+def _error(
+    chain: ArcChain, rows: Rows, align: bool, rings: _Rings, scale: float
+) -> float:
+    """Return the root mean square tip distance with these rings and scaled radii."""
+    changed = _scaled(_with_rings(chain, rings), scale)
+    return _alignment(changed, rows)[1] if align else rows.rmse(changed)
+
+
+def _scaled(chain: ArcChain, scale: float) -> ArcChain:
+    """Return the chain with all radii times a factor."""
+    if scale == 1.0:
+        return chain
+    return chain.with_geometry(radii=scale * chain.geometry()["radii"])
 
 
 def _with_rings(chain: ArcChain, rings: Sequence[tuple[bool, float]]) -> ArcChain:

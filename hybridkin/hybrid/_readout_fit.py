@@ -340,10 +340,12 @@ class _Problem:
         )
         pairs: list[tuple[Tensor, Tensor]] = []
         factor: tuple[Tensor, Tensor] | None = None
+        step_size = 1.0
         for k in range(rounds):
             if float(slope.norm()) <= _SETTLED * scale:
                 break
-            if factor is None or k < _FACTORS or k % _REFRESH == 0:
+            # A shortened step was too far from the system for corrections.
+            if factor is None or step_size < 1.0 or k < _FACTORS or k % _REFRESH == 0:
                 factor = self.linearised(readout).factor(penalty)
                 pairs = []
             step = -_linearised.quasi_newton(slope, pairs, factor)
