@@ -30,6 +30,9 @@ MOST = {
     "powers": HK_MAX_P,
     "rows of a task": HK_MAX_R,
 }
+_LARGE = 4096  # numbers of an array that is worth sharing
+_BITS = 31  # of the lower part of a distance in memory
+_LOW = 2**_BITS - 1
 _OWN = 4  # entries of a node before its own: kind, lengths of input and output, place of numbers
 
 
@@ -46,6 +49,9 @@ class Plan:
     ----------
     model : Stored or callable
         Description of the model, or a function that writes its nodes and returns the last place.
+    shares : bool, default=False
+        Whether large arrays stay where they are, and the plan only refers to them. Such a plan sees
+        when they are written to; it cannot leave the process.
 
     Attributes
     ----------
@@ -62,14 +68,20 @@ class Plan:
         Places of all nodes, in the order of their numbers.
     largest : dict
         Largest sizes, named as in MOST.
+    shared : dict of int to ndarray
+        The arrays that it refers to, by the place in `code` of their distance from `data`.
     """
 
-    def __init__(self, model: Stored | Callable[[Plan], int]) -> None:
+    def __init__(
+        self, model: Stored | Callable[[Plan], int], shares: bool = False
+    ) -> None:
         self._code = [0] * len(MOST)  # then the largest sizes
         self._data: list[NDArray] = []
         self._length = 0
         self.largest = dict.fromkeys(MOST, 0)
         self._place_of: dict[tuple, int] = {}
+        self._shares = shares
+        self.shared: dict[int, NDArray] = {}
         self.root = self.node_of(model) if isinstance(model, Stored) else model(self)
         self.n_inputs, self.n_outputs = self.lengths(self.root)
         self._code[: len(MOST)] = self.largest.values()
@@ -79,6 +91,9 @@ class Plan:
         first = -memory.ctypes.data // 8 % HK_GROUP
         self.data = memory[first : first + self._length + HK_GROUP]
         self.data[:-HK_GROUP] = np.concatenate(self._data)
+        for place, array in self.shared.items():
+            away = (array.ctypes.data - self.data.ctypes.data) // 8
+            self.code[place : place + 2] = away & _LOW, away >> _BITS
         self.places = [*self._place_of.values()]
         # do not pickle them twice
         self._data = []
@@ -121,6 +136,7 @@ class Plan:
         numbers: Sequence[ArrayLike],
         *entries: int,
         aligned: bool = False,
+        last: NDArray | None = None,
     ) -> int:
         """Write a node with its numbers, and return its place; equal nodes share one place.
 
@@ -137,12 +153,22 @@ class Plan:
         aligned : bool, default=False
             Whether the numbers after center, scale, intercept and direct link, 2 n + m + m n, start
             a cache line.
+        last : ndarray, optional
+            Its last numbers. Two more entries say where they are, if they are shared; else 0.
         """
         self.limit("actuators", n)
         self.limit("outputs", m)
         parts = [np.empty(0), *map(np.ravel, numbers)]
+        shared = None
+        if last is not None:
+            entries += 0, 0
+            if self._can_share(last):
+                shared = last
+            else:
+                parts.append(last.ravel())
         flat = np.concatenate(parts, dtype=np.float64)
-        key = (kind, n, m, *entries, flat.tobytes())
+        address = 0 if shared is None else shared.ctypes.data
+        key = (kind, n, m, *entries, flat.tobytes(), address)
         if key in self._place_of:
             return self._place_of[key]
         place = len(self._code)
@@ -152,8 +178,14 @@ class Plan:
             self._append(np.zeros(-end % HK_GROUP))
         number = 1 + KINDS.index(kind)
         self._code += [number, n, m, self._length, *map(int, entries)]
+        if shared is not None:
+            self.shared[len(self._code) - 2] = shared
         self._append(flat)
         return place
+
+    def _can_share(self, array: NDArray) -> bool:
+        fits = array.dtype == np.float64 and array.flags.c_contiguous
+        return self._shares and fits and array.size >= _LARGE
 
     def _append(self, numbers: NDArray) -> None:
         self._data.append(numbers)

@@ -28,11 +28,15 @@ class PlausibleRows:
 
     def hold(self, q: NDArray) -> bool:
         """Return whether all rows of q (N, n) lie within the bounds."""
-        if len(q) == 1 and sum(map(abs, q[0].tolist())) <= self._small:
+        if self.hold_row(q):
             return True
         with np.errstate(all="ignore"):  # numbers too large for float64 are outside
             largest = np.abs((q - self.rest) @ self.weights.T).max(initial=0.0)
         return bool(largest <= 1.0)
+
+    def hold_row(self, q: NDArray) -> bool:
+        """Return whether q (N, n) is one row of small numbers, so finite and within the bounds."""
+        return len(q) == 1 and sum(map(abs, q[0].tolist())) <= self._small
 
     @cached_property
     def _small(self) -> float:

@@ -277,8 +277,8 @@ def _write_quadratic_leverage(plan: Plan, stored: Stored) -> int:
     identity_matrix = np.eye(2 * len(center) + 1)
     factor = solve_triangular(stored.array("factor"), identity_matrix, lower=True).T
     zeros = np.zeros(1), np.zeros(1), np.zeros(len(factor))
-    _, lever = lever_numbers(plan, *zeros, np.triu(factor))
-    numbers = [center, 1.0 / half_width, *lever]
+    _, lever, columns = lever_numbers(plan, *zeros, np.triu(factor))
+    numbers = [center, 1.0 / half_width, *lever, columns]
     return plan.node("quadratic_leverage", len(center), 0, numbers, aligned=True)
 
 

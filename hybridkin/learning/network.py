@@ -56,11 +56,12 @@ def write_units(plan, kind, activation, scaling, readout, hidden, lever=()):
     groups = units.reshape(-1, HK_GROUP, n + 1 + m).swapaxes(1, 2)
     numbers = [center, 1.0 / scale, intercept, direct, groups]
     entries = [n_hidden, KERNELS.index(activation)]
+    columns = None
     if lever:
-        sizes, leverage = lever_numbers(plan, *lever)
+        sizes, leverage, columns = lever_numbers(plan, *lever)
         numbers += leverage
         entries += sizes
-    return plan.node(kind, n, m, numbers, *entries, aligned=True)
+    return plan.node(kind, n, m, numbers, *entries, aligned=True, last=columns)
 
 
 def lever_numbers(plan, offset, prior, center, factor):
@@ -82,12 +83,14 @@ def lever_numbers(plan, offset, prior, center, factor):
     sizes : tuple of int
         f, k, and whether R is full.
     numbers : list of ndarray
-        The columns of R come last, one after the other.
+        All but R.
+    columns : ndarray of shape (k, f)
+        The columns of R, the last numbers.
     """
     n_features, n_columns = factor.shape
     plan.limit("features", n_features)
     full = n_columns < n_features or np.tril(factor, -1).any()
-    return (n_features, n_columns, full), [offset, prior, center, factor.T]
+    return (n_features, n_columns, full), [offset, prior, center], factor.T
 
 
 def write_network(plan, stored, leverage=False):
@@ -172,6 +175,8 @@ class ELM(LeverageModule):
         for name in (*LAYER, *READOUT, "leverage_prior"):
             array = np.asarray(arrays[name], order="C")
             self.register_buffer(name, torch.tensor(array, device="cpu"))
+        # Kernels read column by column.
+        self.leverage_factor = self.leverage_factor.T.contiguous().T
         n_hidden, self.n_actuators = self.input_weights.shape
         n_features, self.n_outputs = self.output_weights.shape
         if n_features not in (n_hidden, n_hidden + self.n_actuators):

@@ -323,15 +323,18 @@ class _Compiled:
     """The program of a model, and what it was made of.
 
     A tensor counts with its place in memory and its bytes, because writes through ``.data`` or
-    NumPy do not change its version.
+    NumPy do not change its version. The program itself sees writes to large tensors, see `Plan`.
     """
 
     def __init__(self, model: ForwardModel) -> None:
         self.program = None
         self.reason = ""
         self.tensors = []
+        self.strided = []
         self.views = []
         self.content = []
+        self.shared_views = []
+        self.shared_content = []
         self.dicts = []
         self.settings = []
         modules = [*model.modules()]
@@ -346,7 +349,7 @@ class _Compiled:
         self._remember()
         try:
             _check_classes(modules)
-            tensors = [*model.buffers(), *model.parameters()]
+            tensors = _described_tensors(modules)
             if any(a.device.type != "cpu" or a.is_inference() for a in tensors):
                 raise NoKernel(
                     "the compiled core needs tensors on the CPU, no inference tensors"
@@ -355,14 +358,25 @@ class _Compiled:
             self.views = [*map(_memory, tensors)]
             self.content = [*map(bytearray, self.views)]
             self._remember()
-            self.program = Program(Plan(model.stored()))
+            plan = Plan(model.stored(), shares=True)
+            self._part_shared(plan)
+            self.program = Program(plan)
         except (ValueError, TypeError) as error:
             self.reason = str(error).split(";")[0]
+
+    def _part_shared(self, plan: Plan) -> None:
+        """Keep the bytes of the tensors that the plan shares apart from those of the others."""
+        shared = {array.ctypes.data for array in plan.shared.values()}
+        for k in reversed(range(len(self.tensors))):
+            if self.places[k] in shared:
+                self.shared_views.append(self.views.pop(k))
+                self.shared_content.append(self.content.pop(k))
 
     def _remember(self) -> None:
         """Remember the places of the tensors and the settings."""
         self.places = [*map(Tensor.data_ptr, self.tensors)]
-        self.strides = [*map(Tensor.stride, self.tensors)]
+        self.strided = [a for a in self.tensors if _can_be_strided(a)]
+        self.strides = [*map(Tensor.stride, self.strided)]
         self.values = self._values()
 
     def _values(self) -> list[object]:
@@ -370,7 +384,7 @@ class _Compiled:
         return [attributes.get(name) for attributes, name in self.settings]
 
     def holds(self) -> bool:
-        """Return whether the model is still the same."""
+        """Return whether the model is still the same, but for tensors that the plan shares."""
         try:
             if self.dicts != self.parts:  # identity first; else tensors are compared
                 return False
@@ -380,14 +394,33 @@ class _Compiled:
             self.values == self._values()
             and self.content == self.views
             and [*map(Tensor.data_ptr, self.tensors)] == self.places
-            and [*map(Tensor.stride, self.tensors)] == self.strides
+            and [*map(Tensor.stride, self.strided)] == self.strides
         )
+
+    def is_same(self) -> bool:
+        """Return whether the model is still the same."""
+        return self.holds() and self.shared_content == self.shared_views
 
 
 def _memory(a: Tensor) -> memoryview:
     """Return the memory that a tensor reads."""
     whole = torch.empty(0, dtype=a.dtype, device=a.device)
     return whole.set_(a.untyped_storage()).numpy().data
+
+
+def _can_be_strided(a: Tensor) -> bool:
+    """Return whether the same memory can hold as many numbers in another order."""
+    return a.ndim > 1 or a.untyped_storage().nbytes() > a.nbytes
+
+
+def _described_tensors(modules: list[torch.nn.Module]) -> list[Tensor]:
+    """Return the tensors that a plan is made of; others are computed from them."""
+    tensors = []
+    for module in modules:
+        if isinstance(module, PortableModule):
+            for name in (*module.layout.arrays, *module.layout.derived):
+                tensors.append(module._buffers.get(name))
+    return [a for a in tensors if a is not None]
 
 
 def _check_classes(modules: list[torch.nn.Module]) -> None:
@@ -403,10 +436,26 @@ def program_of(model: ForwardModel) -> Program | None:
     The model keeps its program until a buffer or a submodule changes.
     """
     compiled = model.__dict__.get("_program")
+    if compiled is None or not compiled.is_same():
+        return _compiled_anew(model)
+    return compiled.program
+
+
+def _present_program(model: ForwardModel) -> Program | None:
+    """Return a program that is right at present, faster than `program_of`.
+
+    It can be that of before if a tensor has changed that it shares.
+    """
+    compiled = model.__dict__.get("_program")
     if compiled is None or not compiled.holds():
-        if library() is None:
-            return None
-        compiled = model.__dict__["_program"] = _Compiled(model)
+        return _compiled_anew(model)
+    return compiled.program
+
+
+def _compiled_anew(model: ForwardModel) -> Program | None:
+    if library() is None:
+        return None
+    compiled = model.__dict__["_program"] = _Compiled(model)
     return compiled.program
 
 
@@ -447,7 +496,7 @@ def evaluate(
     ((2, 3), (2, 3, 3))
     """
     q = np.asarray(q, np.float64)
-    program = program_of(model)
+    program = _present_program(model)
     if program is not None:
         if not (value or jacobian):
             return (program.domain(q)[0],)

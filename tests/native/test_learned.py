@@ -19,7 +19,7 @@ from hybridkin.hybrid._module import HybridModule, InnerCorrection, TipCorrectio
 from hybridkin.learning.network import ELM
 from hybridkin.learning.regressor_modules import AffineModule, KernelModule, PolynomialModule
 from hybridkin.native import backend
-from hybridkin.native.library import program_of
+from hybridkin.native.library import evaluate, program_of
 
 pytestmark = pytest.mark.needs_core
 
@@ -236,6 +236,32 @@ def test_stored_models_of_every_kind(path):
         found = program.evaluate(q, True, True)
         for ours, theirs in zip(found, (x, J, distance), strict=True):
             assert_close_rows(ours, theirs, 2e-11)
+
+
+def test_writes_to_a_large_factor_are_seen():
+    """The core reads it where it is; what needs a copy of its own gets another program."""
+    large = network("low rank", n_hidden=90)
+    rows = inputs(3.0, 19)
+    module = HybridModule(None, [TipCorrection(large, guard("own", large))], torch.ones(1).double())
+    shared = program_of(module)
+    (columns,) = shared.plan.shared.values()
+    assert columns.ctypes.data == large.leverage_factor.data_ptr()
+    for change in (
+        lambda: large.leverage_factor.numpy().__imul__(0.9),
+        lambda: setattr(large.leverage_factor, "data", 0.7 * large.leverage_factor),
+        lambda: setattr(large, "leverage_factor", 0.6 * large.leverage_factor),
+        lambda: large.leverage_factor.data.mul_(0.5),
+        lambda: setattr(large.leverage_factor, "data", (0.9 * large.leverage_factor).contiguous()),
+    ):
+        before = evaluate(module, rows, distance=True)
+        change()
+        found = evaluate(module, rows, distance=True)
+        assert np.abs(found[1] - before[1]).max() > 0.0
+        expected = in_torch(module, rows)
+        assert_close_rows(found[0], expected[0])
+        assert_close_rows(found[1], expected[2])
+        assert program_of(module) is not shared
+        shared = program_of(module)
 
 
 def test_parts_without_kernel_leave_the_model_to_torch():

@@ -18,7 +18,7 @@ from hybridkin import (
     RigidChain,
     as_forward_model,
 )
-from hybridkin._core.plan import MOST
+from hybridkin._core.plan import MOST, Plan
 from hybridkin.ik._compiled import core_of
 from hybridkin.ik.tasks import PointsTask, PoseTask
 from hybridkin.native import library
@@ -95,7 +95,7 @@ def write_plan(path, plan, q):
 @pytest.mark.parametrize("kind", KINDS)
 def test_functions_of_the_library_take_little_stack(tmp_path, kind):
     model, q = largest(kind)
-    plans = [program_of(model).plan]
+    plans = [Plan(model.stored())]
     if kind != "regressor":
         options = {"q_min": -0.02, "q_max": 0.02, "ddq_max": 10.0, "dq_max": 1.0}
         tasks = [PoseTask(model)] if kind in CHAINS else [model]

@@ -26,6 +26,9 @@ static inline hk_factor HK(lever)(const hk_plan *p, int at) {
     if (network) {
         lever.k = more[3];
         lever.full = more[4];
+#ifndef HK_KINDS /* R may stand elsewhere in memory, so far from the numbers of the plan */
+        if (more[5] || more[6]) lever.R = p->data + (more[5] + more[6] * ((int64_t)1 << 31));
+#endif
     }
     return lever;
 }
