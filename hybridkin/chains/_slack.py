@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import torch
@@ -14,6 +13,7 @@ from hybridkin._core.arrays import identity
 from hybridkin._core.kernel_numbers import HK_MOST_TURNS, HK_WHOLE_STEPS
 
 MOST = 62  # a set of tendons is the bits of one integer
+_EXACT = 24  # bits of a float32
 
 
 class Elasticity(NamedTuple):
@@ -98,9 +98,36 @@ def as_mask(codes: Tensor, n: int) -> Tensor:
     return (codes[:, None] >> places) & 1 > 0
 
 
+def _bits(n: int, like: Tensor) -> Tensor:
+    """Return the bits of n tendons (n,); as floating-point numbers if sums of them are exact."""
+    bits = 2 ** torch.arange(n, device=like.device)
+    return bits.float() if n <= _EXACT else bits
+
+
+def _as_codes(mask: Tensor, bits: Tensor) -> Tensor:
+    """Return sets, given as a mask (N, n), as the bits of integers (N,)."""
+    if bits.is_floating_point():  # a product is faster than a sum
+        return (mask.to(bits) @ bits).long()
+    return (mask * bits).sum(-1)
+
+
 def find_in_table(rows: Tensor, table: Tensor) -> Tensor:
-    """Return codes (N,) of the taut tendons, from the stretches of all sets."""
-    return _pivoted(partial(table.index_select, 0), table[-1], extended(rows))
+    """Return codes (N,) of the taut tendons, from the stretches of all sets (M, n, n + 1)."""
+    n = rows.shape[1]
+    columns = table.mT.reshape(-1, n)
+    places = torch.arange(n + 1, device=rows.device)
+
+    def stretches(codes: Tensor, x: Tensor, columns: Tensor = columns) -> Tensor:
+        # The map of each row times x, without a copy of the maps.
+        at = codes[:, None] * (n + 1) + places
+        return nn.functional.embedding_bag(
+            at, columns, per_sample_weights=x, mode="sum"
+        )
+
+    def sizes(codes: Tensor, x: Tensor) -> Tensor:
+        return stretches(codes, x.abs(), columns.abs())
+
+    return _pivoted(stretches, sizes, table[-1], extended(rows))
 
 
 def find_by_solving(rows: Tensor, *elasticity: Tensor) -> Tensor:
@@ -111,29 +138,47 @@ def find_by_solving(rows: Tensor, *elasticity: Tensor) -> Tensor:
         taut = as_mask(codes, n)
         return responses_of(taut, Elasticity(*elasticity)).stretch
 
+    def stretches(codes: Tensor, x: Tensor) -> Tensor:
+        return applied(maps_of(codes), x)
+
+    def sizes(codes: Tensor, x: Tensor) -> Tensor:
+        return applied(maps_of(codes).abs(), x.abs())
+
     all_taut = torch.tensor([2**n - 1], device=rows.device)
-    return _pivoted(maps_of, maps_of(all_taut)[0], extended(rows))
+    return _pivoted(stretches, sizes, maps_of(all_taut)[0], extended(rows))
 
 
-def _pivoted(maps_of: Callable[[Tensor], Tensor], full: Tensor, x: Tensor) -> Tensor:
+_Stretches = Callable[[Tensor, Tensor], Tensor]
+
+
+def _pivoted(
+    stretches: _Stretches, sizes: _Stretches, full: Tensor, x: Tensor
+) -> Tensor:
     """Return the codes (N,) of the taut tendons by block principal pivoting.
 
-    `maps_of` returns the stretches of sets of taut tendons as maps (N, n, n + 1). `full` is the map
-    (n, n + 1) for all tendons taut, which gives the first guess.
+    Parameters
+    ----------
+    stretches : callable
+        Returns the stretches (N, n) for sets of taut tendons, as codes (N,), at x (N, n + 1).
+    sizes : callable
+        The same, of the absolute values of all numbers.
+    full : Tensor of shape (n, n + 1)
+        The stretches for all tendons taut, as a map of x; they give the first guess.
+    x : Tensor of shape (N, n + 1)
+        (q, 1).
     """
     n = x.shape[1] - 1
-    bits = 2 ** torch.arange(n, device=x.device)
     places = torch.arange(len(x), device=x.device)  # of the rows that still change
-    guess = ((x @ full.T >= 0) * bits).sum(-1)
+    bits = _bits(n, x)
+    guess = _as_codes(x @ full.T >= 0, bits)
     codes = guess.clone()
     for step in range(HK_WHOLE_STEPS + 2 ** min(n, HK_MOST_TURNS)):
-        maps = maps_of(guess)
-        stretch = applied(maps, x)
-        taut = ((stretch >= 0) * bits).sum(-1)
+        stretch = stretches(guess, x)
+        taut = _as_codes(stretch >= 0, bits)
         if step >= HK_WHOLE_STEPS:
             # The first wrong tendon alone, ignoring rounding errors.
-            rounding = 4.0 * torch.finfo(x.dtype).eps * applied(maps.abs(), x.abs())
-            certain = ((stretch.abs() > rounding) * bits).sum(-1)
+            rounding = 4.0 * torch.finfo(x.dtype).eps * sizes(guess, x)
+            certain = _as_codes(stretch.abs() > rounding, bits)
             wrong = (taut ^ guess) & certain
             taut = guess ^ (wrong & -wrong)  # its lowest bit
         changed = (taut != guess).nonzero()[:, 0]
