@@ -200,11 +200,11 @@ static inline void HK(guard_slope)(const hk_plan *p, int at, const V *q, HK(seen
 
 /* The weight g = 1 / (1 + excess^3) of a guard, and its slope (n) where not NULL. By a leverage the
    excess begins farther out than by a box. Returns whether any row fades; else g is 1
-   and the slope is not written, and the distance may be an upper bound if not `exact`. */
+   and the slope is not written, and the distance may be an upper bound if not `exact`, see hk_plan. */
 static inline int HK(fading)(const hk_plan *p, int at, int exact, const V *q, HK(seen) * seen,
                              V *distance, V *g, V *slope, V *work) {
     const real full = HK_IS(p, at, HK_LEVERAGE_GUARD) ? HK_FULL_LEVERAGE : HK_FULL;
-    const real enough = exact ? R(-1.0) : full * (R(1.0) - R(8.0) * HK_EPS);
+    const real enough = exact ? p->enough : full * (R(1.0) - R(8.0) * HK_EPS);
     *g = SPLAT(1.0);
     *distance = HK(guard_distance)(p, at, enough, q, seen, work);
     if (!HK(any)(NOT(*distance <= SPLAT(full)))) return 0;

@@ -96,7 +96,7 @@ static void hk_block(const hk_plan *p, int at, V *work, const real *q, int rows,
    Where x is NULL, the distances alone, and their slopes (rows, n) in J. */
 HK_API void hk_evaluate(const hk_call *call, const real *q, int64_t rows, real *x, real *J,
                         real *distance) {
-    const hk_plan plan = {call->code, call->data};
+    const hk_plan plan = {call->code, call->data, R(0.0)};
     const int at = (int)call->at, n = plan.code[at + HK_N], m = x ? plan.code[at + HK_M] : 1;
     if (rows == 1 && !x)
         hk_domain(&plan, at, q, distance, J, call->work);

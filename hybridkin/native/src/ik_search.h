@@ -260,7 +260,7 @@ static void ik_look_at(const ik_settings *ik, int64_t rows, const real *q, real 
 static void ik_search(ik_search_t *s, int64_t rows, const real *target, real *q, real *J, real *e,
                       int32_t *found, int32_t *n_iter) {
     const int n = s->ik.n, m = s->ik.m, width = s->ik.width;
-    const hk_plan *plan = &s->ik.plan;
+    const hk_plan plan = {s->ik.plan.code, s->ik.plan.data, R(1.0)}; /* inside is inside */
     V *work = hkv_aligned(s->ik.work), turn[9], distance = SPLAT(0.0);
     V *vq = hkv_take(&work, n), *vx = hkv_take(&work, m), *vJ = hkv_take(&work, m * n);
     ik_row *lane = (ik_row *)hkv_take(&work, IK_ROW_LANES);
@@ -286,9 +286,9 @@ static void ik_search(ik_search_t *s, int64_t rows, const real *target, real *q,
         }
         if (!busy) return;
         if (IK_IS_POSE(&s->ik))
-            hkv_pose(plan, s->ik.model, vq, vx, turn, vJ, &distance, work);
+            hkv_pose(&plan, s->ik.model, vq, vx, turn, vJ, &distance, work);
         else
-            hkv_model(plan, s->ik.model, vq, vx, vJ, &distance, work);
+            hkv_model(&plan, s->ik.model, vq, vx, vJ, &distance, work);
         EACH(i) {
             ik_row *r = lane + i;
             real x[IK_WIDTH];

@@ -48,7 +48,7 @@ static inline ik_settings ik_settings_of(const int32_t *code, const real *data, 
     const int n = node[HK_N], m = node[HK_M], flags = more[1], n_normals = more[2];
     const real *a = data + node[HK_DATA], *b = a + 6 * n, *c = b + 4 + m;
     const ik_settings ik = {
-        .plan = {code, data},
+        .plan = {code, data, R(0.0)},
         .work = work + IK_SLOTS_WORK(n, m, n_normals),
         .slots = work,
         .model = more[0],

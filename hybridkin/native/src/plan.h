@@ -63,6 +63,7 @@ enum { HK_INNER, HK_REGRESSOR, HK_GUARD, HK_STRIDE };
 typedef struct {
     const int32_t *code;
     const real *data;
+    real enough; /* an upper bound of a domain distance is as good as the distance up to here */
 } hk_plan;
 
 /* A leverage: with v = phi - center and r = R' v it is |r|^2 + offset, or with a prior

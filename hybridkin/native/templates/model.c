@@ -12,7 +12,7 @@ static const real data[] = {@DATA@};
 
 const @REAL@ @NAME@_home[@N@] = {@HOME@};
 
-static const hk_plan plan = {code, data};
+static const hk_plan plan = {code, data, 0};
 
 /* Numbers of memory to compute in, on the stack. */
 enum { WORK = HK_MODEL_WORK(HK_MAX_N, HK_MAX_S, HK_MAX_M, HK_MAX_F, HK_MAX_P) };
