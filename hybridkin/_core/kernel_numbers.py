@@ -88,7 +88,8 @@ IK_DISTANCE = 6  # length of the error
 IK_STOPPED = 7  # whether half-spaces changed the motion of the tip
 # Then target, motion of the target in this period, measured tip, last measured tip minus model, x
 # and error; q, step, q before, whether it was held (n each); and J. Points of a task of m rows have
-# m numbers, poses 16; motions and errors m.
+# m numbers, poses 16; motions and errors m. With hysteresis q is the command and q before what the
+# actuators did; then follow its state, and one to try.
 IK_TARGET = 8
 IK_POSE_NUMBERS = 16
 IK_HAS_TARGET = 1
@@ -96,6 +97,11 @@ IK_HAS_FEED = 2
 IK_HAS_TIP = 4
 IK_MUST_SEE = 8
 IK_FROM_REST = 16
+IK_LEADS = 32  # commands lead what the actuators do, by their hysteresis
+
+# Hysteresis of the actuators.
+HK_CREEP_ROUNDING = 16.0  # of a command, in units of the precision
+IK_AT_REST_SHARE = 1e-6  # a command that moves this much farther than its actuator stays
 
 # The search for configurations.
 IK_LOWERS, IK_TO_DOMAIN, IK_TO_POSTURE = 1, 2, 4  # modes

@@ -1,7 +1,6 @@
 /* The compiled core: the kernels for one row and for blocks of rows, and what Python calls. */
 
 #include "plan.h"
-#include "play.h"
 
 #define HK_ROW_LANES /* one row of a network has lanes over the hidden units */
 
@@ -109,10 +108,22 @@ HK_API void hk_evaluate(const hk_call *call, const real *q, int64_t rows, real *
                      J ? J + r * m * n : NULL, distance ? distance + r : NULL);
 }
 
-/* Rows through the play of tendons, see play.h. */
-HK_API void hk_play(int64_t rows, int32_t n, int32_t lead, const real *half, const real *given,
-                    real *command, real *effective, real *found) {
-    hk_play_rows(rows, n, lead, half, given, command, effective, found);
+/* Rows (rows, n) through hysteresis, see hysteresis.h: commands, or with `lead` what the actuators are
+   to do, `seconds` (rows) after the row before. The results are what they do, or the commands. */
+HK_API void hk_hysteresis_rows(int64_t rows, int32_t n, int32_t lead, const int32_t *code,
+                               const real *numbers, const real *seconds, const real *given,
+                               real *state, real *results) {
+    const hk_hysteresis h = {code, numbers, n};
+    const real *result = state + (lead ? 0 : (code[HK_STATE_ROWS] - 1) * n);
+    for (int64_t r = 0; r < rows; r++, given += n, results += n) {
+        if (lead)
+            hk_hysteresis_command(&h, seconds[r], given, state);
+        else {
+            for (int j = 0; j < n; j++) state[j] = given[j];
+            hk_hysteresis_apply(&h, seconds[r], state);
+        }
+        for (int j = 0; j < n; j++) results[j] = result[j];
+    }
 }
 
 /* What follows targets: settings, and the state of `ik_tick`. */

@@ -2,6 +2,7 @@
    (6). The damped inverse, a posture in its null space, and limits inside the step. One row at a
    time. */
 
+#include "hysteresis.h"
 #include "ik_box.h"
 
 /* The settings: limits of q, of its speed and acceleration, posture, and units in which nothing has
@@ -16,6 +17,7 @@ typedef struct {
     const real *low, *high, *speed, *accel, *posture, *unit, *period, *pulls, *normals;
     const real *scale;             /* of every row of the task [m per unit] */
     const real *spaces, *offsets;  /* normals (m, n_spaces), and how far along them */
+    hk_hysteresis hysteresis;
     real gain, beta, dt, damping;  /* gain < 0: 1 / dt; damping < 0: adaptive */
 } ik_settings;
 
@@ -74,6 +76,7 @@ static inline ik_settings ik_settings_of(const int32_t *code, const real *data, 
         .normals = c + 2 * n,
         .spaces = c + (2 + n_normals) * n,
         .offsets = c + (2 + n_normals) * n + more[3] * m,
+        .hysteresis = {more + 4, c + (2 + n_normals) * n + more[3] * (m + 1), n},
     };
     return ik;
 }
@@ -278,6 +281,18 @@ static inline void ik_step_bounds(const ik_settings *ik, const real *q, real sec
         }
         s->lower[j] = lower, s->upper[j] = upper;
     }
+}
+
+/* The least and the largest step of every actuator. */
+typedef struct {
+    real lower[HK_MAX_N], upper[HK_MAX_N];
+} ik_ends;
+
+/* The bounds of a step as above, or these, unless NULL. */
+static inline void ik_bound(const ik_settings *ik, const real *q, real seconds, const real *last,
+                            const ik_ends *ends, ik_step_t *s) {
+    if (!ends) ik_step_bounds(ik, q, seconds, last, s);
+    for (int j = 0; ends && j < ik->n; j++) s->lower[j] = ends->lower[j], s->upper[j] = ends->upper[j];
 }
 
 /* The largest change of a motion `way` (m) of the task per period, in multiples of it. */
@@ -567,10 +582,11 @@ static void ik_arrive(const ik_settings *ik, const real *q, const real *x, const
 /* Eq. (1) for one period from q: the error e and the motion `feed` of the target (may be NULL) are
    taken back. `tip` (m) is where half-spaces see it. What is not finite, or overflows, holds still,
    with a limit of acceleration after it has braked; from outside the limits the actuators that are
-   known walk back. */
+   known walk back. The step is within `ends`, if not NULL, in place of its limits. */
 static HK_NOINLINE void ik_control(const ik_settings *ik, const real *q, const real *x,
                                    const real *J, const real *e, const real *feed, real seconds,
-                                   const real *last, const real *tip, ik_step_t *s) {
+                                   const real *last, const real *tip, const ik_ends *ends,
+                                   ik_step_t *s) {
     const int n = ik->n, m = ik->m, slides = ik->flags & IK_POSTURE;
     real v[IK_ROWS], gain = ik->gain < R(0.0) ? R(1.0) : ik->gain * seconds;
     real beta = ik->beta * seconds;
@@ -604,17 +620,17 @@ static HK_NOINLINE void ik_control(const ik_settings *ik, const real *q, const r
                 margin[i] = ik_stopping(margin[i], ik_braking(ik, J, normal, seconds, s));
             }
             for (int i = 0; i < k; i++) left[i] = margin[i];
-            ik_step_bounds(ik, q, seconds, last, s);
+            ik_bound(ik, q, seconds, last, ends, s);
             ik_step_inside(ik, J, v, left, slides, s);
             ik_allowed(ik, margin, v, v);
         } else {
-            ik_step_bounds(ik, q, seconds, last, s);
+            ik_bound(ik, q, seconds, last, ends, s);
             ik_limited_step(ik, J, v, slides, NULL, s);
         }
         if (ik->flags & IK_PULLS && ik_finite(n, s->dq)) ik_arrive(ik, q, x, J, v, s);
         if (ik_finite(n, s->dq)) return; /* else v is too large to compute with */
     }
-    ik_step_bounds(ik, q, seconds, known ? last : NULL, s);
+    ik_bound(ik, q, seconds, known ? last : NULL, ends, s);
     for (int j = 0; j < n; j++) {
         s->dq[j] = ik_finite(1, q + j) ? ik_clip(R(0.0), s->lower[j], s->upper[j]) : R(0.0);
         s->held[j] = (unsigned char)((s->dq[j] <= s->lower[j]) | (s->dq[j] >= s->upper[j]));
@@ -625,6 +641,7 @@ static HK_NOINLINE void ik_control(const ik_settings *ik, const real *q, const r
 /* The parts of the state of a robot that follows targets. */
 typedef struct {
     real *target, *feed, *tip, *offset, *x, *error, *q, *dq, *before, *held, *J;
+    real *lead, *tried; /* with hysteresis: its state, and one to try */
 } ik_state;
 
 #define IK_STATE_SIZE(n, m, width) (IK_TARGET + 3 * (width) + 3 * (m) + 4 * (n) + (m) * (n))
@@ -642,6 +659,8 @@ static inline ik_state ik_state_of(const ik_settings *ik, real *state) {
     parts.before = parts.dq + ik->n;
     parts.held = parts.before + ik->n;
     parts.J = parts.held + ik->n;
+    parts.lead = parts.J + ik->m * ik->n;
+    parts.tried = HK_HYSTERESIS ? parts.lead + ik->hysteresis.code[HK_STATE_ROWS] * ik->n : NULL;
     return parts;
 }
 
@@ -662,19 +681,108 @@ static inline int ik_is_rotation(const real *T) {
     return off <= R(1e-3) && det > R(0.0);
 }
 
+/* y (n) = what actuators would do after a command q, by the state that is tried. */
+static inline void ik_try(const ik_settings *ik, const ik_state *now, real seconds, const real *q,
+                          real *y) {
+    const int n = ik->n, last = (ik->hysteresis.code[HK_STATE_ROWS] - 1) * n;
+    for (int i = n; i < last + n; i++) now->tried[i] = now->lead[i];
+    for (int j = 0; j < n; j++) /* what is infinite has no limit */
+        now->tried[j] = ik_finite(1, q + j) ? q[j] : now->lead[j];
+    hk_hysteresis_apply(&ik->hysteresis, seconds, now->tried);
+    for (int j = 0; j < n; j++) y[j] = ik_finite(1, q + j) ? now->tried[last + j] : q[j];
+}
+
+/* The ends of what actuators do after commands from `low` to `high` (n), as y is monotone in q. */
+static inline void ik_try_ends(const ik_settings *ik, const ik_state *now, real seconds,
+                               const real *low, const real *high, ik_ends *ends) {
+    const real *y = now->lead + (ik->hysteresis.code[HK_STATE_ROWS] - 1) * ik->n;
+    ik_try(ik, now, seconds, low, ends->lower);
+    ik_try(ik, now, seconds, high, ends->upper);
+    for (int j = 0; j < ik->n; j++) {
+        ends->lower[j] -= y[j];
+        ends->upper[j] = ik_larger(ends->upper[j] - y[j], ends->lower[j]);
+    }
+}
+
+/* Commands (n) for a step dq of the actuators. One that would move far for almost nothing, such as
+   through a backlash for rounding, stays; `kept` (n) is what they do without a new command. */
+static inline void ik_command(const ik_settings *ik, const ik_state *now, real seconds,
+                              const real *kept, const real *dq, real *command) {
+    const int n = ik->n, rows = ik->hysteresis.code[HK_STATE_ROWS];
+    const real *y = now->lead + (rows - 1) * n;
+    real goal[HK_MAX_N] = {R(0.0)};
+    for (int i = 0; i < rows * n; i++) now->tried[i] = now->lead[i];
+    for (int j = 0; j < n; j++) goal[j] = y[j] + dq[j];
+    hk_hysteresis_command(&ik->hysteresis, seconds, goal, now->tried);
+    for (int j = 0; j < n; j++) {
+        const real way = now->tried[j] - now->q[j];
+        const int stays = ik_abs(goal[j] - kept[j]) < IK_AT_REST_SHARE * ik_abs(way);
+        command[j] = stays ? now->q[j] : now->tried[j];
+    }
+}
+
+/* One period with hysteresis: limits are those of commands, the law is that of what actuators do.
+
+   First the step without limits of speed and acceleration. If its commands are beyond these, the step
+   within what the actuators can do in this period. Where hysteresis stops one of them on its way, its
+   command goes on, and can stop where the first step has it. */
+static HK_NOINLINE void ik_lead(const ik_settings *ik, const ik_state *now, const real *e,
+                                const real *feed, real seconds, const real *last, const real *tip,
+                                ik_step_t *s) {
+    const int n = ik->n;
+    const real *y = now->lead + (ik->hysteresis.code[HK_STATE_ROWS] - 1) * n;
+    real low[HK_MAX_N], high[HK_MAX_N], kept[HK_MAX_N], wanted[HK_MAX_N], goal[HK_MAX_N];
+    ik_step_t limits;
+    ik_ends ends;
+    int beyond = 0;
+    ik_step_bounds(ik, now->q, seconds, last && ik_finite(n, last) ? last : NULL, &limits);
+    for (int j = 0; j < n; j++) {
+        low[j] = ik->flags & IK_LIMITED ? ik->low[j] : -R(INFINITY);
+        high[j] = ik->flags & IK_LIMITED ? ik->high[j] : R(INFINITY);
+    }
+    ik_try(ik, now, seconds, now->q, kept);
+    ik_try_ends(ik, now, seconds, low, high, &ends);
+    ik_control(ik, y, now->x, now->J, e, feed, seconds, last, tip, &ends, s);
+    ik_command(ik, now, seconds, kept, s->dq, wanted);
+    for (int j = 0; j < n; j++) {
+        low[j] = now->q[j] + limits.lower[j], high[j] = now->q[j] + limits.upper[j];
+        goal[j] = wanted[j];
+        beyond |= !(wanted[j] >= low[j] && wanted[j] <= high[j]);
+    }
+    if (beyond) {
+        ik_try_ends(ik, now, seconds, low, high, &ends);
+        ik_control(ik, y, now->x, now->J, e, feed, seconds, last, tip, &ends, s);
+        ik_command(ik, now, seconds, kept, s->dq, goal);
+    }
+    for (int j = 0; j < n; j++) {
+        const real way = wanted[j] - now->q[j], change = ik->accel[j] * seconds * seconds;
+        const real side = way < R(0.0) ? R(-1.0) : R(1.0);
+        const real most = now->q[j] + side * ik_stopping(ik_abs(way), change);
+        if (beyond && s->dq[j] <= ends.lower[j] && most < goal[j]) goal[j] = most;
+        if (beyond && s->dq[j] >= ends.upper[j] && most > goal[j]) goal[j] = most;
+        if (s->sigma_min != s->sigma_min) goal[j] = now->q[j]; /* hold still, not known */
+        now->lead[j] = ik_clip(goal[j], low[j], high[j]);
+        s->dq[j] = now->lead[j] - now->q[j];
+        s->held[j] = (unsigned char)((now->lead[j] <= low[j]) | (now->lead[j] >= high[j]));
+    }
+    hk_hysteresis_apply(&ik->hysteresis, seconds, now->lead);
+}
+
 /* One period of a robot that follows targets. Returns 0, and does nothing, if a pose in the state
    holds no rotation. */
 static inline int ik_tick(const ik_settings *ik, real *state) {
     const int n = ik->n, m = ik->m, mode = (int)state[IK_MODE];
     const ik_state now = ik_state_of(ik, state);
     const real period = state[IK_PERIOD], memory = state[IK_MEMORY];
+    const int leads = HK_HYSTERESIS && mode & IK_LEADS;
+    real *at = leads ? now.tried - n : now.q; /* where the model is */
     real used[IK_ROWS], seen_at[IK_ROWS], *last = NULL, moved[HK_MAX_N];
     int seen = 0;
     ik_step_t step;
     if (IK_IS_POSE(ik) && ((mode & IK_HAS_TARGET && !ik_is_rotation(now.target)) ||
                            (mode & IK_HAS_TIP && !ik_is_rotation(now.tip))))
         return 0;
-    ik_look(ik, now.q, now.x, now.J);
+    ik_look(ik, at, now.x, now.J);
     for (int i = 0; i < m; i++) used[i] = R(0.0), now.error[i] = R(NAN);
     if (mode & IK_HAS_TARGET) {
         ik_difference(ik, now.x, now.target, used);
@@ -700,8 +808,12 @@ static inline int ik_tick(const ik_settings *ik, real *state) {
         last = moved;
         for (int j = 0; j < n; j++) last[j] = ratio * now.dq[j];
     }
-    ik_control(ik, now.q, now.x, now.J, used, mode & IK_HAS_FEED ? now.feed : NULL, period, last,
-               seen_at, &step);
+    const real *feed = mode & IK_HAS_FEED ? now.feed : NULL;
+    for (int j = 0; j < n; j++) now.before[j] = at[j];
+    if (leads)
+        ik_lead(ik, &now, used, feed, period, last, seen_at, &step);
+    else
+        ik_control(ik, now.q, now.x, now.J, used, feed, period, last, seen_at, NULL, &step);
     state[IK_LAST] = period;
     if (memory > R(0.0))
         for (int i = 0; i < m; i++) now.offset[i] *= HK_MATH(exp)(-period / memory);
@@ -710,10 +822,9 @@ static inline int ik_tick(const ik_settings *ik, real *state) {
     state[IK_DISTANCE] = ik_norm(m, now.error);
     state[IK_STOPPED] = (real)step.stopped;
     for (int j = 0; j < n; j++) {
-        now.before[j] = now.q[j];
         now.dq[j] = step.dq[j];
         now.held[j] = step.held[j];
-        now.q[j] = now.q[j] + step.dq[j];
+        now.q[j] = leads ? now.lead[j] : now.q[j] + step.dq[j];
     }
     return 1;
 }

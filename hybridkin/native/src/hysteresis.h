@@ -1,0 +1,144 @@
+/* Hysteresis between the commands of n actuators and what they do: stages in series, each a weighted
+   sum of plays, or creep.
+
+   A description begins with the number of stages and the number of rows of the state. For each stage
+   follows a count: K > 0 for a sum of K plays, -J for creep with J time constants. Its numbers are,
+   stage by stage, half the widths (K, n), ascending, and the slopes (K, n), of which the last are 1;
+   or gains (J, n) and time constants (J).
+
+   The state has rows of n numbers: the command; then of every stage the plays (K) or slow parts (J),
+   and its result, which is the command of the next stage. The last row is what the actuators do. At
+   the start without hysteresis all rows are the command. */
+
+enum { HK_STAGES, HK_STATE_ROWS, HK_STAGE };
+
+typedef struct {
+    const int32_t *code;
+    const real *numbers;
+    int n;
+} hk_hysteresis;
+
+static inline int hk_stage_rows(int count) { return count < 0 ? -count : count; }
+
+/* What of a change with the time constant tau is still to come. */
+static inline real hk_late(real seconds, real tau) { return HK_MATH(exp)(-seconds / tau); }
+
+/* Plays that follow commands u (n), and their weighted sum y (n). */
+static inline void hk_plays_apply(int n, int count, const real *half, const real *slopes,
+                                  const real *u, real *plays, real *y) {
+    for (int j = 0; j < n; j++) y[j] = R(0.0);
+    for (int at = 0; at < count * n; at += n)
+        for (int j = 0; j < n; j++) {
+            const real low = u[j] - half[at + j], high = u[j] + half[at + j];
+            const real before = at ? slopes[at + j - n] : R(0.0);
+            real play = plays[at + j];
+            play = play < low ? low : play; /* a NaN stays */
+            play = high < play ? high : play;
+            plays[at + j] = play;
+            y[j] += (slopes[at + j] - before) * play;
+        }
+}
+
+/* The commands u (n) of sums y (n), which become `goal` (n). Along the direction of an actuator the
+   plays begin to move in the order of their widths, and y is piecewise linear in u. */
+static inline void hk_plays_command(int n, int count, const real *half, const real *slopes,
+                                    const real *goal, real *u, real *plays, real *y) {
+    for (int j = 0; j < n; j++) {
+        const real side = goal[j] > y[j] ? R(1.0) : goal[j] < y[j] ? R(-1.0) : R(0.0);
+        if (side == R(0.0)) continue;
+        real from = side * plays[j] + half[j], level = side * y[j];
+        real lag = slopes[j] * half[j], slope = slopes[j];
+        int at = j + n;
+        for (; at < count * n; at += n) {
+            const real begin = side * plays[at] + half[at], next = level + slope * (begin - from);
+            if (!(next < side * goal[j])) break;
+            from = begin, level = next;
+            lag += (slopes[at] - slope) * half[at], slope = slopes[at];
+        }
+        if (at < count * n)
+            u[j] = side * (from + (side * goal[j] - level) / slope);
+        else /* all of them move */
+            u[j] = goal[j] + side * lag;
+        y[j] = goal[j];
+    }
+    for (int at = 0; at < count * n; at += n)
+        for (int j = 0; j < n; j++) {
+            const real low = u[j] - half[at + j], high = u[j] + half[at + j];
+            plays[at + j] = plays[at + j] < low ? low : plays[at + j];
+            plays[at + j] = high < plays[at + j] ? high : plays[at + j];
+        }
+}
+
+static inline void hk_creep_apply(int n, int count, const real *gains, const real *times,
+                                  real seconds, const real *u, real *slow, real *y) {
+    for (int j = 0; j < n; j++) y[j] = u[j];
+    for (int i = 0; i < count; i++, slow += n, gains += n) {
+        const real late = hk_late(seconds, times[i]);
+        for (int j = 0; j < n; j++) {
+            const real behind = late * (slow[j] - u[j]);
+            slow[j] = u[j] + behind;
+            y[j] += gains[j] * behind;
+        }
+    }
+}
+
+static inline void hk_creep_command(int n, int count, const real *gains, const real *times,
+                                    real seconds, const real *goal, real *u, real *slow, real *y) {
+    for (int j = 0; j < n; j++) {
+        real at_once = R(1.0), left = goal[j], size = goal[j] < R(0.0) ? -goal[j] : goal[j];
+        for (int i = 0; i < count; i++) {
+            const real late = gains[n * i + j] * hk_late(seconds, times[i]);
+            const real part = late * slow[n * i + j];
+            at_once -= late, left -= part, size += part < R(0.0) ? -part : part;
+        }
+        /* Rounding is no reversal, after which a backlash before this stage would jump. */
+        const real moved = left / at_once, change = moved - u[j];
+        if ((change < R(0.0) ? -change : change) > HK_CREEP_ROUNDING * HK_EPS * size / at_once)
+            u[j] = moved;
+        y[j] = goal[j];
+    }
+    for (int i = 0; i < count; i++)
+        for (int j = 0; j < n; j++) {
+            real *part = slow + n * i + j;
+            *part = u[j] + hk_late(seconds, times[i]) * (*part - u[j]);
+        }
+}
+
+/* Follow the command in the first row of the state, `seconds` after the one before. */
+static inline void hk_hysteresis_apply(const hk_hysteresis *h, real seconds, real *state) {
+    const real *a = h->numbers;
+    const int n = h->n;
+    for (int i = 0; i < h->code[HK_STAGES]; i++) {
+        const int count = h->code[HK_STAGE + i], size = n * hk_stage_rows(count);
+        real *inside = state + n, *y = inside + size;
+        if (count > 0)
+            hk_plays_apply(n, count, a, a + size, state, inside, y);
+        else
+            hk_creep_apply(n, -count, a, a + size, seconds, state, inside, y);
+        a += size + (count > 0 ? size : -count);
+        state = y;
+    }
+}
+
+/* The inverse: the state after commands, in its first row, that bring the actuators to `goal` (n). An
+   actuator that is to stay keeps its command, unless it creeps. */
+static inline void hk_hysteresis_command(const hk_hysteresis *h, real seconds, const real *goal,
+                                         real *state) {
+    const int n = h->n, rows = h->code[HK_STATE_ROWS];
+    const real *a = h->numbers;
+    real *y = state + (rows - 1) * n;
+    for (int i = 0; i < h->code[HK_STAGES]; i++) {
+        const int count = h->code[HK_STAGE + i];
+        a += n * hk_stage_rows(count) + (count > 0 ? n * count : -count);
+    }
+    for (int i = h->code[HK_STAGES] - 1; i >= 0; i--) {
+        const int count = h->code[HK_STAGE + i], size = n * hk_stage_rows(count);
+        real *inside = y - size, *u = inside - n;
+        a -= size + (count > 0 ? size : -count);
+        if (count > 0)
+            hk_plays_command(n, count, a, a + size, goal, u, inside, y);
+        else
+            hk_creep_command(n, -count, a, a + size, seconds, goal, u, inside, y);
+        goal = y = u;
+    }
+}
