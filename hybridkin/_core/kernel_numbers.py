@@ -100,8 +100,12 @@ IK_FROM_REST = 16
 IK_LEADS = 32  # commands lead what the actuators do, by their hysteresis
 
 # Hysteresis of the actuators.
+HK_MAX_CREEPS = 16  # time constants of an operator
 HK_CREEP_ROUNDING = 16.0  # of a command, in units of the precision
-IK_AT_REST_SHARE = 1e-6  # a command that moves this much farther than its actuator stays
+IK_STAGES, IK_STATE_ROWS = 4, 5  # entries of a step: stages, and rows of their state
+IK_AT_REST_SHARE = (
+    1e-6  # a command that moves this much farther than its actuator stays
+)
 
 # The search for configurations.
 IK_LOWERS, IK_TO_DOMAIN, IK_TO_POSTURE = 1, 2, 4  # modes

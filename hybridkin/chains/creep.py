@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybridkin._core.arrays import real_array
+from hybridkin._core.kernel_numbers import HK_CREEP_ROUNDING, HK_MAX_CREEPS
 from hybridkin.chains.hysteresis import HysteresisOperator
+from hybridkin.native.hysteresis import Stage
 
 __all__ = ["CreepOperator", "CreepState"]
-
-_ROUNDING = 16.0  # of a command, in units of the precision
 
 
 class CreepState(NamedTuple):
@@ -74,9 +74,10 @@ class CreepOperator(HysteresisOperator[CreepState]):
         self.gains = real_array(gains, "gains").astype(float)
         self.times = real_array(times, "times").astype(float)
         positive = np.isfinite(self.times) & (self.times > 0.0)
-        if self.times.ndim != 1 or not self.times.size or not positive.all():
+        some = self.times.ndim == 1 and 0 < self.times.size <= HK_MAX_CREEPS
+        if not some or not positive.all():
             raise ValueError(
-                f"`times` must be (J,) finite positive numbers, got {times!r:.200}."
+                f"`times` must be 1 to {HK_MAX_CREEPS} finite positive numbers, got {times!r:.200}."
             )
         shaped = self.gains.ndim in (1, 2) and len(self.gains) == len(self.times)
         if not shaped or not _are_shares(self.gains):
@@ -97,6 +98,20 @@ class CreepOperator(HysteresisOperator[CreepState]):
 
     def _start(self, row: NDArray) -> CreepState:
         return CreepState(row, np.tile(row, (len(self.times), 1)))
+
+    def stages(self, n: int) -> list[Stage]:
+        """Return the operator of n actuators as one stage of creep."""
+        times = self.times
+        gains = np.broadcast_to(self._gains(times), (len(times), n))
+        return [Stage(-len(times), (gains, times))]
+
+    def packed(self, state: CreepState) -> NDArray:
+        """Return a state as the kernels keep it (J + 2, n); its result is not known."""
+        return np.vstack([state.command, state.slow, state.command])
+
+    def unpacked(self, rows: NDArray) -> CreepState:
+        """Return the state of rows (J + 2, n) of `packed`."""
+        return CreepState(rows[0], rows[1:-1])
 
     def _applied(
         self, rows: NDArray, start: CreepState, steps: NDArray
@@ -126,7 +141,8 @@ class CreepOperator(HysteresisOperator[CreepState]):
             moved = (rows[t] - (late * slow).sum(axis=0)) / at_once
             # Rounding is no reversal, after which a backlash before this operator would jump.
             size = np.abs(rows[t]) + (late * np.abs(slow)).sum(axis=0)
-            rounding = _ROUNDING * np.finfo(rows.dtype).eps * size / at_once
+            eps = np.finfo(rows.dtype).eps
+            rounding = HK_CREEP_ROUNDING * eps * size / at_once
             command = np.where(np.abs(moved - command) <= rounding, command, moved)
             slow = command + decay[:, None] * (slow - command)
             result[t] = command

@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from hybridkin._core.arrays import check_shape, labels, real_array
+from hybridkin.native.hysteresis import Stage, follow
+from hybridkin.native.library import available
 
 _State = TypeVar("_State", bound=tuple)
 
@@ -58,7 +60,7 @@ class HysteresisOperator(ABC, Generic[_State]):
             For a wrong shape, for entries that are not finite, or for no rows without a state.
         """
         rows, start = self._checked(q, state, "q")
-        result, end = self._applied(rows, start, _checked_steps(dt, len(rows)))
+        result, end = self._moved(rows, start, _checked_steps(dt, len(rows)), False)
         return _like(result, q), self._state_for(end, q)
 
     def command(
@@ -90,7 +92,7 @@ class HysteresisOperator(ABC, Generic[_State]):
             For a wrong shape, for entries that are not finite, or for no rows without a state.
         """
         rows, start = self._checked(y, state, "y")
-        result, end = self._commanded(rows, start, _checked_steps(dt, len(rows)))
+        result, end = self._moved(rows, start, _checked_steps(dt, len(rows)), True)
         return _like(result, y), self._state_for(end, y)
 
     def apply_by_group(
@@ -129,6 +131,30 @@ class HysteresisOperator(ABC, Generic[_State]):
                 steps = np.diff(times[motion], prepend=times[motion][:1])
             effective[motion], _ = self.apply(rows[motion], dt=steps)
         return _like(effective, q)
+
+    @abstractmethod
+    def stages(self, n: int) -> list[Stage]:
+        """Return the operator of n actuators as stages, for kernels."""
+
+    @abstractmethod
+    def packed(self, state: _State) -> NDArray:
+        """Return a state as the kernels keep it (R, n): the command, what is inside, the result."""
+
+    @abstractmethod
+    def unpacked(self, rows: NDArray) -> _State:
+        """Return the state of rows (R, n) of `packed`."""
+
+    def _moved(
+        self, rows: NDArray, start: _State, steps: NDArray, lead: bool
+    ) -> tuple[NDArray, _State]:
+        """Return effective changes (or with `lead` commands), and the last state."""
+        if len(rows) and rows.dtype == np.float64 and available():
+            state = self.packed(start).astype(np.float64)
+            result = follow(self.stages(rows.shape[1]), rows, steps, state, lead)
+            return result, self.unpacked(state)
+        if lead:
+            return self._commanded(rows, start, steps)
+        return self._applied(rows, start, steps)
 
     @property
     @abstractmethod

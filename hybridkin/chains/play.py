@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybridkin._core.arrays import real_array
 from hybridkin.chains.hysteresis import HysteresisOperator
-from hybridkin.native.library import available, play
+from hybridkin.native.hysteresis import Stage
 
 __all__ = ["PlayOperator", "PlayState"]
 
@@ -77,53 +77,61 @@ class PlayOperator(HysteresisOperator[PlayState]):
     def _start(self, row: NDArray) -> PlayState:
         return PlayState(row, row)
 
+    def stages(self, n: int) -> list[Stage]:
+        """Return the operator of n actuators as one stage of one play."""
+        half = np.broadcast_to(self.width / 2, (1, n))
+        return [Stage(1, (half, np.ones((1, n))))]
+
+    def packed(self, state: PlayState) -> NDArray:
+        """Return a state as the kernels keep it (3, n)."""
+        return np.stack([state.command, state.effective, state.effective])
+
+    def unpacked(self, rows: NDArray) -> PlayState:
+        """Return the state of rows (3, n) of `packed`."""
+        return PlayState(rows[0], rows[-1])
+
     def _applied(
         self, rows: NDArray, start: PlayState, steps: NDArray
     ) -> tuple[NDArray, PlayState]:
-        return _moved(rows, start, self.width / 2, lead=False)
+        result = played(rows, start.effective, self.width / 2)
+        if not len(rows):
+            return result, start
+        return result, PlayState(rows[-1], result[-1])
 
     def _commanded(
         self, rows: NDArray, start: PlayState, steps: NDArray
     ) -> tuple[NDArray, PlayState]:
-        return _moved(rows, start, self.width / 2, lead=True)
+        half = _movable(self.width / 2, rows)
+        command, effective = start
+        result = np.empty_like(rows)
+        for t, row in enumerate(rows):
+            ahead = row + half * np.sign(row - effective)
+            command = np.where(row == effective, command, ahead)
+            effective = row
+            result[t] = command
+        return result, PlayState(command, effective)
 
 
-def played(
-    rows: NDArray, command: NDArray, effective: NDArray, half: NDArray
-) -> NDArray:
+def played(rows: NDArray, effective: NDArray, half: NDArray) -> NDArray:
     """Return the results (T, n) of a play operator of half the width `half`.
 
     Parameters
     ----------
     rows : ndarray of shape (T, n)
         Commands.
-    command, effective : ndarray of shape (n,)
-        State before the first row.
+    effective : ndarray of shape (n,)
+        Result before the first row.
     half : ndarray of shape () or (n,)
         Half the width.
     """
-    return _moved(rows, PlayState(command, effective), half, lead=False)[0]
-
-
-def _moved(
-    rows: NDArray, start: PlayState, half: NDArray, *, lead: bool
-) -> tuple[NDArray, PlayState]:
-    """Return effective changes (or with `lead` commands), and the last state."""
-    if len(rows) and rows.dtype == np.float64 and available():
-        result, command, effective = play(rows, start, half, lead)
-        return result, PlayState(command, effective)
-    command, effective = start
-    most = np.finfo(rows.dtype).max / 4  # wider ones never move a tendon
-    half = np.minimum(half, most).astype(rows.dtype)
+    half = _movable(half, rows)
     result = np.empty_like(rows)
     for t, row in enumerate(rows):
-        if lead:
-            ahead = row + half * np.sign(row - effective)
-            command = np.where(row == effective, command, ahead)
-            effective = row
-            result[t] = command
-        else:
-            effective = np.clip(effective, row - half, row + half)
-            command = row
-            result[t] = effective
-    return result, PlayState(command, effective)
+        effective = np.clip(effective, row - half, row + half)
+        result[t] = effective
+    return result
+
+
+def _movable(half: NDArray, rows: NDArray) -> NDArray:
+    """Return half the width in the precision of rows; wider ones never move a tendon."""
+    return np.minimum(half, np.finfo(rows.dtype).max / 4).astype(rows.dtype)

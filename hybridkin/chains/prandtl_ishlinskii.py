@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from hybridkin._core.arrays import real_array
 from hybridkin.chains.hysteresis import HysteresisOperator
 from hybridkin.chains.play import played
+from hybridkin.native.hysteresis import Stage
 
 __all__ = ["HysteresisState", "PrandtlIshlinskiiOperator"]
 
@@ -103,6 +104,19 @@ class PrandtlIshlinskiiOperator(HysteresisOperator[HysteresisState]):
     def _start(self, row: NDArray) -> HysteresisState:
         return HysteresisState(row, row, np.tile(row, (len(self.widths), 1)))
 
+    def stages(self, n: int) -> list[Stage]:
+        """Return the operator of n actuators as one stage of all plays."""
+        half, slopes = self._half_and_slopes(np.empty((0, n)))
+        return [Stage(len(half), (np.broadcast_to(half, slopes.shape), slopes))]
+
+    def packed(self, state: HysteresisState) -> NDArray:
+        """Return a state as the kernels keep it (K + 2, n)."""
+        return np.vstack([state.command, state.plays, state.effective])
+
+    def unpacked(self, rows: NDArray) -> HysteresisState:
+        """Return the state of rows (K + 2, n) of `packed`."""
+        return HysteresisState(rows[0], rows[-1], rows[1:-1])
+
     def _half_and_slopes(self, rows: NDArray) -> tuple[NDArray, NDArray]:
         """Return half the widths (K, 1), and the slopes (K, n), of which the last are 1."""
         slopes = np.ones((len(self.widths), rows.shape[1]), rows.dtype)
@@ -114,7 +128,7 @@ class PrandtlIshlinskiiOperator(HysteresisOperator[HysteresisState]):
     ) -> tuple[NDArray, HysteresisState]:
         half, slopes = self._half_and_slopes(rows)
         plays = [
-            played(rows, start.command, effective, half_width)
+            played(rows, effective, half_width)
             for effective, half_width in zip(start.plays, half, strict=True)
         ]
         result = plays[-1].copy()

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hybridkin.chains.hysteresis import HysteresisOperator
+from hybridkin.native.hysteresis import Stage, stage_numbers
 
 __all__ = ["HysteresisSeries"]
 
@@ -70,6 +71,26 @@ class HysteresisSeries(HysteresisOperator[tuple]):
 
     def _start(self, row: NDArray) -> tuple:
         return tuple(operator._start(row) for operator in self.operators)
+
+    def stages(self, n: int) -> list[Stage]:
+        """Return the stages of all operators."""
+        return [stage for operator in self.operators for stage in operator.stages(n)]
+
+    def packed(self, state: tuple) -> NDArray:
+        """Return a state as the kernels keep it: each operator begins with the result before."""
+        parts = []
+        for operator, part in zip(self.operators, state, strict=True):
+            parts.append(operator.packed(part))
+        return np.vstack([*(part[:-1] for part in parts[:-1]), parts[-1]])
+
+    def unpacked(self, rows: NDArray) -> tuple:
+        """Return the state of rows of `packed`."""
+        states = []
+        for operator in self.operators:
+            n_rows = stage_numbers(operator.stages(rows.shape[1])).code[1]
+            states.append(operator.unpacked(rows[:n_rows]))
+            rows = rows[n_rows - 1 :]
+        return tuple(states)
 
     def _applied(
         self, rows: NDArray, start: tuple, steps: NDArray

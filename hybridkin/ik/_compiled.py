@@ -8,7 +8,7 @@ import math
 from collections.abc import Sequence
 from struct import Struct
 from struct import error as StructError
-from typing import NamedTuple, overload
+from typing import Any, NamedTuple, overload
 
 import numpy as np
 import torch
@@ -26,6 +26,7 @@ from hybridkin._core.kernel_numbers import (
     IK_HAS_TIP,
     IK_HELD,
     IK_LAST,
+    IK_LEADS,
     IK_LOWERS,
     IK_MEMORY,
     IK_MODE,
@@ -33,6 +34,7 @@ from hybridkin._core.kernel_numbers import (
     IK_PERIOD,
     IK_REACHED,
     IK_SIGMA_MIN,
+    IK_STATE_ROWS,
     IK_STOPPED,
     IK_TARGET,
     IK_TO_DOMAIN,
@@ -58,7 +60,10 @@ _write_point = Struct("3d").pack_into
 
 
 class Tick(NamedTuple):
-    """Results of a tick, as single rows: q, the model there, the error, and the step."""
+    """Results of a tick, as single rows: q, the model there, the error, and the step.
+
+    With hysteresis q is what the actuators did, and the step is that of the commands.
+    """
 
     q: Tensor
     x: Tensor
@@ -119,6 +124,8 @@ class Core:
         The settings, with a task evaluated by the core.
     n, m, width : int
         Numbers of actuators, of rows of the task, and of numbers in a target.
+    places : dict of str to slice
+        Places of the parts of the state of a follower.
     """
 
     def __init__(self, settings: StepSettings, models: list[Program]) -> None:
@@ -131,7 +138,8 @@ class Core:
             settings, task=_CoreTask(settings.task, self, models)
         )
         self._idle: list[Follower] = []  # one for every thread that has used `step`
-        places = places_of(self.n, self.m, self.width)
+        n_rows = self.plan.entry(self.plan.root, IK_STATE_ROWS)
+        self.places = places = places_of(self.n, self.m, self.width, n_rows)
         x = places["x"]
         if len(settings.task.shape) > 1:
             x = np.arange(x.start, x.stop).reshape(settings.task.shape)
@@ -280,8 +288,8 @@ class Follower:
 
     Attributes
     ----------
-    command : callable
-        Returns the present command (n,).
+    command, effective : callable
+        Return the present command and what the actuators do (n,).
     """
 
     backend = "compiled"
@@ -296,16 +304,20 @@ class Follower:
         self.core = core
         self._memory = memory
         self._least = mode
-        places = places_of(core.n, core.m, core.width)
+        places = core.places
         if state is None:
-            state = np.zeros(int(places["J"].stop))
+            state = np.zeros(int(places["tried"].stop))
         self.state = state
         self.task = core.settings.task
         self._dt = state[IK_PERIOD] = core.settings.dt
         state[IK_MEMORY] = memory or 0.0
         self._parts = {name: state[place] for name, place in places.items()}
         self.q = self._parts["q"]
-        self.command = self.q.copy
+        self.command = self.effective = self.q.copy
+        self._lead = self._parts["lead"].reshape(-1, core.n)
+        if len(self._lead) and not mode & IK_MUST_SEE:
+            self.effective = self._lead[-1].copy
+            self._least |= IK_LEADS
         shape = core.settings.task.shape
         self._inputs = [
             _Input(places["target"], state, shape),
@@ -323,20 +335,31 @@ class Follower:
     def __reduce__(self) -> tuple[type[Follower], tuple]:
         return Follower, (self.core, self._memory, self._least, self.state.copy())
 
-    def start(self, q: Tensor, dq: Tensor) -> None:
-        """Set the initial configuration (1, n), and the step that led to it."""
+    @property
+    def hysteresis(self) -> Any:
+        """State of the hysteresis, None without."""
+        if self.task.hysteresis is None:
+            return None
+        return self.task.hysteresis.unpacked(self._lead.copy())
+
+    def start(self, q: Tensor, dq: Tensor, hysteresis: Any) -> None:
+        """Set the initial command (1, n), the step to it, and the state of hysteresis before it."""
         parts = self._parts
         for name in ("target", "feed", "tip", "offset", "held", "J"):
             parts[name][:] = 0.0
         parts["error"][:] = math.nan
         self.state[[IK_SIGMA_MIN, IK_DISTANCE]] = math.nan
         self.state[[IK_DAMPING, IK_STOPPED]] = 0.0
+        parts["dq"][:] = as_array(dq[0])
+        parts["q"][:] = as_array(q[0])
+        if self.task.hysteresis is not None:
+            q, end = self.task.hysteresis.apply(q, hysteresis, 0.0)
+            self._lead[:] = self.task.hysteresis.packed(end)
+            self._lead[-1] = as_array(q[0])
         x, _ = self.core.settings.evaluate(q)
         parts["x"][:] = as_array(x).ravel()
         self.state[IK_LAST] = self._dt
-        parts["dq"][:] = as_array(dq[0])
-        parts["q"][:] = as_array(q[0])
-        parts["before"][:] = parts["q"]
+        parts["before"][:] = as_array(q[0])
 
     def tick(self, target: object, dx: object, tip: object) -> bool:
         """Do a tick with plain arrays: the target, its velocity, the measured tip.
@@ -375,7 +398,7 @@ class Follower:
     def last(self) -> Tick:
         """Return the results of the last tick."""
         state = torch.from_numpy(self.state.copy())[None]
-        places = places_of(self.core.n, self.core.m, self.core.width)
+        places = self.core.places
         parts = {name: state[:, place] for name, place in places.items()}
         step = StepRows(
             parts["dq"],
@@ -435,8 +458,11 @@ class _Input:
         return True
 
 
-def places_of(n: int, m: int, width: int) -> dict[str, slice]:
-    """Return the places of the parts of the state: of n actuators, m rows and `width` numbers."""
+def places_of(n: int, m: int, width: int, n_rows: int) -> dict[str, slice]:
+    """Return the places of the parts of the state.
+
+    For n actuators, m rows of the task, `width` numbers in a target, and `n_rows` of hysteresis.
+    """
     lengths = {
         "target": width,
         "feed": m,
@@ -449,6 +475,8 @@ def places_of(n: int, m: int, width: int) -> dict[str, slice]:
         "before": n,
         "held": n,
         "J": m * n,
+        "lead": n_rows * n,
+        "tried": n_rows * n,
     }
     places = {}
     start = IK_TARGET

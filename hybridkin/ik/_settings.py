@@ -35,6 +35,7 @@ from hybridkin._core.plan import NoKernel, Plan
 from hybridkin._core.stored import Layout, Stored
 from hybridkin.ik._half_spaces import HalfSpaces
 from hybridkin.ik.tasks import PointsTask, PoseTask, PositionTask, Task, Tolerance
+from hybridkin.native.hysteresis import stage_numbers
 
 Array: TypeAlias = Numbers | Transform  # what a caller may pass
 Posture: TypeAlias = Callable[[Tensor], Tensor]
@@ -154,8 +155,9 @@ def _write_plan(plan: Plan, stored: Stored) -> int:
     flags |= IK_PULLS * bool(pulls.any())
     flags |= IK_POSE * settings["pose"]
     numbers = [*vectors, weights**-0.5, rates, scale, periods, pulls]
-    numbers += [normals, spaces, stored.array("offsets")]
-    return plan.node("ik", n, m, numbers, model, flags, len(normals), spaces.shape[1])
+    numbers += [normals, spaces, stored.array("offsets"), stored.array("hysteresis")]
+    entries = [model, flags, len(normals), spaces.shape[1], *settings["stages"]]
+    return plan.node("ik", n, m, numbers, *entries)
 
 
 @dataclass(frozen=True)
@@ -355,7 +357,13 @@ class StepSettings(Portable):
             "scale": np.repeat(self.task.units, self.task.parts),
             "spaces": np.zeros((sum(self.task.parts), 0)),
             "offsets": np.zeros(0),
+            "hysteresis": np.zeros(0),
         }
+        stages = [0, 0]
+        if self.task.hysteresis is not None:
+            described = stage_numbers(self.task.hysteresis.stages(n))
+            stages = described.code
+            arrays["hysteresis"] = described.numbers
         for name in (*_VECTORS, "weights", "periods", "pulls"):
             value = getattr(self, name)
             if value is not None:
@@ -378,6 +386,7 @@ class StepSettings(Portable):
             has_posture=self.has_posture,
             accelerates=self.accelerates,
             pose=self.task.has_rotation,
+            stages=stages,
         )
 
     # The plane of q to keep to, where the log lies in one.

@@ -54,6 +54,7 @@ def control_step(
     period: float | None = None,
     last: Tensor | None = None,
     tip: Tensor | None = None,
+    bounds: Bounds | None = None,
 ) -> StepRows:
     """Return the step of eq. (1) for one period, with v = dx dt + gain dt e.
 
@@ -78,6 +79,8 @@ def control_step(
         Previous step, scaled to this period. Default: at rest.
     tip : Tensor of shape (N, m), optional
         Position of the tip, for tip limits.
+    bounds : Bounds, optional
+        Bounds of the step. Default: the limits.
 
     Returns
     -------
@@ -118,7 +121,8 @@ def control_step(
 
     # Eq. (17), within the limits of q, of its speed and acceleration, and of the tip.
     v = feed_forward + gain * e
-    bounds = settings.step_bounds(q, seconds, last)
+    if bounds is None:
+        bounds = settings.step_bounds(q, seconds, last)
     spaces = settings.tip_limits
     if spaces is None or tip is None:
         step = limited_step(settings, J, v, posture, bounds)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -43,7 +43,7 @@ def followed(settings: StepSettings, q0: Tensor, path: Path, loop: Loop) -> Trac
     target = path.points.to(start.dtype)
     command = as_array(start) if path.as_numpy else start
     tracker = Tracker(settings, command, path.tol, loop.memory)
-    q, x, measured, sigma_min, held, damped = tracker.follow(
+    q, effective, x, measured, sigma_min, held, damped = tracker.follow(
         target, path.periods, loop.plant, loop.feedback, loop.progress
     )
     e = task.difference(measured, target)
@@ -52,11 +52,12 @@ def followed(settings: StepSettings, q0: Tensor, path: Path, loop: Loop) -> Trac
     if loop.feedback != "measured":
         judged = task.difference(x, target)
     reached = task.reached(judged, path.tol)
-    status = statuses(task, q, judged.norm(dim=-1), reached, held, damped)
+    status = statuses(task, effective, judged.norm(dim=-1), reached, held, damped)
     status[~torch.isfinite(error)] = IKStatus.INVALID_INPUT
     margin = settings.margin(q)
-    rows = (path.t, q, x, measured, target, error, status, sigma_min, margin)
+    rows = (path.t, q, effective, x, measured, target, error, status, sigma_min, margin)
     results = give_back(rows, (len(target),), path.as_numpy)
+    track = Track(*results)
     if loop.plant is None:
-        results[3] = None
-    return Track(*results)
+        track = replace(track, x_measured=None)
+    return track

@@ -183,9 +183,11 @@ class Track(Generic[ArrayT]):
     t : array of shape (T,)
         Times [s].
     q : array of shape (T, n)
-        Commanded configurations.
+        Commands to send.
+    effective : array of shape (T, n)
+        What the actuators do: `q` without hysteresis.
     x : array of shape (T, 3)
-        Tips of the model at `q` [m].
+        Tips of the model at `effective` [m].
     x_measured : array of shape (T, 3) or None
         Tips measured on the plant [m], NaN if it failed; None without a plant.
     target : array of shape (T, 3)
@@ -202,6 +204,7 @@ class Track(Generic[ArrayT]):
 
     t: ArrayT
     q: ArrayT
+    effective: ArrayT
     x: ArrayT
     x_measured: ArrayT | None
     target: ArrayT

@@ -623,19 +623,5 @@ class InverseKinematics:
         -------
         Tracker
             Its `step` takes a target, and optionally the measured tip, and returns the command.
-
-        Warns
-        -----
-        UserWarning
-            If the model has backlash. The tracker does not compensate for it: q is the motion of
-            the actuators, and ``play_.command`` of the model gives the commands to send.
         """
-        play = getattr(self.settings.task.estimator, "play_", None)
-        if play is not None:
-            warnings.warn(
-                f"the model has backlash (play) of {play.width.tolist()}, and q of this tracker is "
-                "the motion of the actuators: send `model.play_.command(q[None], state)`, which "
-                "returns the command and the next `state` (None before the first).",
-                stacklevel=2,
-            )
         return Tracker(self.settings, q0, self.settings.tolerance(tol), memory)

@@ -16,6 +16,7 @@ from hybridkin._core.arrays import as_tensor, identity, number, whole
 from hybridkin._core.blocks import in_blocks
 from hybridkin._core.model import Fitted, ForwardModel, PoseModel, as_forward_model
 from hybridkin._core.rotations import rotation_vector
+from hybridkin.native.hysteresis import Hysteresis
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -44,6 +45,8 @@ class Task:
         The estimator that the model was taken from, and its module then.
     has_rotation : bool
         Whether targets are poses (4, 4).
+    hysteresis : Hysteresis or None
+        The hysteresis of the actuators before the model, that of the estimator.
     """
 
     shape: tuple[int, ...]
@@ -53,6 +56,7 @@ class Task:
     estimator: Fitted | None = None
     module: nn.Module | None = None
     has_rotation = False
+    hysteresis: Hysteresis | None = None
 
     def present(self) -> Self:
         """Return the task for the module that its estimator has now."""
@@ -73,6 +77,7 @@ class Task:
         if isinstance(model, Fitted) and not isinstance(model, nn.Module):
             self.estimator = model
             self.module = model.module_
+            self.hysteresis = getattr(model, "play_", None)
         self.models = (self._suitable(as_forward_model(model)),)
 
     def _suitable(self, model: ForwardModel) -> ForwardModel:

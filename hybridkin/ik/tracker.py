@@ -6,6 +6,7 @@ import math
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from threading import Lock
 from typing import Any
 
@@ -17,6 +18,7 @@ from hybridkin._core.arrays import as_array, as_tensor, is_numpy, number
 from hybridkin._core.model import Portable
 from hybridkin.ik._compiled import Follower, Tick, core_of, why_torch
 from hybridkin.ik._gram import singular_values
+from hybridkin.ik._hysteresis import Lead
 from hybridkin.ik._settings import Array, StepSettings, require
 from hybridkin.ik._step import StepRows, control_step
 from hybridkin.ik.results import IKStatus
@@ -33,10 +35,19 @@ class Tracker(Portable):
     of the model from `reset`, but a refit of an estimator reaches it at the next `step`: `q` and
     its speed stay, a remembered offset is forgotten. Threads that share it wait for each other.
 
+    With the hysteresis of a `HybridForwardModel` (`play_`) commands lead what the actuators do. All
+    limits are those of commands. After a reversal the command crosses the width of the hysteresis,
+    with `dq_max` in several periods, in which the actuator moves little or not and the others do
+    what they can. With `ddq_max` it brakes before it gets to where the actuator moves. A motion of
+    less than 1e-6 of the way of its command is left out, as it may be rounding. A refit with
+    another operator starts without hysteresis at `q`.
+
     Attributes
     ----------
     q : array of shape (n,)
         The present command: the result of the last `step`, or the argument of `reset`.
+    effective : array of shape (n,)
+        What the actuators do, where the model is evaluated: `q` without hysteresis.
     x : array of shape (3,)
         The model's tip at the start of the last step [m], in the shape of the task.
     error : float
@@ -98,6 +109,12 @@ class Tracker(Portable):
             return self._robot.command()
 
     @property
+    def effective(self) -> NDArray | Tensor:
+        """What the actuators do at the present command, shape (n,)."""
+        with self._lock:
+            return self._robot.effective()
+
+    @property
     def x(self) -> NDArray | Tensor:
         """The model's tip before the last step [m], in the shape of the task."""
         return self._given_back(self._last().x)
@@ -152,13 +169,16 @@ class Tracker(Portable):
         damped = step.damping > 0.0 or step.sigma_min == 0.0
         return IKStatus.SINGULAR if damped else IKStatus.MAX_ITER
 
-    def reset(self, q: Array) -> None:
+    def reset(self, q: Array, state: Any = None) -> None:
         """Restart at rest from an actuator vector, as read from the robot.
 
         Parameters
         ----------
         q : array-like of shape (n,)
-            Actuator vector, in the unit of q. From outside the limits it returns at `dq_max`.
+            Command, in the unit of q. From outside the limits it returns at `dq_max`.
+        state : tuple, optional
+            State of the hysteresis, as from `apply` of the model's `play_` with the commands until
+            now. Default: without hysteresis at q.
         """
         start = as_tensor(q, "q", self._settings.task.device)
         n = self._settings.n_actuators
@@ -170,9 +190,9 @@ class Tracker(Portable):
         )
         with self._lock:
             self._like = start.clone()
-            self._start(self._like, torch.zeros_like(start))
+            self._start(self._like, torch.zeros_like(start), state)
 
-    def _start(self, q: Tensor, dq: Tensor) -> None:
+    def _start(self, q: Tensor, dq: Tensor, hysteresis: Any) -> None:
         """Read the model, and start at q (n,) after a step dq (n,)."""
         self._settings = settings = self._settings.present()
         core = core_of(settings)
@@ -185,7 +205,11 @@ class Tracker(Portable):
         else:
             reason = "`q0` is no float64 array of NumPy"
             robot = _InTorch(settings, self._memory, self._as_numpy, reason)
-        robot.start(q[None], dq[None])
+        require(
+            hysteresis is None or task.hysteresis is not None,
+            "`state` is that of a hysteresis, but the model has none; leave it out.",
+        )
+        robot.start(q[None], dq[None], hysteresis)
         self._estimator = task.estimator
         self._module = task.module
         self._robot = robot
@@ -220,8 +244,13 @@ class Tracker(Portable):
         with self._lock:
             estimator = self._estimator
             if estimator is not None and estimator.module_ is not self._module:
-                q = as_tensor(self._robot.command(), "q")
-                self._start(q, self._robot.last().step.dq[0])
+                robot = self._robot
+                before = robot.task.hysteresis
+                state = robot.hysteresis
+                if getattr(estimator, "play_", None) is not before:
+                    state = None
+                q = as_tensor(robot.command(), "q")
+                self._start(q, robot.last().step.dq[0], state)
             robot = self._robot
             if not robot.tick(x_target, dx, x_measured):
                 self._step(x_target, dx, x_measured)
@@ -252,10 +281,10 @@ class Tracker(Portable):
         feedback: str | None,
         progress: Callable[[int, int], None] | None,
     ) -> list[Tensor]:
-        """Return q, x, the measured tip, sigma_min, and whether a step was held or damped.
+        """Return commands, what the actuators do, x, the measured tip, sigma_min, held and damped.
 
-        Rows are the points of the path (T, ...). Held and damped refer to the step to the point,
-        all others to the state at the point.
+        Rows are the points of the path (T, ...). The last two are whether the step to the point was
+        held or damped, all others refer to the state at the point.
         """
         task = self._settings.task
         n = len(targets)
@@ -274,16 +303,17 @@ class Tracker(Portable):
             if plant is not None:
                 tip = self._measured(plant, i)
             used = {"model": None, "measured": tip, None: unread}[feedback]
+            command = as_tensor(self._robot.command(), "q")[None]
             if not finite[i]:
                 target = None
             tick = self._robot.advance(periods[i], target, ahead[i : i + 1], used)
             if tip is None:
                 tip = tick.x
-            rows.append((tick.q, tick.x, tip, tick.J, held, damped))
+            rows.append((command, tick.q, tick.x, tip, tick.J, held, damped))
             held = tick.step.saturated.any(-1) | tick.step.stopped
             damped = tick.step.damping > 0.0
-        q, x, measured, J, held, damped = map(torch.cat, zip(*rows, strict=True))
-        return [q, x, measured, singular_values(J).sigma_min, held, damped]
+        *states, J, held, damped = map(torch.cat, zip(*rows, strict=True))
+        return [*states, singular_values(J).sigma_min, held, damped]
 
     def _measured(self, plant: Plant, i: int) -> Tensor:
         """Return the plant's tip (1, ...), NaN if the plant raises.
@@ -312,10 +342,20 @@ class _InTorch:
         self.backend = f"torch: {reason}"
         self.task = settings.task.frozen()
         self._settings = replace(settings, task=self.task)
+        self._lead: Lead | None = None
+
+    @property
+    def hysteresis(self) -> Any:
+        """State of the hysteresis, None without."""
+        return self._lead.state if self._lead else None
 
     @torch.no_grad()
-    def start(self, q: Tensor, dq: Tensor) -> None:
-        """Set the initial configuration (1, n), and the step that led to it."""
+    def start(self, q: Tensor, dq: Tensor, hysteresis: Any) -> None:
+        """Set the initial command (1, n), the step to it, and the state of hysteresis before it."""
+        self._command = q
+        if self.task.hysteresis is not None:
+            self._lead = Lead(self._settings, self.task.hysteresis, q, hysteresis)
+            q = self._lead.effective
         self._q = q
         x, J = self._settings.evaluate(q)
         self._offset = x.new_zeros(1, sum(self.task.parts))  # last measured minus model
@@ -363,12 +403,21 @@ class _InTorch:
         at = None
         if settings.tip_limits is not None:
             at = x + self._offset
-        step = control_step(settings, self._q, J, used, feed_forward, seconds, last, at)
+        control = partial(
+            control_step, settings, self._q, J, used, feed_forward, seconds, last, at
+        )
+        effective = self._q
+        if self._lead is not None:
+            step = self._lead.step(control, seconds, last)
+            self._command = self._lead.command
+            self._q = self._lead.effective
+        else:
+            step = control()
+            self._command = self._q = effective + step.dq
         if self._memory is not None:
             self._offset = math.exp(-seconds / self._memory) * self._offset
-        self._last = Tick(self._q, x, J, error, step)
+        self._last = Tick(effective, x, J, error, step)
         self._period = seconds
-        self._q = self._q + step.dq
         return self._last
 
     def last(self) -> Tick:
@@ -377,6 +426,11 @@ class _InTorch:
 
     def command(self) -> NDArray | Tensor:
         """Return the present command (n,)."""
-        if self._as_numpy:
-            return as_array(self._q[0]).copy()
-        return self._q[0].clone()
+        return self._given_back(self._command)
+
+    def effective(self) -> NDArray | Tensor:
+        """Return what the actuators do (n,)."""
+        return self._given_back(self._q)
+
+    def _given_back(self, rows: Tensor) -> NDArray | Tensor:
+        return as_array(rows[0]).copy() if self._as_numpy else rows[0].clone()

@@ -20,7 +20,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hybridkin._core.files import write_files
-from hybridkin._core.kernel_numbers import IK_LIMITED, c_header
+from hybridkin._core.kernel_numbers import (
+    IK_LIMITED,
+    IK_STAGES,
+    IK_STATE_ROWS,
+    c_header,
+)
 from hybridkin._core.model import ForwardModel, as_forward_model
 from hybridkin._core.plan import NoKernel, Plan
 from hybridkin._core.rotations import rotation
@@ -131,8 +136,8 @@ def export_c(
     Parameters
     ----------
     model : ForwardModel, fitted HybridForwardModel or ELMRegressor, or InverseKinematics
-        The model to write. For inverse kinematics the model and one step are written. The play of
-        a hybrid is not written: the code takes q after play.
+        The model to write. For inverse kinematics the model and one step are written, which with
+        hysteresis returns commands. x(q) is that of what the actuators do.
     folder : str or Path
         Output folder. Files of an earlier export are replaced, other files are not.
     name : str, default="model"
@@ -257,6 +262,8 @@ def c_project(
     }
     entries |= _code(plan, controller, dtype)
     entries |= _vectors(modules, plan, controller, dtype)
+    if controller is not None and leads(plan):
+        entries["LEAD_FIELD"] = filled("lead.h", entries)
     for key, template in _STEP_PARTS.items():
         entries[key] = "" if controller is None else filled(template, entries)
 
@@ -303,6 +310,7 @@ def _code(plan: Plan, controller: _Controller | None, dtype: str) -> Entries:
     defines["KINDS"] = f"{sum(1 << kind for kind in kinds)}u"
     defines["POSES"] = int(poses)
     defines["SPACES"] = int(n_spaces > 0)
+    defines["HYSTERESIS"] = int(controller is not None and leads(plan))
     lines = [f"#define HK_{name} {number}" for name, number in defines.items()]
     if dtype == "float32":
         lines.insert(0, "#define HK_FLOAT")
@@ -335,13 +343,23 @@ def _step_code(plan: Plan, task: _Task, n_spaces: int) -> Entries:
         "NEWTON": f"{10 * n**2 + (20 + 7 * m * m) * n:,}",
         "ABOUT_TARGET": _ABOUT_POSES if task.has_rotation else "desired x now [m];",
         "SPACES": _ABOUT_SPACES if n_spaces else "",
+        "LEAD": n * plan.entry(plan.root, IK_STATE_ROWS),
     }
+    entries |= {"LEADS": "", "LEAD_FIELD": "", "WITHOUT": ""}
+    if leads(plan):
+        entries["LEADS"] = filled("lead.md", entries)
+        entries["WITHOUT"] = ", and without hysteresis there"
     names = ("Q_MIN", "Q_MAX", "DQ_MAX", "DDQ_MAX")
     for name, limit in zip(names, limits.tolist(), strict=True):
         entries[name] = ", ".join(f"{value:.6g}" for value in limit)
     sentence = "limits.md" if np.isfinite(limits).any() else "no_limits.md"
     entries["LIMITS"] = filled(sentence, entries)
     return entries
+
+
+def leads(plan: Plan) -> bool:
+    """Return whether commands of inverse kinematics lead what the actuators do, by hysteresis."""
+    return plan.entry(plan.root, IK_STAGES) > 0
 
 
 def _check_stack(plan: Plan, dtype: str) -> None:
@@ -351,6 +369,7 @@ def _check_stack(plan: Plan, dtype: str) -> None:
     numbers += max(n, 3 * segments, m) * (n + 41) + 200 * segments + 30
     if rows:
         numbers += 8 * (rows + 1) * (n + 12)
+        numbers += 2 * n * plan.entry(plan.root, IK_STATE_ROWS)
     if numbers * np.dtype(dtype).itemsize > _MOST_STACK:
         raise NoKernel(
             "its sizes need more than 64 KiB of stack, too much for a controller"

@@ -19,7 +19,14 @@ from numpy.typing import NDArray
 
 from hybridkin._core.files import write_file
 from hybridkin._core.version import __version__
-from hybridkin.native.export import ABOUT_Q, CProject, c_project, filled, literals
+from hybridkin.native.export import (
+    ABOUT_Q,
+    CProject,
+    c_project,
+    filled,
+    leads,
+    literals,
+)
 
 _FLAGS = (
     "-std=c99 -O2 -fPIC -shared -fvisibility=hidden -fno-math-errno -fno-trapping-math"
@@ -73,9 +80,9 @@ def export_fmu(
     from which others can be compiled. Of a model it has the input q and the outputs x, J and
     domain_distance. Of inverse kinematics it has the inputs target, velocity and measured (NaN:
     no measurement), the outputs command, tip (that of the model), error and status (0 a step
-    without limits, 1 limits restricted it, 2 held, because an input is not finite), and as
-    parameters the start, the limits, gain, beta and memory. A step of the simulation must be a
-    multiple of its period.
+    without limits, 1 limits restricted it, 2 held, because an input is not finite), with hysteresis
+    effective (what the actuators do), and as parameters the start, the limits, gain, beta and
+    memory. A step of the simulation must be a multiple of its period.
 
     Parameters
     ----------
@@ -175,6 +182,9 @@ def _variables(project: CProject) -> list[Variable]:
         Variable("error", "output", "distance to the target [m]", ()),
         Variable("status", "output", "0 free, 1 at limits, 2 held", ()),
     ]
+    if leads(plan):
+        about = "what the actuators do, after hysteresis"
+        variables.append(Variable("effective", "output", about, (n,)))
     for limit, values in zip(_LIMITS, project.limits, strict=True):
         if np.isfinite(values).all():
             about = f"{_LIMITS[limit]} of q, in its unit and s"

@@ -95,9 +95,9 @@ def _fault(opened: ctypes.CDLL) -> str:
     opened.hk_work.restype = ctypes.c_int64
     opened.hk_ik_tick.argtypes = [pointer]
     opened.hk_evaluate.restype = None
-    opened.hk_play.restype = None
+    opened.hk_hysteresis_rows.restype = None
     sizes = [ctypes.c_int64, ctypes.c_int32, ctypes.c_int32]
-    opened.hk_play.argtypes = [*sizes, *[pointer] * 5]
+    opened.hk_hysteresis_rows.argtypes = [*sizes, *[pointer] * 6]
     if not _is_right(opened):
         return "computes wrong numbers"
     return ""
@@ -231,7 +231,7 @@ class Program:
         n, m = self._sizes
         end = m + m * n
         results = np.empty(end + 1)
-        at = _address(results)
+        at = address(results)
         row = np.asarray(q, np.float64).tobytes()
         J = None
         at_J = None
@@ -267,7 +267,7 @@ class Program:
             for a, width in results:
                 at = None
                 if a is not None:
-                    at = _address(a) + 8 * width * start
+                    at = address(a) + 8 * width * start
                 places.append(at)
             self._evaluate(self._call.place, at_q + 8 * n * start, count, *places)
 
@@ -287,34 +287,7 @@ def in_chunks(rows: int, run: Callable[[int, int], None]) -> None:
             list(pool.map(run, starts, counts))
 
 
-def play(
-    rows: NDArray, state: tuple[ArrayLike, ArrayLike], half: NDArray, lead: bool
-) -> list[NDArray]:
-    """Return rows (T, n) after the play of the tendons, and the state after the last row.
-
-    Parameters
-    ----------
-    rows : ndarray of shape (T, n)
-        Commands, or effective changes if `lead`; contiguous float64, at least one row.
-    state : pair of array-likes of shape (n,)
-        The command and the effective change before the first row.
-    half : ndarray of shape () or (n,)
-        Half the play of every tendon.
-    lead : bool
-        Whether to return commands for effective changes instead of the reverse.
-    """
-    n = rows.shape[1]
-    vectors = np.empty((3, n))
-    vectors[0] = half
-    vectors[1], vectors[2] = state
-    at = _address(vectors)
-    effective = np.empty_like(rows)
-    places = at, _address(rows), at + 8 * n, at + 16 * n, _address(effective)
-    opened_library().hk_play(len(rows), n, lead, *places)
-    return [effective, vectors[1], vectors[2]]
-
-
-def _address(a: NDArray) -> int:
+def address(a: NDArray) -> int:
     """Return the address of a contiguous, writable array; faster than `a.ctypes`."""
     return ctypes.addressof(_BYTE.from_buffer(a))  # pyright: ignore[reportArgumentType]
 

@@ -275,6 +275,7 @@ def _with_lead_in(
         track,
         t=np.concatenate([track.t[0] + dt * np.arange(n), track.t + n * dt]),
         q=np.concatenate([q, track.q]),
+        effective=np.concatenate([q, track.effective]),
         x=np.concatenate([x, track.x]),
         target=np.concatenate([x, track.target]),
         error=np.concatenate([np.zeros(n), track.error]),

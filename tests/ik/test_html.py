@@ -11,7 +11,14 @@ def track(**changed):
     q = np.stack([t, -t], axis=1)
     error = np.array([0.001, 0.002, 0.003, np.nan, np.inf])
     margin = np.full(5, np.inf)
-    parts = {"t": t, "q": q, "x": np.zeros((5, 3)), "x_measured": None, "target": np.zeros((5, 3))}
+    parts = {
+        "t": t,
+        "q": q,
+        "effective": q,
+        "x": np.zeros((5, 3)),
+        "x_measured": None,
+        "target": np.zeros((5, 3)),
+    }
     parts |= {"error": error, "status": np.array([0, 0, 1, 6, 6]), "sigma_min": np.ones(5)}
     return Track(**{**parts, "limit_margin": margin, **changed})
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from operators import operators, with_hysteresis
 from painted import LIMIT, painted, stacks
 from saved_models import FOLDER, tendon_chain, trunk
 
@@ -83,6 +84,37 @@ TASKS = {
 def test_the_code_of_other_tasks(tmp_path, name, dtype):
     make, settings = TASKS[name]
     assert agrees(tmp_path, limited(make(), **settings), dtype=dtype)
+
+
+@needs_cc
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("kind", ["play", "plays, creep"])
+def test_the_code_leads_by_the_hysteresis(tmp_path, kind, dtype):
+    model = with_hysteresis(trunk(), operators(3, 1e-3)[kind])
+    ik = InverseKinematics(model, q_min=0.15, q_max=0.35, dq_max=0.2, dt=0.02)
+    assert agrees(tmp_path, ik, dtype=dtype)
+    assert "what the actuators do" in (tmp_path / "robot.h").read_text()
+
+
+@needs_cc
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["play", "plays", "creep", "plays, creep"])
+def test_commands_of_the_code_are_those_of_the_tracker(tmp_path, kind):
+    n = trunk().n_actuators
+    model = with_hysteresis(trunk(), operators(n, 1e-3)[kind])
+    ik = InverseKinematics(model, q_min=0.15, q_max=0.35, dq_max=0.2, dt=0.02)
+    start = np.linspace(0.22, 0.26, n)
+    target = ik.tracker(start).x + np.array([0.02, -0.01, 0.005])
+    export_c(ik, tmp_path, name="robot")
+    numbers = [", ".join(map(repr, map(float, row))) for row in (start, target)]
+    source = FOLLOWS.replace("[9]", f"[{n}]").replace("9;", f"{n};")
+    (tmp_path / "follows.c").write_text(source % tuple(numbers))
+    program = built(tmp_path, sources=("robot.c", "follows.c"))
+    found = np.loadtxt(subprocess.check_output([program], text=True).splitlines())
+    tracker = ik.tracker(start)
+    for row in found:
+        np.testing.assert_allclose(row[:n], tracker.step(target), rtol=0, atol=1e-12)
 
 
 FOLLOWS = """

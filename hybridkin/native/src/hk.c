@@ -114,15 +114,14 @@ HK_API void hk_hysteresis_rows(int64_t rows, int32_t n, int32_t lead, const int3
                                const real *numbers, const real *seconds, const real *given,
                                real *state, real *results) {
     const hk_hysteresis h = {code, numbers, n};
-    const real *result = state + (lead ? 0 : (code[HK_STATE_ROWS] - 1) * n);
+    const real *y = state + (code[HK_STATE_ROWS] - 1) * n;
     for (int64_t r = 0; r < rows; r++, given += n, results += n) {
+        for (int j = 0; j < n; j++) *(lead ? results + j : state + j) = given[j];
         if (lead)
-            hk_hysteresis_command(&h, seconds[r], given, state);
-        else {
-            for (int j = 0; j < n; j++) state[j] = given[j];
+            hk_hysteresis_command(&h, seconds[r], results, state);
+        else
             hk_hysteresis_apply(&h, seconds[r], state);
-        }
-        for (int j = 0; j < n; j++) results[j] = result[j];
+        for (int j = 0; j < n && !lead; j++) results[j] = y[j];
     }
 }
 

@@ -20,8 +20,10 @@ typedef struct {
 
 static inline int hk_stage_rows(int count) { return count < 0 ? -count : count; }
 
-/* What of a change with the time constant tau is still to come. */
-static inline real hk_late(real seconds, real tau) { return HK_MATH(exp)(-seconds / tau); }
+/* What of a change is still to come after some seconds, for each of the time constants. */
+static inline void hk_late(int count, const real *times, real seconds, real *late) {
+    for (int i = 0; i < count; i++) late[i] = HK_MATH(exp)(-seconds / times[i]);
+}
 
 /* Plays that follow commands u (n), and their weighted sum y (n). */
 static inline void hk_plays_apply(int n, int count, const real *half, const real *slopes,
@@ -39,31 +41,33 @@ static inline void hk_plays_apply(int n, int count, const real *half, const real
         }
 }
 
-/* The commands u (n) of sums y (n), which become `goal` (n). Along the direction of an actuator the
-   plays begin to move in the order of their widths, and y is piecewise linear in u. */
+/* The sums y (n) become `goal` (n), and that the commands for them; u (n) are the commands before.
+   Along the direction of an actuator the plays begin to move in the order of their widths, and y is
+   piecewise linear in u. */
 static inline void hk_plays_command(int n, int count, const real *half, const real *slopes,
-                                    const real *goal, real *u, real *plays, real *y) {
+                                    const real *u, real *plays, real *y, real *goal) {
     for (int j = 0; j < n; j++) {
-        const real side = goal[j] > y[j] ? R(1.0) : goal[j] < y[j] ? R(-1.0) : R(0.0);
-        if (side == R(0.0)) continue;
+        const real to = goal[j], side = to > y[j] ? R(1.0) : R(-1.0);
         real from = side * plays[j] + half[j], level = side * y[j];
         real lag = slopes[j] * half[j], slope = slopes[j];
         int at = j + n;
         for (; at < count * n; at += n) {
             const real begin = side * plays[at] + half[at], next = level + slope * (begin - from);
-            if (!(next < side * goal[j])) break;
+            if (!(next < side * to)) break;
             from = begin, level = next;
             lag += (slopes[at] - slope) * half[at], slope = slopes[at];
         }
-        if (at < count * n)
-            u[j] = side * (from + (side * goal[j] - level) / slope);
+        if (to == y[j])
+            goal[j] = u[j];
+        else if (at < count * n)
+            goal[j] = side * (from + (side * to - level) / slope);
         else /* all of them move */
-            u[j] = goal[j] + side * lag;
-        y[j] = goal[j];
+            goal[j] = to + side * lag;
+        y[j] = to;
     }
     for (int at = 0; at < count * n; at += n)
         for (int j = 0; j < n; j++) {
-            const real low = u[j] - half[at + j], high = u[j] + half[at + j];
+            const real low = goal[j] - half[at + j], high = goal[j] + half[at + j];
             plays[at + j] = plays[at + j] < low ? low : plays[at + j];
             plays[at + j] = high < plays[at + j] ? high : plays[at + j];
         }
@@ -71,37 +75,36 @@ static inline void hk_plays_command(int n, int count, const real *half, const re
 
 static inline void hk_creep_apply(int n, int count, const real *gains, const real *times,
                                   real seconds, const real *u, real *slow, real *y) {
+    real late[HK_MAX_CREEPS];
+    hk_late(count, times, seconds, late);
     for (int j = 0; j < n; j++) y[j] = u[j];
-    for (int i = 0; i < count; i++, slow += n, gains += n) {
-        const real late = hk_late(seconds, times[i]);
+    for (int i = 0; i < count; i++, slow += n, gains += n)
         for (int j = 0; j < n; j++) {
-            const real behind = late * (slow[j] - u[j]);
+            const real behind = late[i] * (slow[j] - u[j]);
             slow[j] = u[j] + behind;
             y[j] += gains[j] * behind;
         }
-    }
 }
 
+/* As `hk_plays_command`. */
 static inline void hk_creep_command(int n, int count, const real *gains, const real *times,
-                                    real seconds, const real *goal, real *u, real *slow, real *y) {
+                                    real seconds, const real *u, real *slow, real *y, real *goal) {
+    real late[HK_MAX_CREEPS];
+    hk_late(count, times, seconds, late);
     for (int j = 0; j < n; j++) {
         real at_once = R(1.0), left = goal[j], size = goal[j] < R(0.0) ? -goal[j] : goal[j];
         for (int i = 0; i < count; i++) {
-            const real late = gains[n * i + j] * hk_late(seconds, times[i]);
-            const real part = late * slow[n * i + j];
-            at_once -= late, left -= part, size += part < R(0.0) ? -part : part;
+            const real share = gains[n * i + j] * late[i], part = share * slow[n * i + j];
+            at_once -= share, left -= part, size += part < R(0.0) ? -part : part;
         }
         /* Rounding is no reversal, after which a backlash before this stage would jump. */
         const real moved = left / at_once, change = moved - u[j];
-        if ((change < R(0.0) ? -change : change) > HK_CREEP_ROUNDING * HK_EPS * size / at_once)
-            u[j] = moved;
+        const real rounding = HK_CREEP_ROUNDING * HK_EPS * size / at_once;
         y[j] = goal[j];
+        goal[j] = (change < R(0.0) ? -change : change) > rounding ? moved : u[j];
     }
-    for (int i = 0; i < count; i++)
-        for (int j = 0; j < n; j++) {
-            real *part = slow + n * i + j;
-            *part = u[j] + hk_late(seconds, times[i]) * (*part - u[j]);
-        }
+    for (int i = 0; i < count; i++, slow += n)
+        for (int j = 0; j < n; j++) slow[j] = goal[j] + late[i] * (slow[j] - goal[j]);
 }
 
 /* Follow the command in the first row of the state, `seconds` after the one before. */
@@ -120,9 +123,9 @@ static inline void hk_hysteresis_apply(const hk_hysteresis *h, real seconds, rea
     }
 }
 
-/* The inverse: the state after commands, in its first row, that bring the actuators to `goal` (n). An
-   actuator that is to stay keeps its command, unless it creeps. */
-static inline void hk_hysteresis_command(const hk_hysteresis *h, real seconds, const real *goal,
+/* The inverse: `goal` (n), what the actuators are to do, becomes the commands for it, and the state
+   follows. An actuator that is to stay keeps its command, unless it creeps. */
+static inline void hk_hysteresis_command(const hk_hysteresis *h, real seconds, real *goal,
                                          real *state) {
     const int n = h->n, rows = h->code[HK_STATE_ROWS];
     const real *a = h->numbers;
@@ -136,9 +139,10 @@ static inline void hk_hysteresis_command(const hk_hysteresis *h, real seconds, c
         real *inside = y - size, *u = inside - n;
         a -= size + (count > 0 ? size : -count);
         if (count > 0)
-            hk_plays_command(n, count, a, a + size, goal, u, inside, y);
+            hk_plays_command(n, count, a, a + size, u, inside, y, goal);
         else
-            hk_creep_command(n, -count, a, a + size, seconds, goal, u, inside, y);
-        goal = y = u;
+            hk_creep_command(n, -count, a, a + size, seconds, u, inside, y, goal);
+        y = u;
     }
+    for (int j = 0; j < n; j++) state[j] = goal[j];
 }

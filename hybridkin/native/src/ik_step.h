@@ -76,7 +76,7 @@ static inline ik_settings ik_settings_of(const int32_t *code, const real *data, 
         .normals = c + 2 * n,
         .spaces = c + (2 + n_normals) * n,
         .offsets = c + (2 + n_normals) * n + more[3] * m,
-        .hysteresis = {more + 4, c + (2 + n_normals) * n + more[3] * (m + 1), n},
+        .hysteresis = {more + IK_STAGES, c + (2 + n_normals) * n + more[3] * (m + 1), n},
     };
     return ik;
 }
@@ -710,14 +710,12 @@ static inline void ik_command(const ik_settings *ik, const ik_state *now, real s
                               const real *kept, const real *dq, real *command) {
     const int n = ik->n, rows = ik->hysteresis.code[HK_STATE_ROWS];
     const real *y = now->lead + (rows - 1) * n;
-    real goal[HK_MAX_N] = {R(0.0)};
     for (int i = 0; i < rows * n; i++) now->tried[i] = now->lead[i];
-    for (int j = 0; j < n; j++) goal[j] = y[j] + dq[j];
-    hk_hysteresis_command(&ik->hysteresis, seconds, goal, now->tried);
+    for (int j = 0; j < n; j++) command[j] = y[j] + dq[j];
+    hk_hysteresis_command(&ik->hysteresis, seconds, command, now->tried);
     for (int j = 0; j < n; j++) {
-        const real way = now->tried[j] - now->q[j];
-        const int stays = ik_abs(goal[j] - kept[j]) < IK_AT_REST_SHARE * ik_abs(way);
-        command[j] = stays ? now->q[j] : now->tried[j];
+        const real moved = y[j] + dq[j] - kept[j], way = command[j] - now->q[j];
+        if (ik_abs(moved) < IK_AT_REST_SHARE * ik_abs(way)) command[j] = now->q[j];
     }
 }
 
@@ -745,21 +743,29 @@ static HK_NOINLINE void ik_lead(const ik_settings *ik, const ik_state *now, cons
     ik_control(ik, y, now->x, now->J, e, feed, seconds, last, tip, &ends, s);
     ik_command(ik, now, seconds, kept, s->dq, wanted);
     for (int j = 0; j < n; j++) {
+        const real way = wanted[j] - now->q[j], change = ik->accel[j] * seconds * seconds;
+        /* So fast that it can arrive at the speed of the actuator there. */
+        const real most = ik_stopping(ik_abs(way) + s->dq[j] * s->dq[j] / (R(2.0) * change), change);
         low[j] = now->q[j] + limits.lower[j], high[j] = now->q[j] + limits.upper[j];
         goal[j] = wanted[j];
+        if (change < R(INFINITY) && way > R(0.0))
+            goal[j] = now->q[j] + most, high[j] = ik_clip(goal[j], low[j], high[j]);
+        else if (change < R(INFINITY) && way < R(0.0))
+            goal[j] = now->q[j] - most, low[j] = ik_clip(goal[j], low[j], high[j]);
         beyond |= !(wanted[j] >= low[j] && wanted[j] <= high[j]);
     }
     if (beyond) {
         ik_try_ends(ik, now, seconds, low, high, &ends);
         ik_control(ik, y, now->x, now->J, e, feed, seconds, last, tip, &ends, s);
         ik_command(ik, now, seconds, kept, s->dq, goal);
+        for (int j = 0; j < n; j++) {
+            const real close = IK_AT_REST_SHARE * ik_abs(wanted[j] - now->q[j]);
+            const int down = s->dq[j] <= ends.lower[j] + close && wanted[j] < goal[j];
+            const int up = s->dq[j] >= ends.upper[j] - close && wanted[j] > goal[j];
+            if (down || up) goal[j] = wanted[j];
+        }
     }
     for (int j = 0; j < n; j++) {
-        const real way = wanted[j] - now->q[j], change = ik->accel[j] * seconds * seconds;
-        const real side = way < R(0.0) ? R(-1.0) : R(1.0);
-        const real most = now->q[j] + side * ik_stopping(ik_abs(way), change);
-        if (beyond && s->dq[j] <= ends.lower[j] && most < goal[j]) goal[j] = most;
-        if (beyond && s->dq[j] >= ends.upper[j] && most > goal[j]) goal[j] = most;
         if (s->sigma_min != s->sigma_min) goal[j] = now->q[j]; /* hold still, not known */
         now->lead[j] = ik_clip(goal[j], low[j], high[j]);
         s->dq[j] = now->lead[j] - now->q[j];

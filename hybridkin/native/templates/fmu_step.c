@@ -8,7 +8,10 @@ static void write_outputs(instance_t *unit) {
         values[V_COMMAND + j] = unit->state.q[j];
         if (unit->state.held[j] && values[V_STATUS] == 0.0) values[V_STATUS] = 1.0;
     }
-    ik_model(&ik, unit->state.q, values + V_TIP, J);
+    ik_model(&ik, EFFECTIVE(&unit->state), values + V_TIP, J);
+#if HK_HYSTERESIS
+    for (int j = 0; j < @N@; j++) values[V_EFFECTIVE + j] = EFFECTIVE(&unit->state)[j];
+#endif
     values[V_ERROR] = unit->state.error;
 }
 

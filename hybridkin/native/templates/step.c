@@ -14,19 +14,30 @@ static void ik_model(const ik_settings *ik, const real *q, real *x, real *J) {
 /* Numbers of memory for a step, on the stack. */
 enum { STEP_WORK = WORK + IK_SLOTS_WORK(@N@, @TASK@, @NORMALS@) };
 
+/* Numbers of the state of hysteresis, and what the actuators do, where the model is evaluated. */
+enum { LEAD = @LEAD@ };
+#if HK_HYSTERESIS
+#define EFFECTIVE(state) ((state)->hysteresis + LEAD - @N@)
+#else
+#define EFFECTIVE(state) ((state)->q)
+#endif
+
 void @NAME@_reset(@NAME@_state *state, const @REAL@ *q) {
     const @NAME@_state none = {0};
     real work[STEP_WORK], J[@TASK@ * @N@];
     const ik_settings ik = ik_settings_of(code, data, @ROOT@, work);
     *state = none;
     for (int j = 0; j < @N@; j++) state->q[j] = q[j];
+#if HK_HYSTERESIS
+    for (int i = 0; i < LEAD; i++) state->hysteresis[i] = q[i % @N@];
+#endif
     ik_model(&ik, q, state->x, J);
     state->error = state->sigma_min = (real)NAN;
 }
 
 static void step_within(const ik_settings *ik, @NAME@_state *state, const @REAL@ *target,
     const @REAL@ *dx, const @REAL@ *measured) {
-    real all[IK_STATE_SIZE(@N@, @TASK@, @WIDTH@)] = {0};
+    real all[IK_STATE_SIZE(@N@, @TASK@, @WIDTH@) + 2 * LEAD] = {0};
     const ik_state now = ik_state_of(ik, all);
     for (int i = 0; i < @WIDTH@; i++) {
         now.target[i] = target[i];
@@ -41,12 +52,19 @@ static void step_within(const ik_settings *ik, @NAME@_state *state, const @REAL@
         now.dq[j] = state->dq[j];
     }
     all[IK_MODE] = (real)(IK_HAS_TARGET + (dx ? IK_HAS_FEED : 0) + (measured ? IK_HAS_TIP : 0));
+#if HK_HYSTERESIS
+    all[IK_MODE] += IK_LEADS;
+    for (int i = 0; i < LEAD; i++) now.lead[i] = state->hysteresis[i];
+#endif
     all[IK_PERIOD] = ik->dt;
     all[IK_MEMORY] = state->memory;
     if (!ik_tick(ik, all)) { /* no rotation: not known */
         now.target[0] = now.tip[0] = (real)NAN;
         ik_tick(ik, all);
     }
+#if HK_HYSTERESIS
+    for (int i = 0; i < LEAD; i++) state->hysteresis[i] = now.lead[i];
+#endif
     for (int i = 0; i < @TASK@; i++) state->offset[i] = now.offset[i];
     for (int i = 0; i < @WIDTH@; i++) state->x[i] = now.x[i];
     state->error = all[IK_DISTANCE];

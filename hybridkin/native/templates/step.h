@@ -13,9 +13,9 @@ typedef struct {
     unsigned char stopped;   /* whether limits of the tip changed its motion */
     @REAL@ offset[@TASK@]; /* measured minus predicted at the last measurement [m] */
     @REAL@ memory;  /* time constant [s] of the offset while measurements are NaN; 0: not used */
-} @NAME@_state;
+@LEAD_FIELD@} @NAME@_state;
 
-/* Start at rest at the actuator vector q, as read from the robot; sets memory to 0. */
+/* Start at rest at the actuator vector q, as read from the robot@WITHOUT@; sets memory to 0. */
 void @NAME@_reset(@NAME@_state *state, const @REAL@ *q);
 
 /* One period of @DT@ s: q of the state becomes the next command, within the limits of README.md.

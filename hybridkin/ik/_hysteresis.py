@@ -1,0 +1,126 @@
+"""Commands that lead what the actuators do, by the hysteresis of the model, in torch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from hybridkin._core.kernel_numbers import IK_AT_REST_SHARE
+from hybridkin.ik._settings import Bounds, StepSettings, stopping
+from hybridkin.ik._step import StepRows
+from hybridkin.native.hysteresis import Hysteresis
+
+
+class Lead:
+    """Commands of one robot with hysteresis; the torch counterpart of `ik_lead`.
+
+    Parameters
+    ----------
+    settings : StepSettings
+        The limits, which are those of commands.
+    operator : Hysteresis
+        The hysteresis.
+    command : Tensor of shape (1, n)
+        The present command.
+    state : tuple or None
+        State of the hysteresis before it. None: without hysteresis.
+
+    Attributes
+    ----------
+    command, effective : Tensor of shape (1, n)
+        The present command, and what the actuators do.
+    state : tuple
+        The present state.
+    """
+
+    def __init__(
+        self, settings: StepSettings, operator: Hysteresis, command: Tensor, state: Any
+    ) -> None:
+        self._settings = settings
+        self._operator = operator
+        self.command = command
+        self.effective, self.state = operator.apply(command, state, 0.0)
+
+    def step(
+        self,
+        control: Callable[[Bounds], StepRows],
+        seconds: float,
+        last: Tensor,
+    ) -> StepRows:
+        """Send the next command, and return its step.
+
+        First the step without limits of speed and acceleration. If its commands are beyond these,
+        the step within what the actuators can do in this period. Where hysteresis stops one of
+        them on its way, its command goes on, and can stop where the first step has it.
+
+        Parameters
+        ----------
+        control : callable
+            Returns the step of the actuators within bounds.
+        seconds : float
+            Time until the next command [s].
+        last : Tensor of shape (1, n)
+            The last step of the command, scaled to this period.
+        """
+        settings = self._settings
+        command = self.command
+        limits = settings.step_bounds(command, seconds, last)
+        tick = Bounds(command + limits.lower, command + limits.upper)
+        step = control(self._reached(settings.box(command), seconds))
+        wanted = self._commanded(step.dq, seconds)
+        if settings.accelerates:
+            tick = self._slowed(tick, wanted - command, step.dq, seconds)
+        goal = wanted
+        if ((wanted < tick.lower) | (wanted > tick.upper)).any():
+            bounds = self._reached(tick, seconds)
+            step = control(bounds)
+            goal = self._commanded(step.dq, seconds)
+            close = IK_AT_REST_SHARE * (wanted - command).abs()
+            down = (step.dq <= bounds.lower + close) & (wanted < goal)
+            up = (step.dq >= bounds.upper - close) & (wanted > goal)
+            goal = torch.where(down | up, wanted, goal)
+        known = torch.isfinite(step.sigma_min)[:, None]
+        goal = tick.clip(torch.where(known, goal, command))
+        self.command = goal
+        self.effective, self.state = self._operator.apply(goal, self.state, seconds)
+        return step._replace(dq=goal - command, saturated=tick.held(goal))
+
+    def _slowed(self, tick: Bounds, way: Tensor, dq: Tensor, seconds: float) -> Bounds:
+        """Return bounds of commands that can arrive after a way at the speed of steps dq."""
+        change = self._settings.change(dq, seconds)
+        most = stopping(way.abs() + dq.square() / (2.0 * change), change)
+        end = tick.clip(self.command + way.sign() * most)
+        limited = torch.isfinite(change)
+        upper = torch.where(limited & (way > 0.0), end, tick.upper)
+        lower = torch.where(limited & (way < 0.0), end, tick.lower)
+        return Bounds(lower, upper)
+
+    def _reached(self, commands: Bounds, seconds: float) -> Bounds:
+        """Return the bounds of a step of the actuators after commands in bounds (1, n).
+
+        What they do is monotone in the command.
+        """
+        lower, upper = (self._after(end, seconds) for end in commands)
+        lower = lower - self.effective
+        return Bounds(lower, torch.maximum(lower, upper - self.effective))
+
+    def _after(self, command: Tensor, seconds: float) -> Tensor:
+        """Return what the actuators would do after a command; what is infinite has no limit."""
+        finite = torch.isfinite(command)
+        tried = torch.where(finite, command, self.command)
+        effective, _ = self._operator.apply(tried, self.state, seconds)
+        return torch.where(finite, effective, command)
+
+    def _commanded(self, dq: Tensor, seconds: float) -> Tensor:
+        """Return the commands for a step of the actuators (1, n).
+
+        One that would move far for almost nothing, such as through a backlash for rounding, stays.
+        """
+        goal = self.effective + dq
+        command, _ = self._operator.command(goal, self.state, seconds)
+        moved = (goal - self._after(self.command, seconds)).abs()
+        stays = moved < IK_AT_REST_SHARE * (command - self.command).abs()
+        return torch.where(stays, self.command, command)
