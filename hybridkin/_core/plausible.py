@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -36,10 +37,11 @@ class PlausibleRows:
 
     def hold_row(self, q: NDArray) -> bool:
         """Return whether q (N, n) is one row of small numbers, so finite and within the bounds."""
-        return len(q) == 1 and sum(map(abs, q[0].tolist())) <= self._small
+        return len(q) == 1 and math.hypot(*q[0].tolist()) <= self._small
 
     @cached_property
     def _small(self) -> float:
-        """A sum of absolute values of q up to which any row lies within the bounds."""
-        largest = float(np.abs(self.weights).max(initial=np.finfo(float).tiny))
-        return 1.0 / largest - float(np.abs(self.rest).sum())
+        """A length of q up to which any row lies within the bounds."""
+        lengths = np.linalg.norm(self.weights, axis=1)
+        largest = float(lengths.max(initial=np.finfo(float).tiny))
+        return 1.0 / largest - math.hypot(*self.rest.tolist())

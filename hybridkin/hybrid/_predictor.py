@@ -35,6 +35,8 @@ from hybridkin.hybrid.cv_results import CvResults
 from hybridkin.learning.hidden_layer import check_inputs
 from hybridkin.native.library import evaluate
 
+_FLOAT64 = np.dtype(np.float64)
+
 
 class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     """The prediction methods of a `HybridForwardModel`; they use only the results of `fit`."""
@@ -278,7 +280,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         plausible = self._plausible_rows
         return (
             type(X) is np.ndarray
-            and X.dtype == np.float64
+            and X.dtype == _FLOAT64
             and X.shape == (1, self.n_features_in_)
             and X.flags.c_contiguous
             and plausible is not None
@@ -307,7 +309,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 for message in self._doubts(q):
                     warnings.warn(message, stacklevel=3)
         arrays = [*function(q)]
-        if rows.dtype != np.float64:
+        if rows.dtype != _FLOAT64:
             with np.errstate(over="ignore"):  # too large for float32
                 arrays = [array.astype(rows.dtype) for array in arrays]
         if self._single_output:

@@ -174,7 +174,12 @@ class Call:
 
 
 class ThreadCall(threading.local, Call):
-    """A call that has memory of its own in every thread."""
+    """A call that has memory of its own in every thread, also for the results of one row."""
+
+    def __init__(self, plan: Plan, opened: ctypes.CDLL) -> None:
+        super().__init__(plan, opened)
+        self.results = np.empty(plan.n_outputs * (1 + plan.n_inputs) + 1)
+        self.at_results = address(self.results)
 
 
 class Program:
@@ -230,20 +235,19 @@ class Program:
         lead = q.shape[:-1]
         n, m = self._sizes
         end = m + m * n
-        results = np.empty(end + 1)
-        at = address(results)
+        call = self._call
+        at_x = call.at_results
+        at_J = at_x + 8 * m if jacobian else None
+        at_d = at_x + 8 * end if distance else None
         row = np.asarray(q, np.float64).tobytes()
+        self._evaluate(call.place, row, 1, at_x, at_J, at_d)
+        results = call.results.copy()
         J = None
-        at_J = None
+        d = None
         if jacobian:
             J = results[m:end].reshape(*lead, m, n)
-            at_J = at + 8 * m
-        d = None
-        at_d = None
         if distance:
             d = results[end:].reshape(lead)
-            at_d = at + 8 * end
-        self._evaluate(self._call.place, row, 1, at, at_J, at_d)
         return results[:m].reshape(*lead, m), J, d
 
     def domain(self, q: NDArray, slope: bool = False) -> tuple[NDArray, NDArray | None]:
