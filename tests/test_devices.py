@@ -118,7 +118,7 @@ WORK = {
     "calibrate tensors": lambda _: calibrated("radii", "base", tensors=1),
     "play": lambda _: [
         PlayOperator(0.01).apply(Q)[0],
-        fit_play(trunk(), Q, X, GROUPS, [0.001], ("radii",)).cv_rmse,
+        fit_play(trunk(), Q, X, GROUPS, [0.001], ("radii",)).cv_distance,
     ],
     "elm": lambda _: [*NETWORK.fit(Q, X).partial_fit(Q, X).predict(Q, return_std=True)],
     "parallel elm": lambda _: hybrid(error_model=NETWORK, coverage=0.8),

@@ -187,16 +187,16 @@ def table(value: Any, name: str) -> Any:
     return value if name == "X" and hasattr(value, "columns") else array
 
 
-def labels(groups: ArrayLike | Tensor, n_rows: int) -> NDArray:
+def labels(groups: ArrayLike | Tensor, n_rows: int, name: str = "groups") -> NDArray:
     """Return the label of the motion of every row, shape (N,)."""
     if isinstance(groups, Tensor):
-        names = as_tensor(groups, "groups").numpy(force=True)
+        names = as_tensor(groups, name).numpy(force=True)
     else:
         names = np.asarray(groups)
-    check_shape(names, "groups", [n_rows], "one entry for each row of the log")
+    check_shape(names, name, [n_rows], "one entry for each row of the log")
     if names.dtype.kind == "f" and not np.isfinite(names).all():
         need = "must name the motion of every row, got NaN or infinity"
-        raise ValueError(f"`groups` {need}; drop these rows.")
+        raise ValueError(f"`{name}` {need}; drop these rows.")
     return names.astype(str) if names.dtype == object else names
 
 

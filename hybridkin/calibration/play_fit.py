@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from hybridkin._core.arrays import Numbers, check_shape, labels, real_array
 from hybridkin.calibration.calibrate import CalibrationResult, calibrate, fit_geometry
-from hybridkin.calibration.measured import folds
-from hybridkin.calibration.play_search import WidthSearch, search_width
+from hybridkin.calibration.hysteresis_fit import HysteresisLog
+from hybridkin.calibration.hysteresis_search import WidthSearch, search_width
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.play import PlayOperator
-from hybridkin.native.library import evaluate
 
 __all__ = ["PlayFit", "fit_play"]
 
@@ -34,12 +33,13 @@ class PlayFit(WidthSearch):
     widths : ndarray of shape (W,)
         Widths tried [unit of q], ascending from zero, including doubled ones if the largest was
         the best.
-    cv_rmse : ndarray of shape (W,)
-        Root mean square tip distance on held-out motions for each width [m].
+    cv_distance : ndarray of shape (W,)
+        Mean tip distance on held-out motions for each width [m], with a linear correction inside
+        the chain.
     gain : float
-        Mean reduction of the error of a fold by the best width [m].
+        Mean reduction of the distances of motions by the best width [m].
     gain_std_error : float
-        Standard error of `gain` over the folds [m].
+        Standard error of `gain` over the motions [m].
     kept : bool
         Whether the play lowers the error: `gain` is above `gain_std_error`.
     result : CalibrationResult
@@ -65,10 +65,10 @@ def fit_play(
 ) -> PlayFit:
     """Return the backlash (also called play) of the tendons, and the chain calibrated with it.
 
-    For every width the chain is calibrated on the effective changes of the training motions and
-    evaluated on the held-out motions, in at most 5 folds. The best width is kept only if its mean
-    gain over zero play exceeds the standard error of the gain. Only the calibration to all rows
-    issues warnings.
+    The chain is calibrated without play. For every width, a linear correction inside it is fitted
+    to the training motions and evaluated on the held-out motions, in at most 5 folds. The best
+    width is kept only if its mean gain over zero play exceeds the standard error of the gain. Then
+    the chain is calibrated again; only this issues warnings.
 
     Parameters
     ----------
@@ -130,30 +130,19 @@ def fit_play(
     check_shape(x, "x", ("N", chain.n_outputs))
     check_shape(q, "q", (len(x), chain.n_actuators), "one row for each row of `x`")
     groups = labels(groups, len(x))
-    splits = folds(groups, groups)
-    sizes = [len(test) for _, test in splits]
-
-    def effective(width: float) -> NDArray:
-        return PlayOperator(width).apply_by_group(q, groups)
-
-    def held_out_errors(width: float) -> NDArray:
-        """Return the root mean square tip distance of every fold."""
-        y = effective(width)
-        errors = []
-        for train, test in splits:
-            result, _ = fit_geometry(
-                chain, y[train], x[train], names, **calibrate_options
-            )
-            tips = evaluate(result.chain, y[test])[0]
-            # NaN: missing markers.
-            errors.append(np.sqrt(np.nansum((tips - x[test]) ** 2) / len(test)))
-        return np.array(errors)
-
-    def root_mean_square(errors: NDArray) -> float:
-        return np.sqrt(np.average(errors**2, weights=sizes))
-
-    widest = float(np.ptp(q, axis=0).max())
-    search = search_width(held_out_errors, root_mean_square, tried, widest)
-    y = effective(search.width)
+    nominal, _ = fit_geometry(chain, q, x, names, **calibrate_options)
+    log = HysteresisLog(
+        nominal.chain,
+        q.astype(np.float64),
+        x.astype(np.float64),
+        np.ones(len(x)),
+        groups,
+        runs=groups,
+        time=np.arange(len(x), dtype=np.float64),
+    )
+    search = search_width(log, tried)
+    if not search.kept:
+        search = replace(search, width=0.0)
+    y = PlayOperator(search.width).apply_by_group(q, groups)
     result = calibrate(chain, y, x, names, **calibrate_options)
     return PlayFit(**vars(search), result=result)

@@ -64,7 +64,11 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     _plausible_rows: PlausibleRows | None
 
     def predict(
-        self, X: object, return_radius: bool = False, groups: ArrayLike | None = None
+        self,
+        X: object,
+        return_radius: bool = False,
+        groups: ArrayLike | None = None,
+        time: ArrayLike | None = None,
     ) -> Any:
         """Return tip positions f_mech(q) + w(q) eps(q).
 
@@ -75,7 +79,11 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return_radius : bool, default=False
             Whether to return the estimated error radius as well; requires `coverage`.
         groups : array-like of shape (N,), optional
-            Motion of every row, only used with `play`. Default: one motion.
+            Run of every row, only used with `play`: each run starts without hysteresis. Default:
+            one run.
+        time : array-like of shape (N,), optional
+            Time of every row, ascending in each run, if the fit had times; only used with creep
+            [s]. Default: one second from row to row.
 
         Returns
         -------
@@ -88,25 +96,35 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             the domain (`in_domain`), and everywhere if the fit had too few groups.
         """
         if not return_radius:
-            return self._evaluated(self._tips, X, groups)[0]
+            return self._evaluated(self._tips, X, groups, time)[0]
         check_is_fitted(self)
         if self.radius_ is None:
             raise ValueError(
                 "`return_radius` needs a model that was fitted with `coverage`, for example "
                 "HybridForwardModel(..., coverage=0.9); this one was fitted without."
             )
-        x, distance = self._evaluated(partial(self._tips, distance=True), X, groups)
+        x, distance = self._evaluated(
+            partial(self._tips, distance=True), X, groups, time
+        )
         return x, self.radius_.at(distance <= 1.0).astype(x.dtype)
 
     def predict_mechanical(
-        self, X: ArrayLike, groups: ArrayLike | None = None
+        self,
+        X: ArrayLike,
+        groups: ArrayLike | None = None,
+        time: ArrayLike | None = None,
     ) -> NDArray:
         """Return the mechanical part f_mech(q), shaped like `predict` [m]."""
-        return self._evaluated(self._mechanical_tips, X, groups)[0]
+        return self._evaluated(self._mechanical_tips, X, groups, time)[0]
 
-    def predict_error(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray:
+    def predict_error(
+        self,
+        X: ArrayLike,
+        groups: ArrayLike | None = None,
+        time: ArrayLike | None = None,
+    ) -> NDArray:
         """Return the learned part w(q) eps(q), shaped like `predict` [m], rotations [rad]."""
-        return self._evaluated(self._tip_errors, X, groups, warn=False)[0]
+        return self._evaluated(self._tip_errors, X, groups, time, warn=False)[0]
 
     def score(
         self, X: ArrayLike, y: ArrayLike, sample_weight: ArrayLike | None = None
@@ -125,22 +143,33 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             scores.append(score)
         return float(np.mean(scores))
 
-    def jacobian(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray:
+    def jacobian(
+        self,
+        X: ArrayLike,
+        groups: ArrayLike | None = None,
+        time: ArrayLike | None = None,
+    ) -> NDArray:
         """Return the full Jacobian dx/dq of the sum, shape (N, m, n) or, for 1-D y, (N, n).
 
         For poses, the last three rows give the angular velocity in the measuring frame.
         """
-        return self._evaluated(partial(self._tips, jacobian=True), X, groups)[1]
+        return self._evaluated(partial(self._tips, jacobian=True), X, groups, time)[1]
 
     def predict_and_jacobian(
-        self, X: ArrayLike, groups: ArrayLike | None = None
+        self,
+        X: ArrayLike,
+        groups: ArrayLike | None = None,
+        time: ArrayLike | None = None,
     ) -> tuple[NDArray, NDArray]:
         """Return `predict(X)` and `jacobian(X)` in one pass."""
-        x, J = self._evaluated(partial(self._tips, jacobian=True), X, groups)
+        x, J = self._evaluated(partial(self._tips, jacobian=True), X, groups, time)
         return x, J
 
     def in_domain(
-        self, X: ArrayLike, groups: ArrayLike | None = None
+        self,
+        X: ArrayLike,
+        groups: ArrayLike | None = None,
+        time: ArrayLike | None = None,
     ) -> NDArray[np.bool_]:
         """Return whether each row lies in the domain, close to the training rows (see `guard`).
 
@@ -154,7 +183,9 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         X : array-like of shape (N, n)
             Actuator vectors.
         groups : array-like of shape (N,), optional
-            Motion of every row, only used with `play`.
+            Run of every row, only used with `play`.
+        time : array-like of shape (N,), optional
+            Time of every row, only used with creep [s].
 
         Returns
         -------
@@ -162,13 +193,22 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             Without a guard all True, except along those directions.
         """
         distance = partial(self._tips, value=False, distance=True)
-        return self._evaluated(distance, X, groups, warn=False)[0] <= 1.0
+        return self._evaluated(distance, X, groups, time, warn=False)[0] <= 1.0
 
-    def error_weight(self, X: ArrayLike, groups: ArrayLike | None = None) -> NDArray:
+    def error_weight(
+        self,
+        X: ArrayLike,
+        groups: ArrayLike | None = None,
+        time: ArrayLike | None = None,
+    ) -> NDArray:
         """Return the weight w(q) in [0, 1] of the error model at each row, shape (N,)."""
         weight = as_forward_model(self.fitted_module_.error_weight)
         return self._evaluated(
-            lambda q: evaluate(weight, q + self.change_.shift), X, groups, warn=False
+            lambda q: evaluate(weight, q + self.change_.shift),
+            X,
+            groups,
+            time,
+            warn=False,
         )[0]
 
     @property
@@ -233,13 +273,15 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         messages = [*chain.unit_messages(rows, "X"), chain.contradiction(rows, "X")]
         return [message for message in messages if message is not None]
 
-    def _effective(self, X: NDArray, groups: ArrayLike | None) -> NDArray:
-        """Return the motion of the actuators: with backlash, not the commands X themselves."""
+    def _effective(
+        self, X: NDArray, groups: ArrayLike | None, time: ArrayLike | None
+    ) -> NDArray:
+        """Return the motion of the actuators: with `play`, not the commands X themselves."""
         if self.play_ is None or not len(X):
             return X
         if groups is None:
             groups = np.zeros(len(X))
-        return self.play_.apply_by_group(X, groups)
+        return self.play_.apply_by_group(X, groups, time)
 
     def _follow_robot(self) -> None:
         """Set the module and its mechanical model after the change and the drift of the robot."""
@@ -294,6 +336,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         function: Callable[[NDArray], Sequence[NDArray]],
         X: object,
         groups: ArrayLike | None,
+        time: ArrayLike | None,
         warn: bool = True,
     ) -> list[NDArray]:
         """Return the results of a function of rows q for the rows of X, in the dtype of X."""
@@ -304,7 +347,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             q = X
         else:
             rows = check_inputs(self, X)
-            q = self._effective(rows, groups).astype(np.float64, copy=False)
+            q = self._effective(rows, groups, time).astype(np.float64, copy=False)
             if warn:
                 for message in self._doubts(q):
                     warnings.warn(message, stacklevel=3)

@@ -14,6 +14,7 @@ from typing_extensions import Self
 from hybridkin._core.digests import row_digests
 from hybridkin._core.directions import Directions, moved_directions
 from hybridkin._core.distinct import at_place, distinct_rows
+from hybridkin.chains.hysteresis import HysteresisOperator
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,10 @@ class Rows:
     X: NDArray  # (N, n) actuator vectors, float64 or float32
     y: NDArray  # (N, m) or (N,) tips [m]
     weights: NDArray | None = None  # (N,), number of times each row counts
-    groups: NDArray | None = None  # (N,), motion of every row
+    groups: NDArray | None = None  # (N,), motion of every row; held out together
+    # (N,), which rows follow each other in time without a break; None: those of a group
+    runs: NDArray | None = None
+    time: NDArray | None = None  # (N,), [s]; None: one second from row to row of a run
     # (M,), the row here of each of the M given rows; -1: none
     place: NDArray | None = None
     # Shaped like y: measured minus mechanical model [m], in a fit
@@ -47,6 +51,25 @@ class Rows:
         """Number of times each row counts, (N,)."""
         return np.ones(len(self.X)) if self.weights is None else self.weights
 
+    @property
+    def run_of_rows(self) -> NDArray:
+        """The run of every row, (N,)."""
+        if self.runs is not None:
+            return self.runs
+        return np.zeros(len(self)) if self.groups is None else self.groups
+
+    @property
+    def times(self) -> NDArray:
+        """The time of every row, (N,) [s]."""
+        if self.time is not None:
+            return self.time
+        times = np.empty(len(self))
+        names = self.run_of_rows
+        for name in np.unique(names):
+            run = names == name
+            times[run] = np.arange(run.sum())
+        return times
+
     @cached_property
     def directions(self) -> Directions:
         """The directions of q that the rows move."""
@@ -64,6 +87,8 @@ class Rows:
             y=self.y[rows],
             weights=_some(self.weights, rows),
             groups=_some(self.groups, rows),
+            runs=_some(self.runs, rows),
+            time=_some(self.time, rows),
             place=None,
             residual=_some(self.residual, rows),
         )
@@ -84,11 +109,18 @@ class Rows:
 
     def in_runs(self) -> Self:
         """Return the rows in order of time, without those that repeat the row before."""
-        return self._merged(runs=True)
+        timed = replace(self, time=self.times)
+        return timed._merged(runs=True)
+
+    def effective(self, operator: HysteresisOperator) -> Self:
+        """Return the rows with what the actuators do in place of the commands."""
+        moved = operator.apply_by_group(self.X, self.run_of_rows, self.time)
+        return replace(self, X=moved, runs=None, time=None)
 
     def _merged(self, runs: bool) -> Self:
+        columns = [self.y] if self.runs is None else [self.y, _numbered(self.runs)]
         first, counts, place = distinct_rows(
-            self.X, self.y, self.weights, self.groups, runs
+            self.X, np.column_stack(columns), self.weights, self.groups, runs
         )
         return replace(self.take(first), weights=counts, place=place)
 
@@ -106,6 +138,11 @@ class Rows:
     def as_given(self, values: NDArray) -> NDArray:
         """Return values (N, ...) of these rows for the given rows (M, ...); NaN for weight 0."""
         return values if self.place is None else at_place(values, self.place)
+
+
+def _numbered(names: NDArray) -> NDArray:
+    """Return names (N,) as numbers."""
+    return np.unique(names, return_inverse=True)[1]
 
 
 def _some(values: NDArray | None, rows: NDArray) -> NDArray | None:

@@ -24,6 +24,7 @@ from hybridkin.calibration.measured import (
     with_missing_markers,
 )
 from hybridkin.chains.chain import Chain
+from hybridkin.chains.hysteresis import checked_times
 from hybridkin.chains.markers import MarkedChain
 from hybridkin.hybrid._adapt import (
     PARAMETERS,
@@ -34,8 +35,8 @@ from hybridkin.hybrid._adapt import (
 from hybridkin.hybrid._drift import Drift
 from hybridkin.hybrid._fit import few_rows, fit_hybrid, fit_messages
 from hybridkin.hybrid._html import fitted_rows
+from hybridkin.hybrid._hysteresis import play_of
 from hybridkin.hybrid._module import TipCorrection
-from hybridkin.hybrid._play import play_of
 from hybridkin.hybrid._predictor import HybridPredictor
 from hybridkin.hybrid._radius import Radius, conformal_radius
 from hybridkin.hybrid._range import TrainingRange
@@ -95,11 +96,11 @@ class HybridForwardModel(HybridPredictor):
         times the longest correction of a training row.
     play : float, array-like of shape (n,) or "auto", optional
         Backlash (also called play) of the actuators [unit of q]. Rows are then commands in order of
-        time, and the model maps the motion of the actuators, see `PlayOperator`. "auto" takes the
-        width with the least held-out error of an `ELMRegressorCV`, or none, and replaces it by a
-        `PrandtlIshlinskiiOperator` if that lowers the error as clearly. Each group starts anew.
-        Inverse kinematics finds the motion of the actuators; ``play_.command`` gives the commands
-        for it. Default: no backlash, rows in any order.
+        time, and the model maps the motion of the actuators, see `PlayOperator`. "auto" chooses by
+        the error on held-out groups: nothing, a `PlayOperator`, a `PrandtlIshlinskiiOperator`, or
+        a `CreepOperator`, alone or after one of them (`HysteresisSeries`). Each run of the log
+        starts without hysteresis, see `fit`. Inverse kinematics finds the motion of the actuators;
+        ``play_.command`` gives the commands for it. Default: no backlash, rows in any order.
     coverage : float, optional
         Share of tips, 0.9 for example, within the radius of ``predict(Q, return_radius=True)``, if
         new groups are like those of the log. It needs ``coverage / (1 - coverage)`` groups, 9 for
@@ -144,7 +145,7 @@ class HybridForwardModel(HybridPredictor):
         `partial_fit` do not change them. A model from a file has none.
     calibration_ : CalibrationResult or None
         The result of the calibration.
-    play_ : PlayOperator, PrandtlIshlinskiiOperator or None
+    play_ : HysteresisOperator or None
         The hysteresis; None if there is none, or if "auto" found no significant gain.
     radius_ : Radius or None
         With `coverage`: the radius ``inside`` the domain [m], infinite with too few groups.
@@ -209,6 +210,8 @@ class HybridForwardModel(HybridPredictor):
         y: object,
         sample_weight: ArrayLike | None = None,
         groups: ArrayLike | None = None,
+        runs: ArrayLike | None = None,
+        time: ArrayLike | None = None,
     ) -> HybridForwardModel:
         """Calibrate the mechanical model if asked, learn its residual, and return this estimator.
 
@@ -225,6 +228,13 @@ class HybridForwardModel(HybridPredictor):
             Motion of every row. Whole motions are held out by the calibration
             (``calibration_.cv_rmse``), by error models that choose by groups, and for the radius.
             Rows farther from the log than its groups are from each other are not `in_domain`.
+        runs : array-like of shape (N,), optional
+            With `play`, the run of every row: rows of a run follow each other in time without a
+            break, so hysteresis goes on from group to group. Each run starts without hysteresis.
+            Default: each group is a run.
+        time : array-like of shape (N,), optional
+            With `play`, the time of every row, ascending in each run; only creep needs it [s].
+            Default: one second from row to row.
 
         Returns
         -------
@@ -248,7 +258,7 @@ class HybridForwardModel(HybridPredictor):
             millimetres; if there are too few groups for `coverage`; and the warnings of
             `calibrate`.
         """
-        for message in self._fit(X, y, sample_weight, groups):
+        for message in self._fit(X, y, sample_weight, groups, runs, time):
             warnings.warn(message, stacklevel=2)
         return self
 
@@ -258,13 +268,15 @@ class HybridForwardModel(HybridPredictor):
         y: object,
         sample_weight: ArrayLike | None = None,
         groups: ArrayLike | None = None,
+        runs: ArrayLike | None = None,
+        time: ArrayLike | None = None,
         geometry: GeometryChoice | None = None,
         progress: Callable[[int, int], None] | None = None,
         held_out: bool = True,
     ) -> list[str]:
         """Fit, see `fit_quietly`, and return the messages of all warnings."""
         error_model = self._checked_error_model()
-        log = self._checked_rows(X, y, sample_weight, groups)
+        log = self._checked_rows(X, y, sample_weight, groups, runs, time)
         rows = log.distinct()
         settings = replace(self._spec(error_model, log), held_out=held_out)
         messages = few_rows(rows, settings, self.coverage)
@@ -276,7 +288,7 @@ class HybridForwardModel(HybridPredictor):
         if self.play_ is not None:
             settings = replace(settings, commanded=rows.directions)
             spec = replace(spec, commanded=rows.directions)
-            rows = replace(log, X=self._effective(log.X, log.groups)).distinct()
+            rows = log.effective(self.play_).distinct()
         fitted = fit_hybrid(replace(spec, progress=progress), rows)
         for part in [*fitted.module.modules()]:
             if isinstance(part, TipCorrection):
@@ -340,7 +352,7 @@ class HybridForwardModel(HybridPredictor):
         _check_positive("decay", decay, 1.0)
         if alpha is not None:
             _check_positive("alpha", alpha, np.inf)
-        rows = self._checked_rows(X, y, sample_weight, None, reset=False)
+        rows = self._checked_rows(X, y, sample_weight, reset=False)
         if self.play_ is not None:
             X, self._play_state = self.play_.apply(rows.X, self._play_state)
             rows = replace(rows, X=X)
@@ -365,6 +377,8 @@ class HybridForwardModel(HybridPredictor):
         *,
         parameters: Sequence[str] = PARAMETERS,
         groups: ArrayLike | None = None,
+        runs: ArrayLike | None = None,
+        time: ArrayLike | None = None,
     ) -> HybridForwardModel:
         """Adapt the model to a robot that has changed since the fit, from a few new rows.
 
@@ -386,6 +400,8 @@ class HybridForwardModel(HybridPredictor):
             What may have changed.
         groups : array-like of shape (k,), optional
             Motion of every row. Rows of one motion have similar errors and count as fewer rows.
+        runs, time : array-like of shape (k,), optional
+            Run and time of every row, as in `fit`.
 
         Returns
         -------
@@ -415,9 +431,10 @@ class HybridForwardModel(HybridPredictor):
         True
         """
         check_is_fitted(self, "module_")
-        rows = self._checked_rows(X, y, None, groups, reset=False)
+        rows = self._checked_rows(X, y, None, groups, runs, time, reset=False)
         check_parameters(parameters, rows.tips.shape[1] % 3 == 0)
-        rows = replace(rows, X=self._effective(rows.X, rows.groups))
+        if self.play_ is not None:
+            rows = rows.effective(self.play_)
         self._warn_of_units(rows)
         self.change_, message = likeliest_change(
             self.fitted_module_, rows, self._noise, self._drift.scale, parameters
@@ -479,7 +496,14 @@ class HybridForwardModel(HybridPredictor):
             )
 
     def _checked_rows(
-        self, X: Any, y: Any, weights: ArrayLike | None, groups: Any, reset: bool = True
+        self,
+        X: Any,
+        y: Any,
+        weights: ArrayLike | None,
+        groups: Any = None,
+        runs: Any = None,
+        time: Any = None,
+        reset: bool = True,
     ) -> Rows:
         """Return the measured rows, checked."""
         X = table(X, "X")
@@ -494,7 +518,12 @@ class HybridForwardModel(HybridPredictor):
             X = X.copy()
         if groups is not None:
             groups = labels(groups, len(X))
-        return Rows(X, y, cast("NDArray | None", weights), groups)
+        if runs is not None:
+            runs = labels(runs, len(X), "runs")
+        rows = Rows(X, y, cast("NDArray | None", weights), groups, runs)
+        if time is None:
+            return rows
+        return replace(rows, time=checked_times(time, rows.run_of_rows))
 
     def _missing_markers(self, y: Any) -> NDArray[np.bool_]:
         """Return which entries of y (N, 3 K) are missing markers; each row must keep a marker."""
@@ -560,7 +589,7 @@ def fit_quietly(
     log : tuple of ndarray, optional
         All rows (q, x) of the log, if X and y are some of them: all count as fitted.
     """
-    messages = model._fit(X, y, None, groups, geometry, progress, held_out)
+    messages = model._fit(X, y, None, groups, None, None, geometry, progress, held_out)
     if log is not None:
         model._fitted_rows = np.unique(row_digests(*log))
     return messages

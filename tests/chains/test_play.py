@@ -95,14 +95,14 @@ def test_play_in_a_log_is_found():
     assert fit.kept
     assert fit.width == 0.2e-3
     assert fit.gain > fit.gain_std_error
-    assert np.argmin(fit.cv_rmse) == 3
-    assert fit.cv_rmse.shape == fit.widths.shape == (5,)
+    assert np.argmin(fit.cv_distance) == 3
+    assert fit.cv_distance.shape == fit.widths.shape == (5,)
     assert fit.play.width == fit.width
     assert_close(fit.result.chain.radii, truth.radii, rtol=1e-2, atol=0.0)
     as_torch = fit_play(
         start, torch.as_tensor(q), torch.as_tensor(x), groups, parameters=("radii",)
     )
-    close(as_torch.cv_rmse, fit.cv_rmse)
+    close(as_torch.cv_distance, fit.cv_distance)
 
 
 @pytest.mark.slow
@@ -112,7 +112,7 @@ def test_widths_are_doubled_while_the_largest_is_the_best():
     assert fit.kept
     assert fit.width == 1.6e-3
     close(fit.widths[-4:], np.array([0.4e-3, 0.8e-3, 1.6e-3, 3.2e-3]))
-    assert fit.cv_rmse.shape == fit.widths.shape
+    assert fit.cv_distance.shape == fit.widths.shape
 
 
 def test_one_motion_is_too_few():

@@ -15,7 +15,7 @@ from hybridkin import (
     robots,
 )
 from hybridkin.hybrid._error_models import NoCorrection
-from hybridkin.hybrid._play import choose_play
+from hybridkin.hybrid._hysteresis import choose_hysteresis
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._spec import Spec
 
@@ -57,9 +57,9 @@ def test_the_width_is_found_where_a_marker_is_missing(log):
     x += 2e-4 * np.random.default_rng(1).standard_normal(x.shape)
     x[::3, :3] = np.nan
     rows = Rows(q, x, groups=groups)
-    assert abs(choose_play(Spec(chain, NoCorrection()), rows).width - WIDTH) < 0.1 * WIDTH
+    assert abs(choose_hysteresis(Spec(chain, NoCorrection()), rows).width - WIDTH) < 0.1 * WIDTH
     nowhere = Rows(q, np.where(np.arange(6) < 3, np.nan, x), groups=groups)
-    assert choose_play(Spec(chain, NoCorrection()), nowhere) is None
+    assert choose_hysteresis(Spec(chain, NoCorrection()), nowhere) is None
     fitted = fit_play(chain, q, x, groups, widths=[0.5 * WIDTH, WIDTH], parameters=("radii",))
     assert fitted.width == WIDTH
 

@@ -1,0 +1,142 @@
+"""The hysteresis of least error on held-out motions: none, backlash, smooth friction, creep."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+
+from hybridkin.calibration.hysteresis_fit import HysteresisLog, HysteresisProblem
+from hybridkin.chains.hysteresis import HysteresisOperator
+
+_CLOSE = 0.002  # tolerance of a refined width, relative to it
+_LEAST = 0.0025  # first width, relative to the stroke
+_NONE = 0.0, 0.0
+_CREEP = 0.0, 0.2
+# Standard deviations of slopes and gains, from few to many free weights.
+_FRICTION = _NONE, _CREEP, (0.2, 0.0), (1.0, 0.0), (0.2, 0.2), (1.0, 0.2)
+
+
+@dataclass(frozen=True)
+class WidthSearch:
+    """Backlash (also called play) with the least held-out error.
+
+    Attributes
+    ----------
+    width : float
+        The width of least error [unit of q].
+    widths : ndarray of shape (W,)
+        Widths tried, ascending from zero, including doubled ones if the largest was the best.
+    cv_distance : ndarray of shape (W,)
+        Mean tip distance on held-out motions for each width [m], with a linear correction inside
+        the model.
+    gain : float
+        Mean reduction of the distances of motions by the best width [m].
+    gain_std_error : float
+        Standard error of `gain` over the motions [m].
+    kept : bool
+        Whether the play lowers the error: `gain` is above `gain_std_error`.
+    """
+
+    width: float
+    widths: NDArray
+    cv_distance: NDArray
+    gain: float
+    gain_std_error: float
+    kept: bool
+
+
+def search_width(
+    log: HysteresisLog, widths: list[float], *, refine: bool = False
+) -> WidthSearch:
+    """Return the width of one backlash with the least held-out error.
+
+    Parameters
+    ----------
+    log : HysteresisLog
+        The measured rows.
+    widths : list of float
+        Widths to try, ascending from zero. While the largest is the best, twice that width is tried
+        too, up to the largest range of q.
+    refine : bool, default=False
+        Whether to minimise the error between the neighbours of the best width.
+    """
+    widest = float(np.ptp(log.q, axis=0).max())
+
+    @cache
+    def errors_of(width: float) -> NDArray:
+        problem = HysteresisProblem(log, width, creep=False)
+        return log.by_group(problem.fitted(*_NONE).distances)
+
+    def error(width: float) -> float:
+        return float(errors_of(width).mean())
+
+    widths = list(widths)
+    best = min(widths, key=error)
+    while 0.0 < best == widths[-1] < widest:
+        widths.append(min(2.0 * best, widest))
+        best = min(widths, key=error)
+    if refine and best > 0.0:
+        place = widths.index(best)
+        bounds = widths[place - 1], widths[min(place + 1, len(widths) - 1)]
+        options = {"xatol": _CLOSE * best}
+        minimum = minimize_scalar(
+            error, bounds=bounds, method="bounded", options=options
+        )
+        best = min(best, float(minimum.x), key=error)
+    gain, std_error = _gain(errors_of(0.0), errors_of(best))
+    return WidthSearch(
+        best,
+        np.array(widths),
+        np.array([error(width) for width in widths]),
+        gain,
+        std_error,
+        best > 0.0 and gain > std_error,
+    )
+
+
+def find_hysteresis(log: HysteresisLog) -> HysteresisOperator | None:
+    """Return the hysteresis of the actuators; None if none lowers the error on held-out groups.
+
+    Tried are no friction, one backlash of the best width, and Prandtl-Ishlinskii operators about
+    this width, each with and without creep. The simplest is taken to which the one of least error
+    has no clear gain: a mean gain over the groups above its standard error.
+
+    Parameters
+    ----------
+    log : HysteresisLog
+        The measured rows.
+    """
+    strokes = np.subtract(*np.percentile(log.q, (95, 5), axis=0))
+    widest = float(np.ptp(log.q, axis=0).max())
+    widths = [0.0, widest]
+    if strokes.any():
+        # The error can have several minima over the width, so widths of all sizes are tried.
+        least = _LEAST * np.median(strokes[strokes > 0.0])
+        doubled = least * 2.0 ** np.arange(20)
+        widths[1:1] = doubled[doubled < widest].tolist()
+    width = search_width(log, widths, refine=True).width
+
+    widths_and_spreads = [(0.0, _NONE), (0.0, _CREEP)]
+    if width > 0.0:
+        widths_and_spreads += [(width, spreads) for spreads in _FRICTION]
+    problems = {size: HysteresisProblem(log, size, creep=True) for size in (0.0, width)}
+    candidates = []
+    for size, spreads in widths_and_spreads:
+        fit = problems[size].fitted(*spreads)
+        candidates.append((problems[size], fit, log.by_group(fit.distances)))
+    least_errors = min((errors for *_, errors in candidates), key=np.mean)
+    for problem, fit, errors in candidates:
+        gain, std_error = _gain(errors, least_errors)
+        if gain <= std_error:
+            return problem.operator(fit)
+    return None
+
+
+def _gain(before: NDArray, after: NDArray) -> tuple[float, float]:
+    """Return the mean reduction of the errors of groups, and its standard error."""
+    gains = before - after
+    return float(gains.mean()), float(gains.std(ddof=1) / np.sqrt(len(gains)))

@@ -1,0 +1,94 @@
+"""The backlash (also called play), or other hysteresis, of the actuators, from a log."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from hybridkin._core.model import as_forward_model
+from hybridkin.calibration.hysteresis_fit import HysteresisLog
+from hybridkin.calibration.hysteresis_search import find_hysteresis
+from hybridkin.chains.hysteresis import HysteresisOperator
+from hybridkin.chains.play import PlayOperator
+from hybridkin.hybrid._rows import Rows
+from hybridkin.hybrid._spec import Spec
+from hybridkin.learning.elm_cv import ELMRegressorCV
+
+_PLAIN: dict[str, Any] = {"relevance_rounds": 0, "max_hidden": 0, "random_state": 0}
+
+
+def play_of(
+    play: ArrayLike | str | None, spec: Spec, rows: Rows
+) -> tuple[HysteresisOperator | None, list[str]]:
+    """Return the hysteresis for the setting `play` of a HybridForwardModel, and warnings about it.
+
+    Parameters
+    ----------
+    play : None, "auto", float or array-like of shape (n,)
+        The setting.
+    spec : Spec
+        The mechanical model, and its parameters to calibrate first.
+    rows : Rows
+        The log, with the rows of each run in order of time.
+    """
+    if play is None:
+        return None, []
+    ranges = np.ptp(rows.X, axis=0)
+    if isinstance(play, str):
+        chosen = choose_hysteresis(spec.calibrated(replace(rows, groups=None)), rows)
+        single = isinstance(chosen, PlayOperator)
+        if not single or chosen.width < 0.95 * ranges.max():
+            return chosen, []
+        return chosen, [
+            f"play='auto' found a backlash of {chosen.width:.3g}, as wide as the range of "
+            "`X`: the log gives no upper limit. Record larger motions, or give the width as `play`."
+        ]
+    operator = PlayOperator(play)
+    if operator.width.size not in (1, len(ranges)):
+        raise ValueError(
+            f"`play` must be a width or {len(ranges)} widths, got {play!r:.200}."
+        )
+    if not np.any(operator.width >= ranges):
+        return operator, []
+    return operator, [
+        f"`play` {play!r} must be less than the range of `X`, {ranges}: else an actuator never "
+        "moves. Give `play` in the unit of `X`, for lengths metres."
+    ]
+
+
+def choose_hysteresis(spec: Spec, rows: Rows) -> HysteresisOperator | None:
+    """Return the hysteresis of least error on held-out motions; None if none helps.
+
+    Parameters
+    ----------
+    spec : Spec
+        The mechanical model, calibrated without hysteresis.
+    rows : Rows
+        The log, with the rows of each run in order of time.
+    """
+    groups = np.zeros(len(rows)) if rows.groups is None else rows.groups
+    usable = (rows.counts > 0) & ~np.isnan(rows.tips).all(axis=1)
+    if len(np.unique(groups)) == 1:  # a single motion is cut into ten
+        groups = np.arange(len(rows)) * 10 // len(rows)
+    if len(np.unique(groups[usable])) < 2:
+        return None
+    positions = spec.positions(rows).numpy().astype(np.float64)
+    model = spec.mechanical
+    if model is None:
+        network = ELMRegressorCV(200, weight_scales=(0.4,), **_PLAIN)
+        network.fit(rows.X[usable], np.nan_to_num(positions[usable]))
+        model = as_forward_model(network)
+    return find_hysteresis(
+        HysteresisLog(
+            model,
+            rows.q.numpy(),
+            positions,
+            rows.counts,
+            groups,
+            rows.run_of_rows,
+            rows.times,
+        )
+    )
