@@ -202,7 +202,7 @@ class HysteresisProblem:
         log = self.log
         K = len(self.start)
         gains = weights[K:]
-        of_changes = np.concatenate([weights[:K], np.ones_like(weights[:1])])[None]
+        of_changes = np.concatenate([weights[:K], np.ones((1, weights.shape[1]))])[None]
         late = (self.late * of_changes).sum(axis=2)
         y = (self.changes * of_changes).sum(axis=1) + (late * gains).sum(axis=1)
         delayed = (self.late[:, :, :K] * gains[:, None]).sum(axis=1)

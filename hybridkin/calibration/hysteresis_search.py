@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,10 +15,12 @@ from hybridkin.chains.hysteresis import HysteresisOperator
 
 _CLOSE = 0.002  # tolerance of a refined width, relative to it
 _LEAST = 0.0025  # first width, relative to the stroke
+_LEAST_GAIN = 0.02  # relative to the error
+# Standard deviations of the priors of slopes and gains, from few to many free weights.
 _NONE = 0.0, 0.0
 _CREEP = 0.0, 0.2
-# Standard deviations of slopes and gains, from few to many free weights.
-_FRICTION = _NONE, _CREEP, (0.2, 0.0), (1.0, 0.0), (0.2, 0.2), (1.0, 0.2)
+_SMOOTH = (0.2, 0.0), (1.0, 0.0)
+_SMOOTH_AND_CREEP = (0.2, 0.2), (1.0, 0.2)
 
 
 @dataclass(frozen=True)
@@ -38,7 +41,7 @@ class WidthSearch:
     gain_std_error : float
         Standard error of `gain` over the motions [m].
     kept : bool
-        Whether the play lowers the error: `gain` is above `gain_std_error`.
+        Whether the play lowers the error: `gain` is above `gain_std_error` and 2 % of the error.
     """
 
     width: float
@@ -68,8 +71,7 @@ def search_width(
 
     @cache
     def errors_of(width: float) -> NDArray:
-        problem = HysteresisProblem(log, width, creep=False)
-        return log.by_group(problem.fitted(*_NONE).distances)
+        return _Candidate.of(log, width, _NONE).errors
 
     def error(width: float) -> float:
         return float(errors_of(width).mean())
@@ -87,14 +89,14 @@ def search_width(
             error, bounds=bounds, method="bounded", options=options
         )
         best = min(best, float(minimum.x), key=error)
-    gain, std_error = _gain(errors_of(0.0), errors_of(best))
+    gain, std_error, kept = _gain(errors_of(0.0), errors_of(best))
     return WidthSearch(
         best,
         np.array(widths),
         np.array([error(width) for width in widths]),
         gain,
         std_error,
-        best > 0.0 and gain > std_error,
+        kept,
     )
 
 
@@ -103,7 +105,8 @@ def find_hysteresis(log: HysteresisLog) -> HysteresisOperator | None:
 
     Tried are no friction, one backlash of the best width, and Prandtl-Ishlinskii operators about
     this width, each with and without creep. The simplest is taken to which the one of least error
-    has no clear gain: a mean gain over the groups above its standard error.
+    has no clear gain: a mean gain over the groups above its standard error, and above 2 % of the
+    error, which the linear correction can feign.
 
     Parameters
     ----------
@@ -120,23 +123,64 @@ def find_hysteresis(log: HysteresisLog) -> HysteresisOperator | None:
         widths[1:1] = doubled[doubled < widest].tolist()
     width = search_width(log, widths, refine=True).width
 
-    widths_and_spreads = [(0.0, _NONE), (0.0, _CREEP)]
+    candidates = [_Candidate.of(log, 0.0, _NONE), _Candidate.of(log, 0.0, _CREEP)]
     if width > 0.0:
-        widths_and_spreads += [(width, spreads) for spreads in _FRICTION]
-    problems = {size: HysteresisProblem(log, size, creep=True) for size in (0.0, width)}
-    candidates = []
-    for size, spreads in widths_and_spreads:
-        fit = problems[size].fitted(*spreads)
-        candidates.append((problems[size], fit, log.by_group(fit.distances)))
-    least_errors = min((errors for *_, errors in candidates), key=np.mean)
-    for problem, fit, errors in candidates:
-        gain, std_error = _gain(errors, least_errors)
-        if gain <= std_error:
-            return problem.operator(fit)
+        backlash = _Candidate.of(log, width, _NONE)
+        with_creep = _Candidate.of(log, width, _CREEP)
+        if _gain(backlash.errors, with_creep.errors)[2]:
+            with_creep = _with_width_again(log, with_creep)
+        candidates += [backlash, with_creep]
+        candidates += [_Candidate.of(log, width, spreads) for spreads in _SMOOTH]
+        width = with_creep.width
+        candidates += [_Candidate.of(log, width, both) for both in _SMOOTH_AND_CREEP]
+    least = min(candidates, key=_Candidate.error)
+    for candidate in candidates:
+        if not _gain(candidate.errors, least.errors)[2]:
+            return candidate.operator
     return None
 
 
-def _gain(before: NDArray, after: NDArray) -> tuple[float, float]:
-    """Return the mean reduction of the errors of groups, and its standard error."""
+class _Candidate(NamedTuple):
+    """A kind of hysteresis, and its errors on held-out groups."""
+
+    width: float
+    operator: HysteresisOperator | None
+    errors: NDArray
+
+    @classmethod
+    def of(
+        cls, log: HysteresisLog, width: float, spreads: tuple[float, float]
+    ) -> _Candidate:
+        """Return the candidate of the width of a backlash and of the spreads of the weights."""
+        problem = HysteresisProblem(log, width, creep=spreads[1] > 0.0)
+        fit = problem.fitted(*spreads)
+        return cls(width, problem.operator(fit), log.by_group(fit.distances))
+
+    def error(self) -> float:
+        """Return the mean error [m]."""
+        return float(self.errors.mean())
+
+
+def _with_width_again(log: HysteresisLog, candidate: _Candidate) -> _Candidate:
+    """Return backlash and creep with the width of least error, for a width without creep."""
+    tried = [candidate]
+
+    def error(width: float) -> float:
+        tried.append(_Candidate.of(log, width, _CREEP))
+        return tried[-1].error()
+
+    width = candidate.width
+    options = {"xatol": _CLOSE * width}
+    minimize_scalar(
+        error, bounds=(0.25 * width, 1.5 * width), method="bounded", options=options
+    )
+    return min(tried, key=_Candidate.error)
+
+
+def _gain(before: NDArray, after: NDArray) -> tuple[float, float, bool]:
+    """Return the mean reduction of the errors of groups, its standard error, and if it is clear."""
     gains = before - after
-    return float(gains.mean()), float(gains.std(ddof=1) / np.sqrt(len(gains)))
+    gain = float(gains.mean())
+    std_error = float(gains.std(ddof=1) / np.sqrt(len(gains)))
+    clear = gain > max(std_error, _LEAST_GAIN * float(before.mean()))
+    return gain, std_error, clear

@@ -70,6 +70,8 @@ class CreepOperator(HysteresisOperator[CreepState]):
     array([0., 1., 1.])
     """
 
+    kind = "creep"
+
     def __init__(self, gains: ArrayLike, times: ArrayLike) -> None:
         self.gains = real_array(gains, "gains").astype(float)
         self.times = real_array(times, "times").astype(float)

@@ -25,11 +25,14 @@ class HysteresisOperator(ABC, Generic[_State]):
 
     Attributes
     ----------
+    kind : str
+        What it describes, in words.
     width : ndarray of shape () or (n,)
         Largest distance between two commands with the same effective change, if actuators stay at
         each of them [unit of q].
     """
 
+    kind: str
     width: NDArray
 
     def apply(

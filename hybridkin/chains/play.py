@@ -59,6 +59,8 @@ class PlayOperator(HysteresisOperator[PlayState]):
     array([ 0.75, -0.25])
     """
 
+    kind = "backlash (play)"
+
     def __init__(self, width: ArrayLike) -> None:
         self.width = real_array(width, "width").astype(float)
         valid = np.isfinite(self.width) & (self.width >= 0)

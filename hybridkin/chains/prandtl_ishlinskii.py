@@ -72,6 +72,8 @@ class PrandtlIshlinskiiOperator(HysteresisOperator[HysteresisState]):
     array([0. , 0.5, 2. , 1.5])
     """
 
+    kind = "hysteresis"
+
     def __init__(self, widths: ArrayLike, slopes: ArrayLike) -> None:
         self.widths = real_array(widths, "widths").astype(float)
         self.slopes = real_array(slopes, "slopes").astype(float)

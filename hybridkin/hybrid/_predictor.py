@@ -274,7 +274,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return [message for message in messages if message is not None]
 
     def _effective(
-        self, X: NDArray, groups: ArrayLike | None, time: ArrayLike | None
+        self, X: NDArray, groups: ArrayLike | None, time: ArrayLike | None = None
     ) -> NDArray:
         """Return the motion of the actuators: with `play`, not the commands X themselves."""
         if self.play_ is None or not len(X):

@@ -31,9 +31,11 @@ from hybridkin.chains import (  # noqa: F401
     force_tendons,
     rigid,
 )
+from hybridkin.chains.creep import CreepOperator
 from hybridkin.chains.hysteresis import HysteresisOperator
 from hybridkin.chains.play import PlayOperator
 from hybridkin.chains.prandtl_ishlinskii import PrandtlIshlinskiiOperator
+from hybridkin.chains.series import HysteresisSeries
 from hybridkin.hybrid._adapt import Change
 from hybridkin.hybrid._drift import Drift
 from hybridkin.hybrid._radius import Radius
@@ -105,17 +107,38 @@ def stored_hybrid(model: HybridForwardModel) -> Stored:
 
 
 def _stored_play(operator: HysteresisOperator | None) -> dict[str, NDArray]:
-    """Return the arrays of an operator; those of none if there is no hysteresis."""
+    """Return the arrays of an operator, friction or creep or both in this order; or none."""
+    if operator is None:
+        return {}
     if isinstance(operator, PlayOperator):
         return {"play_width": operator.width}
     if isinstance(operator, PrandtlIshlinskiiOperator):
         widths = operator.widths[:, None]  # a matrix: not the widths of actuators
         return {"play_width": widths, "play_slopes": operator.slopes}
-    return {}
+    if isinstance(operator, CreepOperator):
+        return {"creep_gains": operator.gains, "creep_times": operator.times}
+    if isinstance(operator, HysteresisSeries) and len(operator.operators) == 2:
+        friction, creep = operator.operators
+        frictions = PlayOperator, PrandtlIshlinskiiOperator
+        if isinstance(friction, frictions) and isinstance(creep, CreepOperator):
+            return _stored_play(friction) | _stored_play(creep)
+    raise TypeError(f"`play_` {operator!r:.80} could only be stored as code.")
 
 
-def _play_of(stored: Stored, n: int) -> HysteresisOperator:
+def _play_of(stored: Stored, n: int) -> HysteresisOperator | None:
     """Return the operator of n actuators from its arrays, see `_stored_play`."""
+    friction = _friction_of(stored, n)
+    if "creep_gains" not in stored.arrays:
+        return friction
+    times = stored.array("creep_times", "J")
+    shape = (len(times), n)[: stored.array("creep_gains").ndim]
+    creep = CreepOperator(stored.array("creep_gains", shape), times)
+    return creep if friction is None else HysteresisSeries([friction, creep])
+
+
+def _friction_of(stored: Stored, n: int) -> HysteresisOperator | None:
+    if "play_width" not in stored.arrays:
+        return None
     n_dimensions = stored.array("play_width").ndim
     if n_dimensions == 2:
         widths = stored.array("play_width", ("K", 1))[:, 0]
@@ -165,10 +188,9 @@ def hybrid_of(stored: Stored, training: object) -> HybridForwardModel:
     if not (torch.isfinite(x).all() and torch.isfinite(J).all()):
         raise ValueError("the arrays do not give finite numbers")
     model._fitted_range = TrainingRange(*stored.array("training_range", (2, n)))
-    model.calibration_ = model.play_ = model.radius_ = model._play_state = None
+    model.calibration_ = model.radius_ = model._play_state = None
     model.candidates_ = None
-    if "play_width" in stored.arrays:
-        model.play_ = _play_of(stored, n)
+    model.play_ = _play_of(stored, n)
     if "radius" in stored.arrays:
         radius = stored.array("radius", (3,), finite=False).tolist()
         inside, coverage, n_rows = radius

@@ -105,6 +105,14 @@ def test_play_in_a_log_is_found():
     close(as_torch.cv_distance, fit.cv_distance)
 
 
+def test_no_play_in_a_log_is_none():
+    truth, q, x, groups = log_of(0.0, 1e-4)
+    fit = fit_play(truth, q, x, groups, parameters=("radii",))
+    assert not fit.kept
+    assert fit.width == 0.0
+    assert fit.cv_distance[0] < 3e-4
+
+
 @pytest.mark.slow
 def test_widths_are_doubled_while_the_largest_is_the_best():
     truth, q, x, groups = log_of(1.6e-3, 1e-4)

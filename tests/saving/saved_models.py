@@ -12,10 +12,12 @@ from sklearn.linear_model import LinearRegression
 
 from hybridkin import (
     ConstantCurvatureChain,
+    CreepOperator,
     ElasticTendonChain,
     ELMRegressor,
     ELMRegressorCV,
     HybridForwardModel,
+    HysteresisSeries,
     PrandtlIshlinskiiOperator,
     RigidChain,
     save_model,
@@ -128,6 +130,12 @@ def _with_smooth_hysteresis(model, q):
     return model, q
 
 
+def _with_creep(model, q):
+    creep = CreepOperator([[0.1, 0.2, 0.3], [0.2, 0.1, 0.0]], [2.0, 30.0])
+    model.play_ = HysteresisSeries([model.play_, creep])
+    return model, q
+
+
 def _adapted(model, q):
     """A robot on another day: the base has moved, the zeros are others; and a payload."""
     base = np.array([[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
@@ -174,6 +182,7 @@ def models() -> dict[str, tuple[Any, Any]]:
         "blend": _blend(),
         "play": _hybrid("linear", play=[0.01, 0.02, 0.0]),
         "smooth_hysteresis": _with_smooth_hysteresis(*_hybrid("linear", play=0.02)),
+        "creep": _with_creep(*_hybrid("linear", play=0.02)),
         "tested_by_groups": _hybrid("linear", coupling="serial", guard="box"),
         "drift_and_radius": _drifting(),
         "adapted": _adapted(*_hybrid("quadratic", coupling="serial")),

@@ -1,0 +1,197 @@
+"""Hybrid models of robots that creep, and hysteresis that goes on from group to group."""
+
+import numpy as np
+import pytest
+import torch
+from numpy.testing import assert_allclose, assert_array_equal
+from sklearn import config_context
+from sklearn.model_selection import GroupKFold, cross_validate
+
+from hybridkin import (
+    CreepOperator,
+    HybridForwardModel,
+    HysteresisSeries,
+    PlayOperator,
+    load_model,
+    robots,
+    save_model,
+)
+
+CHAIN = robots.bionic_handling_assistant()
+CREEP = CreepOperator([0.15, 0.25], [3.0, 40.0])
+SLIDE = HysteresisSeries([PlayOperator(0.02), CREEP])
+
+
+def motions(n, seed, rows=40):
+    """Return commands of n motions back and forth [m], their groups and irregular times [s]."""
+    rng = np.random.default_rng(seed)
+    turn = np.linspace(0.0, 2.0 * np.pi, rows)
+    waves = np.stack([np.sin(turn), np.sin(2.0 * turn), np.cos(turn) - 1.0])
+    q = 0.25 + (rng.uniform(-0.03, 0.03, (n, 9, 3)) @ waves).transpose(0, 2, 1).reshape(-1, 9)
+    return q, np.repeat(np.arange(n), rows), np.cumsum(rng.uniform(0.5, 4.0, n * rows))
+
+
+def tips(y):
+    with torch.no_grad():
+        bent = torch.from_numpy(y) + 0.03 * torch.from_numpy(y[:, ::-1] - 0.25).square()
+        return CHAIN(bent).numpy()
+
+
+def log(operator, n, seed, runs=None):
+    """Return commands, tips with noise, groups and times."""
+    q, groups, time = motions(n, seed)
+    y = operator.apply_by_group(q, groups if runs is None else runs, time)
+    noise = 5e-4 * np.random.default_rng(1).standard_normal((len(q), 3))
+    return q, tips(y) + noise, groups, time
+
+
+def mean_error(model, operator, **given):
+    """Return the mean error of predictions on new motions [m]."""
+    q, groups, time = motions(6, seed=2)
+    x = tips(operator.apply_by_group(q, groups, time))
+    return np.linalg.norm(model.predict(q, groups=groups, **given) - x, axis=1).mean()
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    q, x, groups, time = log(SLIDE, 16, seed=0)
+    model = HybridForwardModel(CHAIN, "quadratic", coupling="serial", play="auto")
+    return model.fit(q, x, groups=groups, time=time)
+
+
+@pytest.mark.slow
+def test_creep_behind_a_backlash_is_found(fitted):
+    assert fitted.play_.kind == "backlash (play) and creep"
+    q, x, groups, time = log(SLIDE, 16, seed=0)
+    single = HybridForwardModel(CHAIN, "quadratic", coupling="serial", play=0.02)
+    single.fit(q, x, groups=groups)
+    time = motions(6, seed=2)[2]
+    assert mean_error(fitted, SLIDE, time=time) < 0.2 * mean_error(single, SLIDE)
+    # Without times the steps are not those of the robot.
+    assert mean_error(fitted, SLIDE, time=time) < 0.7 * mean_error(fitted, SLIDE)
+    assert "backlash (play) and creep" in fitted.html_rows()
+
+
+@pytest.mark.slow
+def test_creep_alone_is_found_and_nothing_where_nothing_is():
+    q, x, groups, time = log(CREEP, 16, seed=0)
+    model = HybridForwardModel(CHAIN, "quadratic", coupling="serial", play="auto")
+    assert isinstance(model.fit(q, x, groups=groups, time=time).play_, CreepOperator)
+    assert mean_error(model, CREEP, time=motions(6, seed=2)[2]) < 1e-3
+    q, x, groups, time = log(PlayOperator(0.0), 16, seed=0)
+    assert model.fit(q, x, groups=groups, time=time).play_ is None
+
+
+@pytest.mark.slow
+def test_a_file_holds_friction_and_creep(fitted, tmp_path):
+    save_model(fitted, tmp_path / "model.safetensors")
+    loaded = load_model(tmp_path / "model.safetensors")
+    assert repr(loaded.play_) == repr(fitted.play_)
+    q, groups, time = motions(2, seed=4)
+    expected = fitted.predict(q, groups=groups, time=time)
+    assert_array_equal(loaded.predict(q, groups=groups, time=time), expected)
+
+
+def test_a_series_that_a_file_cannot_hold_is_refused(tmp_path):
+    q, x, groups, _ = log(CREEP, 4, seed=0)
+    model = HybridForwardModel(CHAIN, "linear", play=0.02).fit(q, x, groups=groups)
+    model.play_ = HysteresisSeries([CREEP, CREEP])
+    with pytest.raises(TypeError, match=r"`play_` HysteresisSeries\(.* stored as code"):
+        save_model(model, tmp_path / "model.safetensors")
+
+
+def test_hysteresis_goes_on_within_a_run_and_starts_anew_with_the_next():
+    wide = PlayOperator(0.03)
+    q, groups, _ = motions(8, seed=0)
+    runs = groups // 4
+    x = tips(wide.apply_by_group(q, runs))
+    model = HybridForwardModel(CHAIN, "linear", play=0.03)
+    model.fit(q, x, groups=groups, runs=runs)
+    still = HybridForwardModel(CHAIN, "linear")
+    still.fit(wide.apply_by_group(q, runs), x, groups=groups)
+    expected = still.predict(wide.apply_by_group(q, runs))
+    assert_array_equal(model.predict(q, groups=runs), expected)
+    assert np.abs(model.predict(q, groups=groups) - expected).max() > 1e-3
+    # The change since the fit is found from rows of such runs as well.
+    moved = model.adapt(
+        q, x + np.array([0.0, 0.0, 0.1]), parameters=["base"], groups=groups, runs=runs
+    )
+    assert_allclose(moved.change_.motion[2, 3], 0.1, rtol=0.0, atol=1e-3)
+
+
+@pytest.mark.slow
+def test_the_choice_uses_the_runs():
+    # Each group is too short to know its start: only with runs is the backlash found well.
+    q, groups, _ = motions(8, seed=0, rows=160)
+    parts = np.arange(len(q)) // 20
+    x = tips(PlayOperator(0.02).apply_by_group(q, groups))
+    x += 5e-4 * np.random.default_rng(1).standard_normal(x.shape)
+    model = HybridForwardModel(CHAIN, "linear", coupling="serial", play="auto")
+    model.fit(q, x, groups=parts, runs=groups)
+    assert abs(model.play_.width - 0.02) < 0.001
+    error = np.linalg.norm(model.predict(q, groups=groups) - x, axis=1).mean()
+    model.fit(q, x, groups=parts)
+    alone = np.linalg.norm(model.predict(q, groups=groups) - x, axis=1).mean()
+    assert error < 0.9 * alone
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("log_of", ["markers", "gains", "repeated", "few", "still"])
+def test_logs_as_they_come(log_of):
+    q, x, groups, time = log(SLIDE, 10, seed=0)
+    chain = CHAIN
+    weights = None
+    if log_of == "markers":
+        chain = CHAIN.with_markers([(1, 1.0), (2, 1.0)])
+        with torch.no_grad():
+            y = SLIDE.apply_by_group(q, groups, time)
+            x = chain(torch.from_numpy(y)).numpy()
+        x[::3, :3] = np.nan
+        x[1::3, 3:] = np.nan
+    elif log_of == "gains":
+        chain = CHAIN.with_geometry(gains=torch.full((9,), 2e-3, dtype=torch.float64))
+        q = q / 2e-3
+    elif log_of == "repeated":
+        keep = np.repeat(np.arange(len(q)), 2)
+        q, x, groups, time = q[keep], x[keep], groups[keep], time[keep]
+    elif log_of == "few":
+        weights = (np.arange(len(q)) % 3 > 0).astype(float)
+    elif log_of == "still":
+        time = np.zeros(len(q))  # of a log without a clock: no creep, but friction
+    model = HybridForwardModel(chain, "linear", coupling="serial", play="auto")
+    model.fit(q, x, weights, groups=groups, time=time)
+    if log_of == "still":
+        assert "creep" not in model.play_.kind
+        return
+    assert "creep" in model.play_.kind
+    error = np.nanmean(np.abs(model.predict(q, groups=groups, time=time) - x))
+    assert error < 0.01
+
+
+def test_wrong_runs_and_times_are_named():
+    q, x, groups, time = log(CREEP, 4, seed=0)
+    model = HybridForwardModel(CHAIN, "linear", play=0.02)
+    with pytest.raises(ValueError, match="`runs` must"):
+        model.fit(q, x, runs=groups[:-1])
+    with pytest.raises(ValueError, match="`time` must not decrease within a motion"):
+        model.fit(q, x, time=time[::-1])
+    model.fit(q, x, groups=groups, runs=-groups, time=time)
+    with pytest.raises(ValueError, match="`time` must be finite"):
+        model.predict(q, groups=groups, time=np.full(len(q), np.nan))
+    with pytest.raises(ValueError, match="`runs` must"):
+        model.adapt(q[:5], x[:5], runs=groups)
+
+
+def test_cross_validation_hands_over_runs_and_times():
+    q, x, groups, time = log(CREEP, 6, seed=0)
+    model = HybridForwardModel(CHAIN, "linear", play=0.02)
+    with config_context(enable_metadata_routing=True):
+        model.set_fit_request(groups=True, runs=True, time=True)
+        results = cross_validate(
+            model,
+            q,
+            x,
+            cv=GroupKFold(3),
+            params={"groups": groups, "runs": groups // 2, "time": time},
+        )
+    assert np.isfinite(results["test_score"]).all()
