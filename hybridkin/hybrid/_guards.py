@@ -41,7 +41,7 @@ _AS_LOGGED = 3.0  # plus so many times its rms there
 _BESIDE = 1000  # rows of the log, and as many beside them, for which distances are kept
 _BEYOND = 1.5  # how far beside, in ranges of the log
 _CHANGE = 5e-4  # largest relative change of their distances; of weights it is less than twice this
-_ROUNDING = 1e-9  # largest rounding of their distances
+_ROUNDING = 1e-11  # largest rounding of their distances; 5e-3 in float32
 
 
 class Guard(PortableModule):
