@@ -80,11 +80,12 @@ def merge(a, b):
     return Statistics(n, a.mean + step * (b.n / n), scatter)
 
 
-def ridge(G, C, alpha):
+def ridge(G, C, alpha, least=0.0):
     """Return W = (G + alpha 1)^-1 C, R with R R' = (G + alpha 1)^-1, tr(R' G R), and the solver.
 
     If G + alpha 1 is singular, W is the solution of minimum norm. R then replaces eigenvalues
-    below rounding by their rounding error: it is large in directions without data.
+    below rounding by their rounding error, but at least by `least`: it is large in directions
+    without data.
     """
     A = G + alpha * np.eye(len(G))
     eps = len(G) * np.finfo(np.float64).eps
@@ -109,7 +110,7 @@ def ridge(G, C, alpha):
     regular = shifted > cutoff
     axes = V[:, regular]
     W = axes @ ((axes.T @ C) / shifted[regular, None])
-    R = V / np.sqrt(np.maximum(shifted, cutoff))
+    R = V / np.sqrt(np.maximum(shifted, max(cutoff, least)))
     dof = np.sum(eigenvalues[regular] / shifted[regular])
     return W, R, dof, "eigh"
 
@@ -148,9 +149,12 @@ def fit_readout(stats, n_features, alpha, fit_intercept):
     dof = np.empty(yy.shape)
     solvers = set()
     R = None
+    mu = mean[:n_features]
+    # Features that only differ from their mean by rounding.
+    least = np.finfo(np.float64).eps * n * (mu @ mu)
     for value in np.unique(alphas)[::-1]:
         of = alphas == value
-        W[:, of], R, dof[of], solver = ridge(G, C[:, of], value)
+        W[:, of], R, dof[of], solver = ridge(G, C[:, of], value, least)
         solvers.add(solver)
     # This form of the residual is stationary in W: rounding in W enters squared.
     rss = yy - np.sum(W * (2 * C - G @ W), axis=0)
@@ -158,7 +162,6 @@ def fit_readout(stats, n_features, alpha, fit_intercept):
     smallest = np.sqrt(np.finfo(np.float64).eps) * n
     resolved = np.isfinite(dof_left) & (dof_left > smallest)
     noise = np.maximum(rss, 0.0) / np.where(resolved, dof_left, np.nan)
-    mu = mean[:n_features]
     readout = {
         "output_weights": W,
         "intercept": mean[n_features:] - mu @ W,

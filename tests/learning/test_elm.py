@@ -219,6 +219,20 @@ def test_gradcheck(params):
 # Uncertainty
 
 
+@pytest.mark.filterwarnings("ignore::scipy.linalg.LinAlgWarning")
+@pytest.mark.parametrize("activation", ["logistic", "tanh", "sin"])
+def test_equal_rows_without_penalty_have_the_leverage_of_their_mean(activation):
+    """Their features differ from the mean by rounding alone, which is not the same in a batch."""
+    for n_rows in (2, 3, 7):
+        X = np.full((n_rows, 1), 0.27392337)
+        model = elm(
+            5, alpha=0.0, activation=activation, input_scaling=None, fit_intercept=True
+        ).fit(X, X)
+        single = [model.leverage(X[k : k + 1])[0] for k in range(n_rows)]
+        assert_allclose(model.leverage(X), 1 / n_rows, rtol=1e-12)
+        assert_allclose(single, 1 / n_rows, rtol=1e-12)
+
+
 @variants
 def test_leverage_and_std_equal_dense_formulas(params):
     X, Y = trunk()
