@@ -1,6 +1,6 @@
 """An arm of two bellows segments driven by six pressures: errors at rest on days held out.
 
-The table of the docs page "Any motor or pressure", section "A recorded arm with pressures"::
+The table of the docs page "Motors from end to end", section "A recorded arm with pressures"::
 
     python examples/studies/bellows.py --jobs 2
 
@@ -70,7 +70,7 @@ def nominal() -> ConstantCurvatureChain:
 
 
 class Recording:
-    """Pressures [bar], both markers [m], and which rows are at rest."""
+    """Pressures [bar], both markers [m], times [s], and which rows are at rest."""
 
     def __init__(self, data_home: Path | None) -> None:
         data = datasets.load_asu_bellows(data_home)
@@ -78,6 +78,7 @@ class Recording:
         self.q = data.q[used] / BAR
         self.x = np.hstack([data.middle, data.x])[used]
         self.runs = data.groups[used]
+        self.time = data.time[used]
         self.days = data.day[used]
         self.rest = np.zeros(len(self.q), dtype=bool)
         for run in np.unique(self.runs):
@@ -102,8 +103,15 @@ class Recording:
         if model.play is None:
             model.fit(self.q[fitted], self.x[fitted], groups=self.days[fitted])
             return model.predict(q_new)
-        model.fit(self.q[other], self.x[other], counted[other], self.runs[other])
-        return model.predict(q_new, groups=self.runs[~other])
+        model.fit(
+            self.q[other],
+            self.x[other],
+            counted[other],
+            groups=self.days[other],
+            runs=self.runs[other],
+            time=self.time[other],
+        )
+        return model.predict(q_new, groups=self.runs[~other], time=self.time[~other])
 
     def error(self, name: str, day: str) -> tuple[float, float, float]:
         """Return mean and largest tip error at rest on a day [mm], and processor time [s]."""
