@@ -27,7 +27,7 @@ MODULES = (
 OF_THE_ACTUATORS = {"q", "q0", "q_min", "q_max", "q_pref", "dq", "X", "y", "std"}
 WITHOUT_UNIT = {
     *("groups", "sample_weight", "weights", "sizes", "rows", "part", "train_idx", "test_idx"),
-    *("motions", "fold", "late"),
+    *("motions", "runs", "fold", "late"),
     *("normal", "axes", "axes_", "frames", "base", "tip", "origins", "pose", "values", "spreads"),
     *("correlations", "narrowing", "identifiable", "singular_values", "sigma_min", "scale"),
     *("input_weights_", "alphas", "alpha_", "cv_results_", "leverage_center_"),

@@ -50,8 +50,8 @@ class CreepOperator(HysteresisOperator[CreepState]):
     Attributes
     ----------
     width : ndarray of shape ()
-        Zero: commands of effective changes at rest are these changes. The commands of a motion lead
-        by more, the faster it is.
+        Zero [unit of q]: commands of effective changes at rest are these changes. The commands of a
+        motion lead by more, the faster it is.
 
     References
     ----------

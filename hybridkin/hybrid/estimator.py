@@ -401,7 +401,7 @@ class HybridForwardModel(HybridPredictor):
         groups : array-like of shape (k,), optional
             Motion of every row. Rows of one motion have similar errors and count as fewer rows.
         runs, time : array-like of shape (k,), optional
-            Run and time of every row, as in `fit`.
+            Run and time of every row [s], as for `fit`.
 
         Returns
         -------

@@ -185,7 +185,7 @@ class Track(Generic[ArrayT]):
     q : array of shape (T, n)
         Commands to send.
     effective : array of shape (T, n)
-        What the actuators do: `q` without hysteresis.
+        What the actuators do [unit of q]: `q` without hysteresis.
     x : array of shape (T, 3)
         Tips of the model at `effective` [m].
     x_measured : array of shape (T, 3) or None

@@ -47,7 +47,7 @@ class Tracker(Portable):
     q : array of shape (n,)
         The present command: the result of the last `step`, or the argument of `reset`.
     effective : array of shape (n,)
-        What the actuators do, where the model is evaluated: `q` without hysteresis.
+        What the actuators do, where the model is evaluated [unit of q]: `q` without hysteresis.
     x : array of shape (3,)
         The model's tip at the start of the last step [m], in the shape of the task.
     error : float
