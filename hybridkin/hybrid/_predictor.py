@@ -104,7 +104,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 "HybridForwardModel(..., coverage=0.9); this one was fitted without."
             )
         x, distance = self._evaluated(
-            partial(self._tips, distance=True), X, groups, time
+            partial(self._tips, distance=True, enough=1.0), X, groups, time
         )
         return x, self.radius_.at(distance <= 1.0).astype(x.dtype)
 
@@ -192,7 +192,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         inside : ndarray of bool of shape (N,)
             Without a guard all True, except along those directions.
         """
-        distance = partial(self._tips, value=False, distance=True)
+        distance = partial(self._tips, value=False, distance=True, enough=1.0)
         return self._evaluated(distance, X, groups, time, warn=False)[0] <= 1.0
 
     def error_weight(
@@ -298,7 +298,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if self._chain is not None:
             self._plausible_rows = self._chain.plausible_rows()
 
-    def _tips(self, q: NDArray, **results: bool) -> tuple[NDArray, ...]:
+    def _tips(self, q: NDArray, **results: float) -> tuple[NDArray, ...]:
         """Return the tips of rows q (N, n), or other `results` of `evaluate`."""
         return evaluate(in_columns(self.module_, self.output), q, **results)
 

@@ -90,7 +90,14 @@ def _fault(opened: ctypes.CDLL) -> str:
     if opened.hk_sources() & 0xFFFFFFFF != checksum(_FOLDER / "src"):
         return "was compiled from other sources; reinstall hybridkin, or run hatch_build.py"
     pointer = ctypes.c_void_p
-    opened.hk_evaluate.argtypes = [pointer, pointer, ctypes.c_int64, *[pointer] * 3]
+    results = [pointer] * 3
+    opened.hk_evaluate.argtypes = [
+        pointer,
+        pointer,
+        ctypes.c_int64,
+        *results,
+        ctypes.c_double,
+    ]
     opened.hk_work.argtypes = [pointer, ctypes.c_int32]
     opened.hk_work.restype = ctypes.c_int64
     opened.hk_ik_tick.argtypes = [pointer]
@@ -204,7 +211,11 @@ class Program:
         return Program, (self.plan,)
 
     def evaluate(
-        self, q: NDArray, jacobian: bool = False, distance: bool = False
+        self,
+        q: NDArray,
+        jacobian: bool = False,
+        distance: bool = False,
+        enough: float = 0.0,
     ) -> Results:
         """Return x (..., m), dx/dq (..., m, n) or None, and the domain distance (...) or None.
 
@@ -219,18 +230,22 @@ class Program:
             Whether to compute dx/dq.
         distance : bool, default=False
             Whether to compute the domain distance.
+        enough : float, default=0.0
+            Instead of a distance up to this, any number between the two may be returned.
         """
         lead = q.shape[:-1]
         n, m = self._sizes
         if q.size == n == q.shape[-1]:
-            return self._evaluate_row(q, jacobian, distance)
+            return self._evaluate_row(q, jacobian, distance, enough)
         x = np.empty((*lead, m))
         J = np.empty((*lead, m, n)) if jacobian else None
         d = np.empty(lead) if distance else None
-        self._fill(q, [(x, m), (J, m * n), (d, 1)])
+        self._fill(q, [(x, m), (J, m * n), (d, 1)], enough)
         return x, J, d
 
-    def _evaluate_row(self, q: NDArray, jacobian: bool, distance: bool) -> Results:
+    def _evaluate_row(
+        self, q: NDArray, jacobian: bool, distance: bool, enough: float
+    ) -> Results:
         """Return the results of one row (..., n), quickly: they share an array."""
         lead = q.shape[:-1]
         n, m = self._sizes
@@ -240,7 +255,7 @@ class Program:
         at_J = at_x + 8 * m if jacobian else None
         at_d = at_x + 8 * end if distance else None
         row = np.asarray(q, np.float64).tobytes()
-        self._evaluate(call.place, row, 1, at_x, at_J, at_d)
+        self._evaluate(call.place, row, 1, at_x, at_J, at_d, enough)
         results = call.results.copy()
         J = None
         d = None
@@ -250,14 +265,18 @@ class Program:
             d = results[end:].reshape(lead)
         return results[:m].reshape(*lead, m), J, d
 
-    def domain(self, q: NDArray, slope: bool = False) -> tuple[NDArray, NDArray | None]:
+    def domain(
+        self, q: NDArray, slope: bool = False, enough: float = 0.0
+    ) -> tuple[NDArray, NDArray | None]:
         """Return the domain distance (...) at q (..., n), and its gradient (..., n) or None."""
         d = np.empty(q.shape[:-1])
         slopes = np.empty(q.shape) if slope else None
-        self._fill(q, [(None, 0), (slopes, self._sizes[0]), (d, 1)])
+        self._fill(q, [(None, 0), (slopes, self._sizes[0]), (d, 1)], enough)
         return d, slopes
 
-    def _fill(self, q: NDArray, results: list[tuple[NDArray | None, int]]) -> None:
+    def _fill(
+        self, q: NDArray, results: list[tuple[NDArray | None, int]], enough: float
+    ) -> None:
         n = self._sizes[0]
         if q.shape[-1] != n:
             raise ValueError(f"`q` must have shape (..., {n}), got {q.shape}.")
@@ -273,7 +292,9 @@ class Program:
                 if a is not None:
                     at = address(a) + 8 * width * start
                 places.append(at)
-            self._evaluate(self._call.place, at_q + 8 * n * start, count, *places)
+            self._evaluate(
+                self._call.place, at_q + 8 * n * start, count, *places, enough
+            )
 
         in_chunks(q.size // n, run)
 
@@ -442,6 +463,7 @@ def evaluate(
     value: bool = True,
     jacobian: bool = False,
     distance: bool = False,
+    enough: float = 0.0,
 ) -> tuple[NDArray, ...]:
     """Return the requested results of a model for NumPy rows, by the compiled core if it can.
 
@@ -457,6 +479,9 @@ def evaluate(
         Whether to compute dx/dq.
     distance : bool, default=False
         Whether to compute the domain distance; 1 is the edge of the domain.
+    enough : float, default=0.0
+        Instead of a distance up to this, any number between the two may be returned, which takes
+        less time.
 
     Returns
     -------
@@ -476,8 +501,8 @@ def evaluate(
     program = _present_program(model)
     if program is not None:
         if not (value or jacobian):
-            return (program.domain(q)[0],)
-        results = program.evaluate(q, jacobian, distance)
+            return (program.domain(q, enough=enough)[0],)
+        results = program.evaluate(q, jacobian, distance, enough)
         return tuple([part for part in results if part is not None])
     rows = torch.from_numpy(np.require(q, requirements="W"))
     results = []

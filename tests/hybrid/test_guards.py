@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 import torch
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 from sklearn.linear_model import LinearRegression
 from torch.testing import assert_close
 
 from hybridkin import ConstantCurvatureChain, ELMRegressor, HybridForwardModel
 from hybridkin.hybrid._guards import GroupDistance, LeverageGuard, QuadraticLeverage
+from hybridkin.native import evaluate
 
 LONGEST = torch.tensor(0.01).double()
 
@@ -74,6 +75,27 @@ def test_a_leverage_of_low_rank_keeps_distances_and_weights(alpha):
 def test_a_leverage_whose_low_rank_would_cancel_digits_stays_as_it_is():
     q, full = network_guard(1e-9)
     assert full.of_low_rank(q) is full
+
+
+@pytest.mark.needs_core
+def test_the_domain_needs_no_exact_distance_inside():
+    q = rows(300, 9).numpy()
+    chain = ConstantCurvatureChain([0.05] * 3)
+    model = HybridForwardModel(chain, ELMRegressor(120, random_state=0), random_state=0)
+    lengths = 0.2 + 0.05 * q
+    model.fit(lengths, chain(torch.from_numpy(lengths)).numpy() + 0.01 * q[:, :3] ** 2)
+    at = 0.2 + 0.08 * rows(400, 9, seed=3).numpy()
+    at = at[model.module_.domain_distance(torch.from_numpy(at)).argsort()]
+    exact = evaluate(model.module_, at, value=False, distance=True)[0]
+    (enough,) = evaluate(model.module_, at, value=False, distance=True, enough=1.0)
+    inside = exact <= 1.0
+    assert 40 < inside.sum() < 360
+    assert_array_equal(enough <= 1.0, inside)
+    assert_allclose(enough[~inside], exact[~inside], rtol=1e-12)
+    assert (enough[inside] >= exact[inside] - 1e-12).all()
+    assert (enough[inside] > 1.01 * exact[inside]).any()
+    assert_array_equal(model.in_domain(at), inside)
+    assert_array_equal([model.in_domain(row[None])[0] for row in at], inside)
 
 
 def two_lines(n_rows=11):

@@ -54,13 +54,13 @@ int main(int argc, char **argv) {
             block[k] = filled(NULL, sizeof **block, lengths[k]);
         }
         for (size_t i = 0; i < N; i++) {
-            hk_evaluate(&call, q + i * n, 1, NULL, one[3] + i * n, one[2] + i);
-            hk_evaluate(&call, q + i * n, 1, one[0] + i * m, one[1] + i * m * n, one[2] + i);
+            hk_evaluate(&call, q + i * n, 1, NULL, one[3] + i * n, one[2] + i, 0.0);
+            hk_evaluate(&call, q + i * n, 1, one[0] + i * m, one[1] + i * m * n, one[2] + i, 0.0);
         }
-        hk_evaluate(&call, q, count, NULL, block[3], block[2]);
-        hk_evaluate(&call, q, count, block[0], NULL, NULL);
+        hk_evaluate(&call, q, count, NULL, block[3], block[2], 0.0);
+        hk_evaluate(&call, q, count, block[0], NULL, NULL, 0.0);
         worst[0] = fmax(worst[0], difference(one[0], block[0], lengths[0]));
-        hk_evaluate(&call, q, count, block[0], block[1], block[2]);
+        hk_evaluate(&call, q, count, block[0], block[1], block[2], 0.0);
         for (int k = 0; k < 4; k++) {
             worst[k] = fmax(worst[k], difference(one[k], block[k], lengths[k]));
             free(one[k]);

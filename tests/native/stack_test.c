@@ -80,7 +80,7 @@ typedef struct {
 static call_t call;
 static int64_t rows;
 static double *q, *x, *J, *distance;
-static void (*evaluate)(const call_t *, const double *, int64_t, double *, double *, double *);
+static void (*evaluate)(const call_t *, const double *, int64_t, double *, double *, double *, double);
 static int32_t (*tick)(const call_t *);
 static void (*steps)(const call_t *, int64_t, int32_t, const double *, const double *,
                      const double *, const double *, const double *, double *, unsigned char *);
@@ -90,14 +90,14 @@ static void (*look)(const call_t *, int64_t, const double *, double *, double *)
 static const double tolerance = 1e-9;
 
 static void *value(void *count) {
-    return evaluate(&call, q, *(int64_t *)count, x, NULL, NULL), NULL;
+    return evaluate(&call, q, *(int64_t *)count, x, NULL, NULL, 0.0), NULL;
 }
-static void *slope(void *count) { return evaluate(&call, q, *(int64_t *)count, x, J, NULL), NULL; }
+static void *slope(void *count) { return evaluate(&call, q, *(int64_t *)count, x, J, NULL, 0.0), NULL; }
 static void *all(void *count) {
-    return evaluate(&call, q, *(int64_t *)count, x, J, distance), NULL;
+    return evaluate(&call, q, *(int64_t *)count, x, J, distance, 0.0), NULL;
 }
 static void *domain(void *count) {
-    return evaluate(&call, q, *(int64_t *)count, NULL, J, distance), NULL;
+    return evaluate(&call, q, *(int64_t *)count, NULL, J, distance, 0.0), NULL;
 }
 static void *ticks(void *none) { return tick(&call), none; }
 static void *many_steps(void *none) {

@@ -92,10 +92,10 @@ static void hk_block(const hk_plan *p, int at, V *work, const real *q, int rows,
 }
 
 /* x (rows, m), J (rows, m, n) and domain distances (rows) of q (rows, n); NULL: no J, no distance.
-   Where x is NULL, the distances alone, and their slopes (rows, n) in J. */
+   Where x is NULL, the distances alone, and their slopes (rows, n) in J. For `enough` see hk_plan. */
 HK_API void hk_evaluate(const hk_call *call, const real *q, int64_t rows, real *x, real *J,
-                        real *distance) {
-    const hk_plan plan = {call->code, call->data, R(0.0)};
+                        real *distance, real enough) {
+    const hk_plan plan = {call->code, call->data, enough};
     const int at = (int)call->at, n = plan.code[at + HK_N], m = x ? plan.code[at + HK_M] : 1;
     if (rows == 1 && !x)
         hk_domain(&plan, at, q, distance, J, call->work);

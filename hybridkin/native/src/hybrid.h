@@ -184,7 +184,8 @@ static inline void HK(farthest)(const hk_plan *p, int at, const V *q, V *distanc
     for (int j = 0; slope && j < n; j++) slope[j] = SPLAT(0.0);
     for (int c = 0; c < count; c++, part += HK_STRIDE) {
         if (part[HK_GUARD] < 0) continue;
-        const V here = HK(guard_distance)(p, part[HK_GUARD], p->enough, q, &seen, work);
+        const real enough = slope ? R(0.0) : p->enough;
+        const V here = HK(guard_distance)(p, part[HK_GUARD], enough, q, &seen, work);
         const M farther = NOT(here <= *distance);
         *distance = SELECT(farther, here, *distance);
         if (!slope || !HK(any)(farther)) continue;
