@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -36,13 +37,17 @@ class Loop:
     progress: Callable[[int, int], None] | None = None
 
 
-def followed(settings: StepSettings, q0: Tensor, path: Path, loop: Loop) -> Track:
-    """Return the track from one start (n,)."""
+def followed(
+    settings: StepSettings, q0: Tensor, path: Path, loop: Loop, state: Any = None
+) -> Track:
+    """Return the track from one start (n,), with the state of hysteresis there."""
     task = settings.task
     start = settings.configurations(q0, "q0", path.points)
     target = path.points.to(start.dtype)
     command = as_array(start) if path.as_numpy else start
     tracker = Tracker(settings, command, path.tol, loop.memory)
+    if state is not None:
+        tracker.reset(command, state)
     q, effective, x, measured, sigma_min, held, damped = tracker.follow(
         target, path.periods, loop.plant, loop.feedback, loop.progress
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from inspect import signature
+from typing import Any
 
 import numpy as np
 import torch
@@ -489,6 +490,7 @@ class InverseKinematics:
         memory: float | None = None,
         tol: float | None = None,
         progress: Callable[[int, int], None] | None = None,
+        state: Any = None,
     ) -> Track:
         """Return the motion that follows a path, one step per point, eq. (1).
 
@@ -522,6 +524,8 @@ class InverseKinematics:
             of its measurement nor the change of the model's error during the step.
         progress : callable, optional
             Called as ``progress(i, T)`` before point i.
+        state : tuple, optional
+            State of the hysteresis at one start, see `Tracker.reset`. Default: without hysteresis.
 
         Returns
         -------
@@ -563,7 +567,8 @@ class InverseKinematics:
         if starts is not None and starts.ndim == 1:
             for message in settings.far_messages(target, "path"):
                 warnings.warn(message, stacklevel=3)
-            return followed(settings, starts, timed, loop)
+            return followed(settings, starts, timed, loop, state)
+        require(state is None, "`state` requires `q0` of shape (n,), one start.")
         # The start is chosen on the model alone: the robot moves once.
         alone = plant is None and feedback == "model"
         on_model = Loop(progress=progress if alone else None)

@@ -225,19 +225,29 @@ class Domain:
     def solver(
         self, q_pref: Posture | None = None, dt: float = 0.01
     ) -> InverseKinematics:
-        """Return inverse kinematics within the limits; default of `q_pref`: `preferred`."""
+        """Return inverse kinematics within the limits; default of `q_pref`: `preferred`.
+
+        With hysteresis the limits of q are those of the commands.
+        """
         limits = self.limits
         if q_pref is None:
             q_pref = self.preferred
+        q_min, q_max = self.of_commands
         return InverseKinematics(
-            self.loaded.module,
-            q_min=limits.q_min,
-            q_max=limits.q_max,
+            self.loaded.model,
+            q_min=q_min,
+            q_max=q_max,
             dq_max=limits.dq_max,
             ddq_max=limits.ddq_max,
             q_pref=q_pref,
             dt=dt,
         )
+
+    @property
+    def of_commands(self) -> tuple[NDArray, NDArray]:
+        """Limits of commands, which lead what the actuators do by up to half the width."""
+        half = self.loaded.half_play
+        return self.limits.q_min - half, self.limits.q_max + half
 
     def postures(self, n: int) -> NDArray:
         """Return at most n commands from the whole range of the limits; tendons are balanced.

@@ -81,7 +81,7 @@ def export_model(
 
 
 def _about_q(loaded: LoadedModel) -> str:
-    """Return unit, sign and backlash of q in sentences, as a controller must know them."""
+    """Return unit, sign and hysteresis of q in sentences, as a controller must know them."""
     log = loaded.log_format()
     factors = np.broadcast_to(log.q_factor, len(log.q))
     terms = []
@@ -92,7 +92,6 @@ def _about_q(loaded: LoadedModel) -> str:
     if loaded.play is None:
         return about_q
     return (
-        f"{about_q} The robot has backlash (play) of {loaded.play.width.tolist()}, in the unit of "
-        "q, for which this code does not compensate: q is the motion of the actuators, and "
-        "`model.play_.command` in Python shows the commands to send."
+        f"{about_q} The robot has hysteresis (play) of a width of {loaded.play.width.tolist()}, in "
+        "the unit of q. x(q) is that of what the actuators do; steps return commands for it."
     )

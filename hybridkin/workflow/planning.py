@@ -88,7 +88,7 @@ def next_rows(
     target = None
     where = "within the limits"
     if path is not None:
-        target = best_track(domain, path, _TOL, progress).q
+        target = best_track(domain, path, _TOL, progress).effective
         candidates = np.concatenate([target, candidates])
         far = distance(loaded.tips(target), path.x).max()
         where = f"along the path, which the model reaches to within {millimetres(far)}"

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -108,7 +109,7 @@ def _write(report: Report[TrackRecord], loaded: LoadedModel, better: str) -> Non
     )
     if record.play is not None:
         report.text(
-            f"Backlash (play) {millimetres(max(record.play))}: a command jumps by it when its "
+            f"Backlash (play) {millimetres(max(record.play))}: a command crosses it when its "
             "actuator reverses. Send q; effective_... is the motion of the actuators."
         )
     if loaded.plane_in_words():
@@ -183,8 +184,12 @@ def track_path(
     check_reach(domain, path, tol, force, progress)
     track = best_track(domain, path, tol, progress)
     statuses = [IKStatus(int(code)).name for code in track.status]
-    whole, n_lead = _with_lead_in(track, stands, domain)
-    inside = loaded.domain_distance(track.q) <= 1.0
+    lead_in = _lead_in(track, stands, domain)
+    n_lead = len(lead_in) - 1
+    if loaded.play is not None and n_lead > 0:
+        track = best_track(domain, path, tol, progress, lead_in)
+    whole = _with_lead_in(track, lead_in[:-1], loaded)
+    inside = loaded.domain_distance(track.effective) <= 1.0
     better = ""
     if loaded.hybrid is not None and inside.mean() < 1.0 - _MOST_OUTSIDE:
         better = f": {better_place(domain, path, tol)}"
@@ -195,16 +200,16 @@ def track_path(
         errors=Errors.of(track.error),
         statuses=dict(Counter(statuses)),
         in_domain=None if loaded.hybrid is None else float(inside.mean()),
-        expected=_expected(loaded, track.q[inside]),
+        expected=_expected(loaded, track.effective[inside]),
         play=play_widths(loaded.hybrid),
         lead_in=n_lead,
         limits=domain.limits,
     )
     report = Report(f"{loaded.name}: a path of {len(path)} points", record)
     _write(report, loaded, better)
-    commands = {"command": loaded.commands(whole.q)}
+    commands = {"command": whole.q}
     if loaded.play is not None:
-        commands["actuator"] = whole.q
+        commands["actuator"] = whole.effective
     _add_path(report, loaded, track)
     _add_commands(report, domain, whole.t, commands, n_lead)
     rows = partial(
@@ -249,16 +254,20 @@ def _start(domain: Domain, start: ArrayLike | str) -> NDArray | None:
     return q
 
 
-def _with_lead_in(
-    track: Track, start: NDArray | None, domain: Domain
-) -> tuple[Track, int]:
-    """Return a track that begins at `start`, and the number of rows from there to the path.
+def _lead_in(track: Track, start: NDArray | None, domain: Domain) -> NDArray:
+    """Return the commands (N + 1, n) from `start` to a track, of which the last is its first.
 
-    These rows begin and end at rest; their targets are the tips of the model.
+    They begin and end at rest.
     """
+    if start is None:
+        return track.q[:1]
     limits = domain.limits
-    way = np.zeros_like(track.q[0]) if start is None else track.q[0] - start
-    dt = float(track.t[1] - track.t[0]) if len(track.t) > 1 else _DT
+    end = track.effective[0]
+    play = domain.loaded.play
+    if play is not None:
+        end = play.command(np.stack([start, end]))[0][1].clip(*domain.of_commands)
+    way = end - start
+    dt = _period(track)
     speed = limits.dq_max
     if speed is None:
         speed = _SLOW * max(limits.span.max(), np.abs(way).max())
@@ -268,26 +277,51 @@ def _with_lead_in(
         seconds = np.sqrt(_PUSH * np.abs(way) / limits.ddq_max).max()
         moves = max(moves, math.ceil(seconds / dt))
         n = moves + 1  # the path begins at rest
-    left = 1.0 - trajectories.min_jerk(np.arange(n) / max(moves, 1))
-    q = track.q[0] - left[:, None] * way
-    x = domain.loaded.tips(q)
-    whole = replace(
+    left = 1.0 - trajectories.min_jerk(np.arange(n + 1) / max(moves, 1))
+    left[n] = 0.0
+    return end - left[:, None] * way
+
+
+def _period(points: Track | Trajectory) -> float:
+    """Return the time between two points [s]."""
+    return float(points.t[1] - points.t[0]) if len(points.t) > 1 else _DT
+
+
+def _with_lead_in(track: Track, lead_in: NDArray, loaded: LoadedModel) -> Track:
+    """Return a track after other commands (N, n); the targets of these are the model's tips."""
+    n = len(lead_in)
+    dt = _period(track)
+    effective = lead_in
+    if loaded.play is not None and n > 0:
+        effective, _ = loaded.play.apply(lead_in, None, dt)
+    x = loaded.tips(effective)
+    return replace(
         track,
         t=np.concatenate([track.t[0] + dt * np.arange(n), track.t + n * dt]),
-        q=np.concatenate([q, track.q]),
-        effective=np.concatenate([q, track.effective]),
+        q=np.concatenate([lead_in, track.q]),
+        effective=np.concatenate([effective, track.effective]),
         x=np.concatenate([x, track.x]),
         target=np.concatenate([x, track.target]),
         error=np.concatenate([np.zeros(n), track.error]),
     )
-    return whole, n
 
 
 def best_track(
-    domain: Domain, path: Trajectory, tol: float, progress: Progress
+    domain: Domain,
+    path: Trajectory,
+    tol: float,
+    progress: Progress,
+    lead_in: NDArray | None = None,
 ) -> Track:
-    """Return the track of several attempts that reaches most points in the domain."""
+    """Return the track of several attempts that reaches most points in the domain.
+
+    After the commands `lead_in` (N + 1, n) it starts at the last of them, with its hysteresis.
+    """
     commands, tips = domain.sample
+    state = None
+    if lead_in is not None and domain.loaded.play is not None:
+        commands = lead_in[-1]
+        _, state = domain.loaded.play.apply(lead_in, None, _period(path))
     way = np.linalg.norm(np.diff(path.x, axis=0), axis=1).max(initial=0.0)
     extent = np.linalg.norm(np.ptp(tips, axis=0))
     every = max(1, math.ceil(way / (_STEP * extent)))
@@ -302,9 +336,9 @@ def best_track(
         ) -> None:
             progress(what, done + 1, total)
 
-        track = ik.track(fine, q0=commands, tol=tol, progress=report)
+        track = ik.track(fine, q0=commands, tol=tol, progress=report, state=state)
         # Only the points are kept, not the steps between them.
-        tracks.append(_thinned(track, every))
+        tracks.append(_after_commands(_thinned(track, every), domain.loaded, state))
         if score(tracks[-1]) == (len(path), len(path)):
             break
     return max(tracks, key=score)  # of equal tracks the first
@@ -320,6 +354,17 @@ def _thinned(track: Track, every: int) -> Track:
     """Return every k-th row of a track."""
     rows = {name: a[::every] for name, a in vars(track).items() if a is not None}
     return replace(track, **rows)
+
+
+def _after_commands(track: Track, loaded: LoadedModel, state: Any) -> Track:
+    """Return a track with what the actuators do if they get only its commands."""
+    if loaded.play is None:
+        return track
+    steps = np.diff(track.t, prepend=track.t[0])
+    effective, _ = loaded.play.apply(track.q, state, steps)
+    x = loaded.tips(effective)
+    error = np.linalg.norm(x - track.target, axis=1)
+    return replace(track, effective=effective, x=x, error=error)
 
 
 def read_track(path: str | Path, log_format: LogFormat) -> Log:
@@ -383,7 +428,7 @@ def _add_path(report: Report[TrackRecord], loaded: LoadedModel, track: Track) ->
     i, j = sorted(np.argsort(np.ptp(track.target, axis=0))[1:])
     display.plot(axes[0], unit="mm", plane="xyz"[i] + "xyz"[j])
     display.plot_time(axes[1], unit="mm")
-    errors = loaded.expected_errors(track.q)
+    errors = loaded.expected_errors(track.effective)
     expected = {f"robot, {name}": values for name, values in errors.items()}
     display.plot_error(axes[2], unit="mm", expected=expected)
     caption = "Path and tip by the model; error of the solver"
@@ -409,8 +454,7 @@ def _add_commands(
     figure, axes = hybridkin.plots.new_figure(
         7.0, 1.0 + 1.8 * n, n, 1, sharex=True, squeeze=False
     )
-    low = domain.limits.q_min - loaded.half_play
-    high = domain.limits.q_max + loaded.half_play
+    low, high = domain.of_commands
     display = hybridkin.plots.ActuatorDisplay(
         commands, counts, t, names=log_format.q, limits=np.stack([low, high])
     )

@@ -174,11 +174,14 @@ def test_code_and_trackers_tell_unit_sign_and_backlash_of_q(playful, tmp_path, c
     for text in (printed, *((out / name).read_text() for name in ("README.md", "robot.h"))):
         text = " ".join(text.split())
         assert f"log in mm: q[0] = -0.001 * {COLUMNS[0]}, q[1] = -0.001 * {COLUMNS[1]}" in text
-        assert "backlash (play) of 0.0004" in text
+        assert "hysteresis (play) of a width of 0.0004" in text
+    assert "what the actuators do" in (out / "robot.h").read_text()
     model = load_model(playful / "model.safetensors")
     ik = hybridkin.InverseKinematics(model, q_min=-0.005, q_max=0.005)
-    with pytest.warns(UserWarning, match=r"backlash \(play\) of 0.0004"):
-        ik.tracker(np.zeros(6))
+    tracker = ik.tracker(np.zeros(6))
+    assert tracker.backend == "compiled"
+    tracker.step(tracker.x + np.array([0.002, 0.0, 0.0]))
+    assert np.abs(tracker.q - tracker.effective).max() == pytest.approx(2e-4)
 
 
 @pytest.mark.slow
@@ -193,6 +196,12 @@ def test_track_with_play_tells_what_to_send_and_what_it_does(playful, tmp_path, 
     np.testing.assert_allclose(PlayOperator(4e-4).apply(sent)[0], does, atol=1e-10)
     assert np.abs(sent - does).max() == pytest.approx(2e-4)
     assert np.abs(sent).max() <= 0.006
+    steps = np.abs(np.diff(sent, axis=0))
+    slow = ["--dq-max", "6", "--out", tmp_path / "slow", "--force"]
+    document(capsys, "track", playful, *shape, *slow)
+    table_of = np.genfromtxt(tmp_path / "slow" / "track.csv", delimiter=",", names=True, dtype=None)
+    slow_steps = np.diff(np.column_stack([table_of[name] for name in COLUMNS]), axis=0)
+    assert np.abs(slow_steps).max() <= 6 * 0.05 * (1 + 1e-6) < 1e3 * steps.max()
     target = 1e-3 * np.column_stack([table["target_" + axis] for axis in "xyz"])
     model = load_model(playful / "model.safetensors")
     assert np.linalg.norm(model.predict(sent) - target, axis=1).max() < 1e-4
