@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import torch
+from operators import operators
 from sklearn.base import clone
 from sklearn.linear_model import LinearRegression
 
@@ -103,7 +104,7 @@ ERROR_MODELS = {
 FACTORS = {
     "robot": tuple(ROBOTS),
     "markers": ("tip", "two", "two, some missing"),
-    "play": ("none", "width", "auto"),
+    "play": ("none", "width", "operator", "auto"),
     "error_model": tuple(ERROR_MODELS),
     "coupling": ("parallel", "serial"),
     "output": ("position", "pose"),
@@ -251,7 +252,7 @@ def fitted(case):
         coupling=case["coupling"],
         calibrate=calibrate[case["calibrate"]],
         guard=case["guard"],
-        play={"none": None, "width": 0.1 * robot.half, "auto": "auto"}[case["play"]],
+        play=play_of(case["play"], robot),
         output=case["output"],
         random_state=0,
     )
@@ -265,6 +266,13 @@ def fitted(case):
     if "drifted" in case["change"]:
         model.partial_fit(log.q[:20], log.x[:20] + 0.002)
     return Fitted(model, unchanged, log, robot)
+
+
+def play_of(play, robot):
+    """Return the argument `play` of a model: none, a width, an operator, or "auto"."""
+    if play == "operator":
+        return operators(robot.n, 0.1 * robot.half)["plays, creep"]
+    return {"none": None, "width": 0.1 * robot.half, "auto": "auto"}[play]
 
 
 def name_of(case):
@@ -418,6 +426,30 @@ def test_what_a_solve_says_of_its_error_is_true(crossing):
     np.testing.assert_allclose(solution.error, error, rtol=0, atol=1e-7)
     assert (np.asarray(solution.q) >= q_min - 1e-9 * robot.half).all()
     assert (np.asarray(solution.q) <= q_max + 1e-9 * robot.half).all()
+
+
+def test_commands_lead_by_the_hysteresis(crossing):
+    _, (model, _, log, robot) = crossing
+    if model.module_.tip_model.n_outputs != 3:
+        return  # outputs without a chain: which of them is the tip is not known
+    q_min, q_max = robot.middle - robot.half, robot.middle + robot.half
+    ik = InverseKinematics(model, q_min=q_min, q_max=q_max, dq_max=10.0 * robot.half)
+    start = log.q[5].astype(float)
+    with torch.no_grad():
+        targets = model.module_.tip_model(torch.from_numpy(log.q[6:12])).numpy()
+    tracker = ik.tracker(start)
+    reference = ik.tracker(torch.from_numpy(start))
+    sent = [start, *(tracker.step(target) for target in targets)]
+    assert (np.min(sent, axis=0) >= q_min).all()
+    assert (np.max(sent, axis=0) <= q_max).all()
+    assert np.abs(np.diff(sent, axis=0)).max() <= (1.0 + 1e-9) * 0.1 * robot.half
+    for target in targets:
+        expected = reference.step(torch.from_numpy(target))
+    np.testing.assert_allclose(tracker.q, expected, rtol=0, atol=1e-6 * robot.half)
+    effective = np.array(sent)
+    if model.play_ is not None:
+        effective, _ = model.play_.apply(effective, dt=0.01)
+    np.testing.assert_allclose(tracker.effective, effective[-1], rtol=0, atol=1e-12 * robot.half)
 
 
 def test_every_factor_meets_every_other():

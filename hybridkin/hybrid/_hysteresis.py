@@ -21,13 +21,13 @@ _PLAIN: dict[str, Any] = {"relevance_rounds": 0, "max_hidden": 0, "random_state"
 
 
 def play_of(
-    play: ArrayLike | str | None, spec: Spec, rows: Rows
+    play: ArrayLike | HysteresisOperator | str | None, spec: Spec, rows: Rows
 ) -> tuple[HysteresisOperator | None, list[str]]:
     """Return the hysteresis for the setting `play` of a HybridForwardModel, and warnings about it.
 
     Parameters
     ----------
-    play : None, "auto", float or array-like of shape (n,)
+    play : None, "auto", float, array-like of shape (n,) or HysteresisOperator
         The setting.
     spec : Spec
         The mechanical model, and its parameters to calibrate first.
@@ -46,7 +46,9 @@ def play_of(
             f"play='auto' found a backlash of {chosen.width:.3g}, as wide as the range of "
             "`X`: the log gives no upper limit. Record larger motions, or give the width as `play`."
         ]
-    operator = PlayOperator(play)
+    operator = play
+    if not isinstance(operator, HysteresisOperator):
+        operator = PlayOperator(operator)
     if operator.width.size not in (1, len(ranges)):
         raise ValueError(
             f"`play` must be a width or {len(ranges)} widths, got {play!r:.200}."

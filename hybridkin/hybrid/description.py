@@ -48,6 +48,7 @@ from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.elm_cv import ELMRegressorCV
 
 # Regressors that a file may name as the setting `error_model`.
+_OPERATOR = "operator"  # `play` was one: that of the fit
 _REGRESSORS = {
     cls.__name__: cls
     for cls in (ELMRegressor, ELMRegressorCV, KernelRidge, LinearRegression)
@@ -78,6 +79,8 @@ def stored_hybrid(model: HybridForwardModel) -> Stored:
     nominal = model.mechanical_model
     params = params_of(model)
     del params["mechanical_model"], params["error_model"]
+    if isinstance(model.play, HysteresisOperator):
+        params["play"] = _OPERATOR
     return Stored.of(
         "hybrid",
         {
@@ -142,7 +145,8 @@ def _friction_of(stored: Stored, n: int) -> HysteresisOperator | None:
     n_dimensions = stored.array("play_width").ndim
     if n_dimensions == 2:
         widths = stored.array("play_width", ("K", 1))[:, 0]
-        slopes = stored.array("play_slopes", (len(widths) - 1, n))
+        shape = (len(widths) - 1, n)[: stored.array("play_slopes").ndim]
+        slopes = stored.array("play_slopes", shape)
         return PrandtlIshlinskiiOperator(widths, slopes)
     shape = () if n_dimensions == 0 else (n,)
     return PlayOperator(stored.array("play_width", shape))
@@ -155,6 +159,8 @@ def hybrid_of(stored: Stored, training: object) -> HybridForwardModel:
     model = estimator_of(HybridForwardModel, stored.value("params", dict))
     if isinstance(model.calibrate, list):
         model.calibrate = tuple(model.calibrate)
+    if model.play == _OPERATOR:
+        model.play = _play_of(stored, n)
     if "nominal" in stored.parts:
         model.mechanical_model = restorer()(stored.part("nominal"))
     model.error_model = stored.value("error_model", (str, dict, None))

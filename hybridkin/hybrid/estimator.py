@@ -24,7 +24,7 @@ from hybridkin.calibration.measured import (
     with_missing_markers,
 )
 from hybridkin.chains.chain import Chain
-from hybridkin.chains.hysteresis import checked_times
+from hybridkin.chains.hysteresis import HysteresisOperator, checked_times
 from hybridkin.chains.markers import MarkedChain
 from hybridkin.hybrid._adapt import (
     PARAMETERS,
@@ -94,13 +94,13 @@ class HybridForwardModel(HybridPredictor):
         None: everywhere. With `groups`, the domain (`in_domain`) also excludes rows where no
         held-out group has tested the model. With a guard, f_hyb differs from f_mech by at most 1.5
         times the longest correction of a training row.
-    play : float, array-like of shape (n,) or "auto", optional
+    play : float, array-like of shape (n,), HysteresisOperator or "auto", optional
         Backlash (also called play) of the actuators [unit of q]. Rows are then commands in order of
         time, and the model maps the motion of the actuators, see `PlayOperator`. "auto" chooses by
         the error on held-out groups: nothing, a `PlayOperator`, a `PrandtlIshlinskiiOperator`, or
         a `CreepOperator`, alone or after one of them (`HysteresisSeries`). Each run of the log
-        starts without hysteresis, see `fit`. Inverse kinematics finds the motion of the actuators;
-        ``play_.command`` gives the commands for it. Default: no backlash, rows in any order.
+        starts without hysteresis, see `fit`. An operator is taken as it is. Trackers send commands
+        that lead by it. Default: no backlash, rows in any order.
     coverage : float, optional
         Share of tips, 0.9 for example, within the radius of ``predict(Q, return_radius=True)``, if
         new groups are like those of the log. It needs ``coverage / (1 - coverage)`` groups, 9 for
@@ -182,7 +182,7 @@ class HybridForwardModel(HybridPredictor):
         coupling: str = "parallel",
         calibrate: Sequence[str] | str | None = None,
         guard: str | None = "leverage",
-        play: ArrayLike | str | None = None,
+        play: ArrayLike | HysteresisOperator | str | None = None,
         coverage: float | None = None,
         output: str = "position",
         random_state: int | np.random.RandomState | None = None,
