@@ -298,9 +298,12 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if self._chain is not None:
             self._plausible_rows = self._chain.plausible_rows()
 
-    def _tips(self, q: NDArray, **results: float) -> tuple[NDArray, ...]:
+    def _tips(
+        self, q: NDArray, enough: float = 0.0, **results: bool
+    ) -> tuple[NDArray, ...]:
         """Return the tips of rows q (N, n), or other `results` of `evaluate`."""
-        return evaluate(in_columns(self.module_, self.output), q, **results)
+        model = in_columns(self.module_, self.output)
+        return evaluate(model, q, enough=enough, **results)
 
     def _mechanical_tips(self, q: NDArray) -> tuple[NDArray, ...]:
         """Return f_mech(q) of rows q (N, n), zero without a mechanical model."""
