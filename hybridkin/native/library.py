@@ -381,8 +381,12 @@ class _Compiled:
         """Return the present values of the settings."""
         return [attributes.get(name) for attributes, name in self.settings]
 
-    def holds(self) -> bool:
-        """Return whether the model is still the same, but for tensors that the plan shares."""
+    def holds(self, copies: bool) -> bool:
+        """Return whether the model is still the same.
+
+        The program itself sees writes to the tensors that it shares. So they are only compared for
+        those who have copies of the plan.
+        """
         try:
             if self.dicts != self.parts:  # identity first; else tensors are compared
                 return False
@@ -393,11 +397,8 @@ class _Compiled:
             and self.content == self.views
             and [*map(Tensor.data_ptr, self.tensors)] == self.places
             and [*map(Tensor.stride, self.strided)] == self.strides
+            and not (copies and self.shared_content != self.shared_views)
         )
-
-    def is_same(self) -> bool:
-        """Return whether the model is still the same."""
-        return self.holds() and self.shared_content == self.shared_views
 
 
 def _memory(a: Tensor) -> memoryview:
@@ -428,32 +429,17 @@ def _check_classes(modules: list[torch.nn.Module]) -> None:
             raise NoKernel(f"a {type(module).__name__} has no kernel")
 
 
-def program_of(model: ForwardModel) -> Program | None:
+def program_of(model: ForwardModel, copies: bool = True) -> Program | None:
     """Return the program of a model, or None if torch computes it; see `backend`.
 
-    The model keeps its program until a buffer or a submodule changes.
+    The model keeps its program until a buffer or a submodule changes. Without `copies` of the plan,
+    also while large buffers change that the program shares, which takes less time to find out.
     """
     compiled = model.__dict__.get("_program")
-    if compiled is None or not compiled.is_same():
-        return _compiled_anew(model)
-    return compiled.program
-
-
-def _present_program(model: ForwardModel) -> Program | None:
-    """Return a program that is right at present, faster than `program_of`.
-
-    It can be that of before if a tensor has changed that it shares.
-    """
-    compiled = model.__dict__.get("_program")
-    if compiled is None or not compiled.holds():
-        return _compiled_anew(model)
-    return compiled.program
-
-
-def _compiled_anew(model: ForwardModel) -> Program | None:
-    if library() is None:
-        return None
-    compiled = model.__dict__["_program"] = _Compiled(model)
+    if compiled is None or not compiled.holds(copies):
+        if library() is None:
+            return None
+        compiled = model.__dict__["_program"] = _Compiled(model)
     return compiled.program
 
 
@@ -498,7 +484,7 @@ def evaluate(
     ((2, 3), (2, 3, 3))
     """
     q = np.asarray(q, np.float64)
-    program = _present_program(model)
+    program = program_of(model, copies=False)
     if program is not None:
         if not (value or jacobian):
             return (program.domain(q, enough=enough)[0],)
