@@ -15,7 +15,7 @@ from hybridkin.chains.hysteresis import HysteresisOperator
 
 _CLOSE = 0.002  # tolerance of a refined width, relative to it
 _LEAST = 0.0025  # first width, relative to the stroke
-_LEAST_GAIN = 0.02  # relative to the error
+_LEAST_GAIN = 0.01  # relative to the error
 # Standard deviations of the priors of slopes and gains, from few to many free weights.
 _NONE = 0.0, 0.0
 _CREEP = 0.0, 0.2
@@ -41,7 +41,7 @@ class WidthSearch:
     gain_std_error : float
         Standard error of `gain` over the motions [m].
     kept : bool
-        Whether the play lowers the error: `gain` is above `gain_std_error` and 2 % of the error.
+        Whether the play lowers the error: `gain` is above `gain_std_error` and 1 % of the error.
     """
 
     width: float
@@ -105,7 +105,7 @@ def find_hysteresis(log: HysteresisLog) -> HysteresisOperator | None:
 
     Tried are no friction, one backlash of the best width, and Prandtl-Ishlinskii operators about
     this width, each with and without creep. The simplest is taken to which the one of least error
-    has no clear gain: a mean gain over the groups above its standard error, and above 2 % of the
+    has no clear gain: a mean gain over the groups above its standard error, and above 1 % of the
     error, which the linear correction can feign.
 
     Parameters

@@ -41,7 +41,7 @@ class PlayFit(WidthSearch):
     gain_std_error : float
         Standard error of `gain` over the motions [m].
     kept : bool
-        Whether the play lowers the error: `gain` is above `gain_std_error` and 2 % of the error.
+        Whether the play lowers the error: `gain` is above `gain_std_error` and 1 % of the error.
     result : CalibrationResult
         The calibration on all rows with the chosen width.
     """
@@ -68,7 +68,7 @@ def fit_play(
     The chain is calibrated without play. For every width, a linear correction inside it is fitted
     to the training motions and evaluated on the held-out motions, in at most 5 folds. The best
     width is kept only if its mean gain over zero play exceeds the standard error of the gain, and
-    2 % of the error. Then the chain is calibrated again; only this issues warnings.
+    1 % of the error. Then the chain is calibrated again; only this issues warnings.
 
     Parameters
     ----------

@@ -35,6 +35,11 @@ class HysteresisOperator(ABC, Generic[_State]):
     kind: str
     width: NDArray
 
+    @property
+    def parts(self) -> tuple[HysteresisOperator, ...]:
+        """The operators in series that it consists of."""
+        return (self,)
+
     def apply(
         self, q: Any, state: _State | None = None, dt: ArrayLike = 1.0
     ) -> tuple[Any, _State]:

@@ -59,7 +59,7 @@ class PlayOperator(HysteresisOperator[PlayState]):
     array([ 0.75, -0.25])
     """
 
-    kind = "backlash (play)"
+    kind = "backlash"
 
     def __init__(self, width: ArrayLike) -> None:
         self.width = real_array(width, "width").astype(float)

@@ -67,6 +67,11 @@ class HysteresisSeries(HysteresisOperator[tuple]):
         return f"HysteresisSeries({list(self.operators)})"
 
     @property
+    def parts(self) -> tuple[HysteresisOperator, ...]:
+        """The operators."""
+        return self.operators
+
+    @property
     def _size(self) -> int | str:
         return self._actuators
 

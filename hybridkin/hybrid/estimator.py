@@ -566,6 +566,7 @@ def fit_quietly(
     y: NDArray,
     groups: ArrayLike | None = None,
     *,
+    time: ArrayLike | None = None,
     geometry: GeometryChoice | None = None,
     progress: Callable[[int, int], None] | None = None,
     held_out: bool = True,
@@ -577,7 +578,7 @@ def fit_quietly(
     ----------
     model : HybridForwardModel
         The estimator; it is fitted in place.
-    X, y, groups
+    X, y, groups, time
         As for its `fit`.
     geometry : GeometryChoice, optional
         What to calibrate. Default: chosen on the rows.
@@ -589,7 +590,7 @@ def fit_quietly(
     log : tuple of ndarray, optional
         All rows (q, x) of the log, if X and y are some of them: all count as fitted.
     """
-    messages = model._fit(X, y, None, groups, None, None, geometry, progress, held_out)
+    messages = model._fit(X, y, None, groups, None, time, geometry, progress, held_out)
     if log is not None:
         model._fitted_rows = np.unique(row_digests(*log))
     return messages

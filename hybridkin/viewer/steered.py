@@ -173,7 +173,9 @@ class SteeredRobot:
         tips = log.x[:, -3:]
         measured = np.isfinite(log.q).all(axis=1) & np.isfinite(tips).all(axis=1)
         groups = None if log.groups is None else np.asarray(log.groups)[measured]
-        return self.loaded.effective(log.q[measured], groups), tips[measured]
+        time = None if log.time is None else np.asarray(log.time)[measured]
+        q = self.loaded.effective(log.q[measured], groups, time)
+        return q, tips[measured]
 
     def commands(self) -> NDArray:
         """Return the commands (T, n) since the start, at most ten minutes, in the log's unit.

@@ -1,4 +1,4 @@
-"""What a fitted hybrid chose by itself: its error model and backlash, in words."""
+"""What a fitted hybrid chose by itself: its error model and hysteresis, in words."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 from hybridkin.hybrid.cv_results import CvResults
 from hybridkin.hybrid.estimator import HybridForwardModel
 from hybridkin.learning.elm_cv import ELMRegressorCV
-from hybridkin.workflow.model import play_widths
+from hybridkin.workflow.model import hysteresis_in_words
 from hybridkin.workflow.report import millimetres
 
 
@@ -37,7 +37,7 @@ def _weights(results: CvResults) -> dict[str, float]:
 
 
 def _auto_in_short(model: HybridForwardModel, results: CvResults) -> str:
-    """Return the parts, the calibrated parameters and the backlash that "auto" chose."""
+    """Return the parts, the calibrated parameters and the hysteresis that "auto" chose."""
     weights = _weights(results)
     words = next(iter(weights))
     if len(weights) > 1:
@@ -45,9 +45,8 @@ def _auto_in_short(model: HybridForwardModel, results: CvResults) -> str:
         words = f"blend of {', '.join(parts)}"
     if len(results["mechanical_model"]) > 1:
         words += f" on {results['parameters']}"
-    play = play_widths(model)
-    if play is not None:
-        words += f", backlash {millimetres(max(play))}"
+    if model.play_ is not None:
+        words += f", {hysteresis_in_words(model)}"
     return words
 
 
@@ -75,14 +74,14 @@ def auto_in_words(model: HybridForwardModel) -> list[str]:
         f"{', '.join(listed)}.",
         f"Expected on new motions like these: {expected}.",
     ]
-    play = play_widths(model)
-    if play is not None:
+    if model.play_ is not None:
         sentences.append(
-            f"Backlash (play) of the actuators: {millimetres(max(play))}. Predictions depend on "
-            "the order of the rows in a motion."
+            f"The actuators have {hysteresis_in_words(model)}. Predictions depend on the order of "
+            "the rows in a motion, with creep on their times."
         )
     elif model.play is not None:
         sentences.append(
-            "Auto looked for backlash (play), but it did not lower the errors."
+            "Auto looked for backlash (play), other hysteresis and creep, but none lowered the "
+            "errors."
         )
     return sentences

@@ -240,7 +240,7 @@ def with_play_detected(
     in_order = rows.named and not rows.n_late
     if mechanical.start is not None and settings.auto and in_order:
         model = HybridForwardModel(mechanical.model, "drop", play="auto")
-        fit_quietly(model, rows.q, rows.x, rows.motions)
+        fit_quietly(model, rows.q, rows.x, rows.motions, time=rows.time)
         play = None if model.play_ is None else "auto"
     return replace(settings, play=play)
 
@@ -343,6 +343,7 @@ def _one_fold(
             train.q,
             train.x,
             train.motions,
+            time=None if settings.play is None else train.time,
             geometry=mechanical.geometry,
             held_out=False,
         )
@@ -374,7 +375,7 @@ def _held_out(
     """Return the errors (N, K) of the markers on test rows by a module of the fitted model."""
     q = test.q
     if model.play_ is not None:
-        q = model.play_.apply_by_group(q, test.motions)
+        q = model.play_.apply_by_group(q, test.motions, test.time)
     return distances(evaluate(module, np.array(q, dtype=float))[0], test.x)
 
 

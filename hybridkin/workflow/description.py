@@ -12,8 +12,8 @@ from torch import Tensor
 from hybridkin.chains.robots import Limits, LogFormat
 from hybridkin.hybrid.cv_results import CvResults
 from hybridkin.workflow.errors import HeldOutErrors
-from hybridkin.workflow.model import LoadedModel, play_widths
-from hybridkin.workflow.report import Report, listed, millimetres
+from hybridkin.workflow.model import LoadedModel, hysteresis_in_words, play_widths
+from hybridkin.workflow.report import Report, listed
 
 _NAMES = 24  # width of the names of rows
 _PER_TIME = {"dq_max": "/s", "ddq_max": "/s^2"}
@@ -34,7 +34,7 @@ class Description:
     auto : dict or None
         The choices of "auto", see ``HybridForwardModel.cv_results_``.
     play : list of float or None
-        Backlash of every actuator [m].
+        Width of the hysteresis of every actuator [m].
     domain : Limits or None
         Training range.
     log_format : LogFormat
@@ -100,10 +100,8 @@ def describe(loaded: LoadedModel) -> Report[Description]:
     else:
         rows = hybrid.html_rows()
     report.verbatim(_in_lines(rows))
-    if record.play is not None:
-        report.text(
-            f"Backlash (play) of the actuators: {millimetres(max(record.play))}."
-        )
+    if hybrid is not None and hybrid.play_ is not None:
+        report.text(f"The actuators have {hysteresis_in_words(hybrid)}.")
     log = record.log_format
     for name, limits in {
         "Training range": record.domain,

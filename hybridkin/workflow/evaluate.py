@@ -142,9 +142,9 @@ def evaluate_log(
         measured.check_order("A model with backlash (play)")
     # Else one motion.
     motion = measured.motions if measured.named else np.zeros(len(log.q))
-    predicted = loaded.predict(log.q, motion)
+    predicted = loaded.predict(log.q, motion, log.time)
     markers = distances(predicted, log.x)
-    errors = _row_errors(loaded, log.q, motion, markers)
+    errors = _row_errors(loaded, log, motion, markers)
     fitted = loaded.was_fitted(log.q, log.x, measured.motions)
     fitted_errors = None
     new_errors = None
@@ -176,15 +176,16 @@ def evaluate_log(
 
 
 def _row_errors(
-    loaded: LoadedModel, q: NDArray, motion: NDArray, markers: NDArray
+    loaded: LoadedModel, log: Log, motion: NDArray, markers: NDArray
 ) -> _RowErrors:
+    q = log.q
     in_domain = np.full(len(q), np.nan)
     in_radius = in_domain
     hybrid = loaded.hybrid
     if hybrid is not None:
-        in_domain = hybrid.in_domain(q, groups=motion).astype(float)
+        in_domain = hybrid.in_domain(q, motion, log.time).astype(float)
     if hybrid is not None and hybrid.radius_ is not None:
-        _, radius = hybrid.predict(q, return_radius=True, groups=motion)
+        _, radius = hybrid.predict(q, True, motion, log.time)
         inside = np.nanmax(markers, axis=1) <= radius
         in_radius = np.where(np.isinf(radius), np.nan, inside)
     return _RowErrors(np.nanmean(markers, axis=1), in_domain, in_radius)
@@ -240,7 +241,7 @@ def _add_figures(
     row = int(np.argsort(errors)[int(0.95 * len(errors))])
     body = None
     if loaded.chain is not None:
-        q = loaded.effective(log.q, motion)[row]
+        q = loaded.effective(log.q, motion, log.time)[row]
         body = plots.BackboneDisplay.from_estimator(loaded.chain, q).points[0]
     tips = plots.WorkspaceDisplay(log.x[:, -3:], predicted[:, -3:], body, row)
     tips.plot(ax, unit="mm")

@@ -54,7 +54,7 @@ def animate_track(
         )
     log = read_track(path, loaded.log_format())
     out = Path(out)
-    q = loaded.effective(log.q)
+    q = loaded.effective(log.q, time=log.time)
     if log.groups is not None:  # the way to the path is no part of it
         on_path = log.groups != LEAD_IN
         log = log.rows(on_path)

@@ -112,6 +112,7 @@ def fit_log(
         rows.q,
         rows.x,
         rows.motions,
+        time=None if settings.play is None else rows.time,
         geometry=mechanical.geometry,
         progress=report_fit,
         log=(complete.q, complete.x),

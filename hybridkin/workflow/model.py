@@ -23,6 +23,7 @@ from hybridkin.learning.elm import ELMRegressor
 from hybridkin.native.library import evaluate
 from hybridkin.saving.saved_model import load_model, model_header
 from hybridkin.workflow.errors import ExpectedErrors, HeldOutErrors, Promise
+from hybridkin.workflow.report import millimetres
 
 LOG_SUFFIXES = (".csv", ".tsv", ".txt", ".npz", ".parquet", ".pq")
 """Endings of files that are treated as logs."""
@@ -96,7 +97,7 @@ class LoadedModel:
 
     @property
     def play(self) -> HysteresisOperator | None:
-        """The backlash of the actuators, None without."""
+        """The hysteresis of the actuators, None without."""
         if self.hybrid is None:
             return None
         return self.hybrid.play_
@@ -108,25 +109,39 @@ class LoadedModel:
             return 0.0
         return 0.5 * self.play.width
 
-    def effective(self, q: NDArray, groups: NDArray | None = None) -> NDArray:
-        """Return the motion of the actuators (N, n) for commands q of one motion, or of groups."""
+    def effective(
+        self, q: NDArray, groups: NDArray | None = None, time: NDArray | None = None
+    ) -> NDArray:
+        """Return the motion of the actuators (N, n) for commands q of one motion, or of groups.
+
+        Their times (N,) matter with creep [s].
+        """
         if self.play is None:
             return q
         if groups is None:
             groups = np.zeros(len(q))
-        return self.play.apply_by_group(q, groups)
+        return self.play.apply_by_group(q, groups, time)
 
-    def commands(self, q: NDArray) -> NDArray:
-        """Return the commands (N, n) that move the actuators along q (N, n), row after row."""
+    def commands(self, q: NDArray, time: NDArray | None = None) -> NDArray:
+        """Return the commands (N, n) that move the actuators along q (N, n), row after row.
+
+        The times (N,) of the rows matter with creep [s].
+        """
         if self.play is None:
             return q
-        commands, _ = self.play.command(q)
+        steps = 1.0 if time is None else np.diff(time, prepend=time[:1])
+        commands, _ = self.play.command(q, dt=steps)
         return commands
 
-    def predict(self, q: NDArray, groups: NDArray | None = None) -> NDArray:
-        """Return tips (N, 3) [m], or all markers; `groups`, the motions, matter with backlash."""
+    def predict(
+        self, q: NDArray, groups: NDArray | None = None, time: NDArray | None = None
+    ) -> NDArray:
+        """Return tips (N, 3) [m], or all markers.
+
+        Motions `groups` matter with backlash, times with creep [s].
+        """
         if self.hybrid is not None:
-            return self.hybrid.predict(q, groups=groups)
+            return self.hybrid.predict(q, groups=groups, time=time)
         return evaluate(as_forward_model(self.model), np.array(q, dtype=float))[0]
 
     def tips(self, q: NDArray) -> NDArray:
@@ -236,14 +251,29 @@ class LoadedModel:
 
 
 def play_widths(model: HybridForwardModel | None) -> list[float] | None:
-    """Return the backlash of every actuator [m], None without."""
+    """Return the width of the hysteresis of every actuator [m], None without."""
     if model is None or model.play_ is None:
         return None
+    return _in_metres(model, model.play_.width).tolist()
+
+
+def hysteresis_in_words(model: HybridForwardModel) -> str:
+    """Return the kinds of hysteresis that the actuators have, with their widths."""
+    if model.play_ is None:
+        return "no hysteresis"
+    words = []
+    for part in model.play_.parts:
+        width = _in_metres(model, part.width).max()
+        words.append(f"{part.kind} {millimetres(width)}" if width > 0.0 else part.kind)
+    return " and ".join(words)
+
+
+def _in_metres(model: HybridForwardModel, width: NDArray) -> NDArray:
+    """Return widths in the unit of q in metres, of one or all actuators."""
     chain = model.mechanical_model_
-    width = model.play_.width
     if isinstance(chain, ArcChain) and not chain.in_metres:
         width = width * as_array(chain.gains.detach().abs())
-    return np.ravel(width).tolist()
+    return np.ravel(width)
 
 
 def open_model(path: str | Path, robot: str | Path | None = None) -> LoadedModel:

@@ -24,7 +24,7 @@ from hybridkin.ik.results import IKStatus, Track, score
 from hybridkin.ik.trajectories import Trajectory
 from hybridkin.workflow.domain import Domain, PathLimits, path_limits
 from hybridkin.workflow.errors import Errors
-from hybridkin.workflow.model import LoadedModel, play_widths
+from hybridkin.workflow.model import LoadedModel, hysteresis_in_words, play_widths
 from hybridkin.workflow.path import interpolated
 from hybridkin.workflow.reach import better_place, check_reach
 from hybridkin.workflow.report import (
@@ -69,7 +69,7 @@ class TrackRecord:
     expected : dict of str to float
         "mean" and "p95" of the errors to expect of the robot in the domain [m], if known.
     play : list of float or None
-        Backlash of every actuator [m].
+        Width of the hysteresis of every actuator [m].
     lead_in : int
         Number of rows that lead from the robot's configuration to the path.
     limits : PathLimits
@@ -107,10 +107,11 @@ def _write(report: Report[TrackRecord], loaded: LoadedModel, better: str) -> Non
         f"first {record.lead_in} rows, with the status LEAD_IN, move from the start of the robot "
         "to the path."
     )
-    if record.play is not None:
+    if loaded.hybrid is not None and loaded.play is not None:
         report.text(
-            f"Backlash (play) {millimetres(max(record.play))}: a command crosses it when its "
-            "actuator reverses. Send q; effective_... is the motion of the actuators."
+            f"The actuators have {hysteresis_in_words(loaded.hybrid)}: a command crosses the "
+            "width when its actuator reverses, and leads where they creep. Send q; effective_... "
+            "is the motion of the actuators."
         )
     if loaded.plane_in_words():
         report.text(loaded.plane_in_words())

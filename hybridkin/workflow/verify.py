@@ -151,7 +151,7 @@ def verify_track(
         check_out(out, "verify", force=force)
     loaded.check_columns(log.q)
     sent = read_track(track, loaded.log_format())
-    motion = loaded.effective(sent.q)
+    motion = loaded.effective(sent.q, time=sent.time)
     rows = _rows_of(log, sent)
     x = log.x[:, -3:]
     used = np.isfinite(x).all(axis=1)

@@ -61,7 +61,7 @@ def fitted():
 
 @pytest.mark.slow
 def test_creep_behind_a_backlash_is_found(fitted):
-    assert fitted.play_.kind == "backlash (play) and creep"
+    assert fitted.play_.kind == "backlash and creep"
     q, x, groups, time = log(SLIDE, 16, seed=0)
     single = HybridForwardModel(CHAIN, "quadratic", coupling="serial", play=0.02)
     single.fit(q, x, groups=groups)
@@ -69,7 +69,7 @@ def test_creep_behind_a_backlash_is_found(fitted):
     assert mean_error(fitted, SLIDE, time=time) < 0.2 * mean_error(single, SLIDE)
     # Without times the steps are not those of the robot.
     assert mean_error(fitted, SLIDE, time=time) < 0.7 * mean_error(fitted, SLIDE)
-    assert "backlash (play) and creep" in fitted.html_rows()
+    assert "backlash and creep" in fitted.html_rows()
 
 
 @pytest.mark.slow
