@@ -1,10 +1,10 @@
-"""Hysteresis of actuators: one backlash, a Prandtl-Ishlinskii operator, averages of the past.
+"""Hysteresis of actuators: one backlash, or what `play="auto"` finds.
 
 The tables and the figure of the docs page "When the past matters"::
 
     python examples/studies/hysteresis.py --out results/hysteresis
 
-About six minutes of processor time. The simulated trunk is the chain of the library with an error
+About eight minutes of processor time. The simulated trunk is the chain of the library with an error
 to learn; what its actuators do has hysteresis of three kinds, none of which is the operator that
 is fitted. The recordings are in the folder that ``--data`` or HYBRIDKIN_DATA names; an absent one
 is left out (`help(hybridkin.datasets.load_asl_trunk)` names its source).
@@ -30,13 +30,12 @@ from hybridkin import (
     ELMRegressorCV,
     HybridForwardModel,
     PlayOperator,
-    PrandtlIshlinskiiOperator,
     datasets,
+    fit_play,
     robots,
 )
 
 TRUNK = robots.bionic_handling_assistant()
-RATES = 0.5, 0.25, 0.1  # of averages, per row
 ROWS = 40  # in a motion
 NOISE = 5e-4  # [m]
 Hysteresis = Callable[[NDArray], NDArray]
@@ -65,16 +64,11 @@ def bouc_wen(q: NDArray) -> NDArray:
 
 def creep(q: NDArray) -> NDArray:
     """Return 60 % of the commands plus 10 % of each of four averages of the past (T, n) [m]."""
-    return 0.6 * q + 0.1 * averages(q, (0.7, 0.25, 0.1, 0.03)).sum(axis=1)
-
-
-def averages(q: NDArray, rates: tuple[float, ...] = RATES) -> NDArray:
-    """Return exponential averages (T, J, n) of rows (T, n), which start at the first row."""
-    filtered = []
-    for rate in rates:
+    effective = 0.6 * q
+    for rate in (0.7, 0.25, 0.1, 0.03):
         start = (1.0 - rate) * q[:1]
-        filtered.append(lfilter([rate], [1.0, rate - 1.0], q, axis=0, zi=start)[0])
-    return np.stack(filtered, axis=1)
+        effective += 0.1 * lfilter([rate], [1.0, rate - 1.0], q, axis=0, zi=start)[0]
+    return effective
 
 
 def by_group(
@@ -110,28 +104,34 @@ def far(a: NDArray, b: NDArray) -> NDArray:
     return 1e3 * np.linalg.norm(a - b, axis=1)
 
 
-def fits(model: HybridForwardModel, *rows: NDArray) -> dict[str, HybridForwardModel]:
+def fits(
+    model: HybridForwardModel,
+    q: NDArray,
+    x: NDArray,
+    groups: NDArray,
+    runs: NDArray | None = None,
+    weights: NDArray | None = None,
+) -> dict[str, HybridForwardModel]:
     """Return models without hysteresis, with one backlash, and with what "auto" finds.
 
     Parameters
     ----------
     model : HybridForwardModel
         Its settings, but for `play`.
-    *rows : ndarray
-        Commands, tips and motions.
+    q, x, groups, runs, weights : ndarray
+        Rows as for its `fit`.
     """
-    q, x, groups = rows
 
     def fitted(play: float | str | None) -> HybridForwardModel:
-        return clone(model).set_params(play=play).fit(q, x, groups=groups)
+        hybrid = clone(model).set_params(play=play)
+        return hybrid.fit(q, x, weights, groups, runs)
 
-    auto = fitted("auto")
-    width = 0.0
-    if isinstance(auto.play_, PrandtlIshlinskiiOperator):
-        width = auto.play_.widths[3]  # the backlash about which the others were chosen
-    elif auto.play_ is not None:
-        width = auto.play_.width
-    return {"none": fitted(None), "one backlash": fitted(width), "auto": auto}
+    none = fitted(None)
+    used = slice(None) if weights is None else weights > 0.0
+    widths = np.ptp(q, axis=0).max() * np.geomspace(0.003, 0.8, 30)
+    chain = none.mechanical_model_
+    single = fit_play(chain, q[used], x[used], groups[used], widths, ["base"])
+    return {"none": none, "one backlash": fitted(single.width), "auto": fitted("auto")}
 
 
 def trunk_model() -> HybridForwardModel:
@@ -185,18 +185,18 @@ def trunk_of_motors(cases: list[Case], data_home: str | None) -> list[list[str]]
     for case in cases:
         q, x, groups = _all_rows(case)
         test = np.isin(groups, case.tests["5 folds"][2])
+        known = np.where(test[:, None], x[~test].mean(axis=0), x)
+        weights = (~test).astype(float)  # held-out rows still move the motors
 
         nominal = HybridForwardModel(case.chain, "drop", calibrate="default")
-        for name, model in fits(nominal, case.q, case.x, case.groups).items():
-            for start, motion in {"run": groups, "runs in a row": joined}.items():
-                y = q if model.play_ is None else model.play_.apply_by_group(q, motion)
-                past = by_group(averages, y, motion).reshape(len(y), -1)
-                inputs = {"": y, " + averages": np.hstack([y, past])}
-                for more, columns in inputs.items():
-                    network = ELMRegressorCV(200, relevance_rounds=0, random_state=0)
-                    network.fit(columns[~test], x[~test], groups=groups[~test])
-                    error = far(network.predict(columns[test]), x[test])
-                    errors.setdefault((name + more, start), []).append(error)
+        for start, runs in {"run": groups, "runs in a row": joined}.items():
+            models = fits(nominal, q, known, groups, runs, weights)
+            for name, model in models.items():
+                y = q if model.play_ is None else model.play_.apply_by_group(q, runs)
+                network = ELMRegressorCV(200, relevance_rounds=0, random_state=0)
+                network.fit(y[~test], x[~test], groups=groups[~test])
+                error = far(network.predict(y[test]), x[test])
+                errors.setdefault((name, start), []).append(error)
     return [[name, start, *_by_fold(parts)] for (name, start), parts in errors.items()]
 
 
@@ -257,7 +257,7 @@ def draw_loops(path: Path) -> None:
     figure, axes = plt.subplots(
         1, 3, figsize=(9.0, 3.2), sharey=True, layout="constrained"
     )
-    titles = "no hysteresis", "one backlash", "Prandtl-Ishlinskii"
+    titles = "no hysteresis", "one backlash", "found by auto"
     for ax, title, model in zip(axes, titles, models, strict=True):
         ax.plot(
             1e3 * loop[:, 0],

@@ -142,6 +142,9 @@ class HysteresisProblem:
         self.times = log.times if creep else np.empty(0)
         late = _slow_states(changes, log, self.times)[:, log.rows] - self.changes
         self.late = late.transpose(1, 0, 2, 3)  # (C, J, K + 1, n)
+        self.measured = log.x[log.rows]
+        roots = np.sqrt(log.counts[log.rows])[:, None]
+        self.roots = np.where(np.isnan(self.measured), 0.0, roots)
         n = log.q.shape[1]
         one_backlash = _FACTORS[: len(self.widths) - 1] >= 1.0
         self.start = np.outer(one_backlash, np.ones(n))
@@ -173,63 +176,69 @@ class HysteresisProblem:
         slope_spread, gain_spread : float
             Standard deviations of the priors of a slope and of a gain; 0 for fixed ones.
         """
-        K = len(self.start)
-        J, n = len(self.times), self.start.shape[1]
-        weights = np.concatenate([self.start, np.zeros((J, n))])
-        spreads = np.repeat([slope_spread, gain_spread], [K, J])
-        prior = _Prior.of(weights, spreads)
-        correction: NDArray | None = None
+        K, n = self.start.shape
+        weights = np.concatenate([self.start, np.zeros((len(self.times), n))])
+        spreads = np.repeat([slope_spread, gain_spread], [K, len(self.times)])
+        free = spreads > 0.0
+        mean = weights[free].ravel()
+        of_actuators = np.linalg.inv((1.0 - _COMMON) * np.eye(n) + _COMMON)
+        precision = np.kron(np.diag(spreads[free] ** -2.0), of_actuators)
+        n_rows = np.square(self.roots.max(axis=1)).sum()
+        correction = None
         system = None
+        distances = np.full(len(self.log.rows), LARGEST)
         for _ in range(_ROUNDS):
-            system = self._linearised(weights, correction, prior)
-            if system is None:  # the model is not regular so far from the rows
-                far = np.full(len(self.log.rows), LARGEST)
-                return HysteresisFit(self.start, np.zeros((J, n)), far)
-            weights, correction = system.solved()
-            gains = weights[K:]
-            most = (1.0 - _AT_ONCE) / np.maximum(gains.sum(axis=0), 1.0 - _AT_ONCE)
-            weights = np.concatenate([weights[:K], gains * most])
+            columns, noise, correction = self._linearised(weights, correction, free)
+            if not np.isfinite(columns).all():  # the model is not regular so far away
+                return HysteresisFit(weights[:K], weights[K:], distances)
+            system = _LeastSquares.of(columns, noise * precision, mean, n_rows)
+            solution = system.solution(system.products)
+            of_weights = solution[correction.size :]
+            correction = solution[: correction.size].reshape(correction.shape)
+            weights[free] = of_weights.reshape(-1, n)
+            late = np.maximum(weights[K:].sum(axis=0), 1.0 - _AT_ONCE)
+            weights[K:] *= (1.0 - _AT_ONCE) / late
         assert system is not None
-        distances = np.empty(len(self.log.rows))
         for _, test in self.log.folds:
-            distances[test] = system.held_out(test)
+            distances[test] = system.held_out(test) / self.roots[test].max(axis=1)
         return HysteresisFit(weights[:K], weights[K:], distances)
 
     def _linearised(
-        self, weights: NDArray, correction: NDArray | None, prior: _Prior
-    ) -> _System | None:
-        """Return the linear system at weights (K + J, n) and W (Z, n + 1); None if not finite."""
-        log = self.log
+        self, weights: NDArray, correction: NDArray | None, free: NDArray
+    ) -> tuple[NDArray, float, NDArray]:
+        """Return columns (C, m, P + F n + 1) of W, of free weights and tips, the noise, and W.
+
+        ``columns @ [W, weights, -1]`` are the errors of the tips, W (Z, n + 1) is zero at first.
+        """
         K = len(self.start)
         gains = weights[K:]
-        of_changes = np.concatenate([weights[:K], np.ones((1, weights.shape[1]))])[None]
+        of_changes = np.concatenate([weights[:K], np.ones((1, weights.shape[1]))])
         late = (self.late * of_changes).sum(axis=2)
         y = (self.changes * of_changes).sum(axis=1) + (late * gains).sum(axis=1)
         delayed = (self.late[:, :, :K] * gains[:, None]).sum(axis=1)
         by_weights = np.concatenate([self.changes[:, :K] + delayed, late], axis=1)
 
+        model = self.log.model
         inputs = np.column_stack([np.ones(len(y)), (y - self.center) / self.scale])
         with torch.no_grad():
-            z, dz = log.model.coordinates(torch.from_numpy(y))
+            z, dz = model.coordinates(torch.from_numpy(y))
             if correction is None:
                 correction = np.zeros((z.shape[1], inputs.shape[1]))
-            tips, by_z = log.model.from_coordinates_and_jacobian(
+            tips, by_z = model.from_coordinates_and_jacobian(
                 z + torch.from_numpy(inputs @ correction.T)
             )
             by_y = by_z @ (dz + torch.from_numpy(correction[:, 1:] / self.scale))
-        root = np.sqrt(log.counts[log.rows])[:, None]
-        measured = log.x[log.rows]
-        root = np.where(np.isnan(measured), 0.0, root)
-        residual = np.where(root > 0.0, measured - tips.numpy(), 0.0)
-        if not (np.isfinite(residual).all() and by_y.isfinite().all()):
-            return None
-        noise = np.square(root * residual).sum() / (root > 0.0).sum()
-        noise += _LEAST_NOISE**2 * np.nanvar(measured)
-        by_correction = inputs[:, None, :, None] * by_z.numpy()[:, :, None]
-        by_free = by_y.numpy()[:, :, None] * by_weights[:, None, prior.free]
-        return _System.of(
-            root, residual, by_correction, by_free, weights, correction, noise, prior
-        )
+        residual = np.where(self.roots > 0.0, self.measured - tips.numpy(), 0.0)
+        by_correction = by_z.numpy()[..., None] * inputs[:, None, None]
+        by_free = by_y.numpy()[:, :, None] * by_weights[:, None, free]
+        by_correction = by_correction.reshape(*residual.shape, -1)
+        by_free = by_free.reshape(*residual.shape, -1)
+        target = residual + by_correction @ correction.ravel()
+        target = target + by_free @ weights[free].ravel()
+        columns = np.concatenate([by_correction, by_free, target[..., None]], axis=2)
+        noise = np.square(self.roots * residual).sum() / (self.roots > 0.0).sum()
+        noise += _LEAST_NOISE**2 * np.nanvar(self.measured)
+        return self.roots[..., None] * columns, noise, correction
 
 
 def _slow_states(changes: NDArray, log: HysteresisLog, times: NDArray) -> NDArray:
@@ -246,105 +255,48 @@ def _slow_states(changes: NDArray, log: HysteresisLog, times: NDArray) -> NDArra
     return slow
 
 
-class _Prior(NamedTuple):
-    """A normal prior of the weights that are free; the others keep their start."""
+class _LeastSquares(NamedTuple):
+    """Linear least squares of all rows, whose products are kept to leave some of them out.
 
-    start: NDArray  # (F, n)
-    free: NDArray  # (K + J,), which rows of the weights
-    precision: NDArray  # (F n, F n)
-
-    @classmethod
-    def of(cls, weights: NDArray, spreads: NDArray) -> _Prior:
-        """Return the prior about weights (K + J, n) with standard deviations (K + J,)."""
-        n = weights.shape[1]
-        free = spreads > 0.0
-        of_actuators = np.linalg.inv((1.0 - _COMMON) * np.eye(n) + _COMMON)
-        precision = np.kron(np.diag(spreads[free] ** -2.0), of_actuators)
-        return cls(weights[free], free, precision)
-
-
-class _System(NamedTuple):
-    """Linear least squares of all rows, whose products are kept.
-
-    The columns of a row are those of the correction W, of the free weights, and of the tips. One
-    unit of the scaled W moves the tips by 1 m; W may explain all errors.
+    The columns are those of a correction, of weights of zero and more, and of the target. Beside
+    the penalty of the weights, each entry of the correction has one that counts as one row.
     """
 
-    columns: NDArray  # (C, m, P + F n + 1)
+    columns: NDArray  # (C, m, P + F + 1)
     products: NDArray  # of the columns, summed over rows
-    units: NDArray  # (P,)
-    weights: NDArray  # (K + J, n), at the linearisation
-    shape: tuple[int, ...]  # of W
-    noise: float
-    prior: _Prior
-    root: NDArray  # (C, m), roots of the counts
+    ridge: NDArray  # (P,)
+    penalty: NDArray  # (F, F)
+    mean: NDArray  # (F,), at which the penalty is zero
 
     @classmethod
     def of(
-        cls,
-        root: NDArray,
-        residual: NDArray,
-        by_correction: NDArray,
-        by_free: NDArray,
-        weights: NDArray,
-        correction: NDArray,
-        noise: float,
-        prior: _Prior,
-    ) -> _System:
-        """Return the system of rows, linearised at weights and a correction."""
-        by_correction = by_correction.reshape(*residual.shape, -1)
-        by_free = by_free.reshape(*residual.shape, -1)
-        units = np.sqrt(np.square(by_correction).sum(axis=1).mean(axis=0))
-        units = np.where(units > 0.0, units, 1.0)
-        target = residual + by_correction @ correction.T.ravel()
-        target = target + by_free @ (weights[prior.free] - prior.start).ravel()
-        columns = [by_correction / units, by_free, target[..., None]]
-        columns = root[..., None] * np.concatenate(columns, axis=2)
+        cls, columns: NDArray, penalty: NDArray, mean: NDArray, n_rows: float
+    ) -> _LeastSquares:
+        """Return the system of columns of so many rows."""
         flat = columns.reshape(-1, columns.shape[2])
         products = flat.T @ flat
-        shape = correction.shape
-        return cls(columns, products, units, weights, shape, noise, prior, root)
-
-    def solved(self) -> tuple[NDArray, NDArray]:
-        """Return the weights (K + J, n) and the correction W (Z, n + 1) of all rows."""
-        solution = self._solution(self.products)
-        P = len(self.units)
-        correction = (solution[:P] / self.units).reshape(self.shape[::-1]).T
-        weights = self.weights.copy()
-        free = self.prior.start + solution[P:].reshape(self.prior.start.shape)
-        weights[self.prior.free] = free
-        return weights, correction
+        ridge = np.diag(products)[: -1 - len(mean)] / n_rows
+        ridge = np.where(ridge > 0.0, ridge, 1.0)
+        return cls(columns, products, ridge, penalty, mean)
 
     def held_out(self, test: NDArray) -> NDArray:
-        """Return the distances of rows from the solution of all others [m]."""
+        """Return the lengths of the errors of rows, from the solution of all others."""
         columns = self.columns[test]
         flat = columns.reshape(-1, columns.shape[2])
-        solution = self._solution(self.products - flat.T @ flat)
-        missed = columns @ np.append(-solution, 1.0)
-        # Each row as it is measured once.
-        return np.linalg.norm(missed, axis=1) / self.root[test].max(axis=1)
+        solution = self.solution(self.products - flat.T @ flat)
+        return np.linalg.norm(columns @ np.append(solution, -1.0), axis=1)
 
-    def _solution(self, products: NDArray) -> NDArray:
-        """Return scaled W and changes of the weights, whose sums with the start are positive.
-
-        Least squares plus the penalties |W|^2 and those of the prior. W is eliminated first.
-        """
-        P = len(self.units)
-        A = slice(0, P)
-        B = slice(P, -1)
-        normal = products[A, A] + np.eye(P)
-        explained = np.linalg.solve(normal, products[A, P:])
-        of_weights, of_tips = explained[:, :-1], explained[:, -1]
-        if not len(self.prior.precision):
-            return of_tips
-        start = self.prior.start.ravel()
-        system = products[B, B] - products[B, A] @ of_weights
-        system = system + self.noise * self.prior.precision
-        moment = products[B, -1] - products[B, A] @ of_tips
-        # system (weights - start) = moment, with weights of zero and more.
+    def solution(self, products: NDArray) -> NDArray:
+        """Return the correction and the weights of products; the correction is eliminated."""
+        P = len(self.ridge)
+        normal = products[:P, :P] + np.diag(self.ridge)
+        explained = np.linalg.solve(normal, products[:P, P:])
+        if not len(self.mean):
+            return explained[:, -1]
+        left = products[P:, P:] - products[P:, :P] @ explained
+        system = left[:-1, :-1] + self.penalty
+        moment = left[:-1, -1] + self.penalty @ self.mean
         factor = np.linalg.cholesky(system)
-        target = np.linalg.solve(factor, moment + system @ start)
-        weights, _ = nnls(factor.T, target)
-        return np.concatenate(
-            [of_tips - of_weights @ (weights - start), weights - start]
-        )
+        weights, _ = nnls(factor.T, np.linalg.solve(factor, moment))
+        correction = explained @ np.append(-weights, 1.0)
+        return np.concatenate([correction, weights])

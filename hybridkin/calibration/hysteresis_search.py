@@ -123,13 +123,16 @@ def find_hysteresis(log: HysteresisLog) -> HysteresisOperator | None:
         widths[1:1] = doubled[doubled < widest].tolist()
     width = search_width(log, widths, refine=True).width
 
-    candidates = [_Candidate.of(log, 0.0, _NONE), _Candidate.of(log, 0.0, _CREEP)]
-    if width > 0.0:
+    candidates = [_Candidate.of(log, 0.0, _NONE)]
+    creep = _Candidate.of(log, 0.0, _CREEP)
+    if width == 0.0:
+        candidates.append(creep)
+    else:
         backlash = _Candidate.of(log, width, _NONE)
         with_creep = _Candidate.of(log, width, _CREEP)
         if _gain(backlash.errors, with_creep.errors)[2]:
             with_creep = _with_width_again(log, with_creep)
-        candidates += [backlash, with_creep]
+        candidates += [backlash, creep, with_creep]
         candidates += [_Candidate.of(log, width, spreads) for spreads in _SMOOTH]
         width = with_creep.width
         candidates += [_Candidate.of(log, width, both) for both in _SMOOTH_AND_CREEP]
