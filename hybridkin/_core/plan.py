@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -51,7 +52,7 @@ class Plan:
         Description of the model, or a function that writes its nodes and returns the last place.
     shares : bool, default=False
         Whether large arrays stay where they are, and the plan only refers to them. Such a plan sees
-        when they are written to; it cannot leave the process.
+        when they are written to. A copy of it has copies of them.
 
     Attributes
     ----------
@@ -91,15 +92,25 @@ class Plan:
         first = -memory.ctypes.data // 8 % HK_GROUP
         self.data = memory[first : first + self._length + HK_GROUP]
         self.data[:-HK_GROUP] = np.concatenate(self._data)
-        for place, array in self.shared.items():
-            away = (array.ctypes.data - self.data.ctypes.data) // 8
-            self.code[place : place + 2] = away & _LOW, away >> _BITS
         self.places = [*self._place_of.values()]
         # do not pickle them twice
         self._data = []
         self._place_of = {}
-        for array in (self.code, self.data):
-            array.flags.writeable = False
+        self.data.flags.writeable = False
+        self._refer_to_shared()
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        # The arrays of a copy stand elsewhere.
+        vars(self).update(state)
+        self._refer_to_shared()
+
+    def _refer_to_shared(self) -> None:
+        """Write the distances of the shared arrays from the numbers."""
+        self.code.flags.writeable = True
+        for place, array in self.shared.items():
+            away = (array.ctypes.data - self.data.ctypes.data) // 8
+            self.code[place : place + 2] = away & _LOW, away >> _BITS
+        self.code.flags.writeable = False
 
     @property
     def digest(self) -> str:

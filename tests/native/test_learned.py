@@ -1,5 +1,8 @@
 """Learned corrections, guards and hybrids in the compiled core against the same in torch."""
 
+import copy
+import pickle
+
 import numpy as np
 import pytest
 import torch
@@ -262,6 +265,8 @@ def test_writes_to_a_large_factor_are_seen():
         assert_close_rows(found[1], expected[2])
         assert program_of(module) is not shared
         shared = program_of(module)
+    for copied in (copy.deepcopy(shared), pickle.loads(pickle.dumps(shared))):
+        assert_array_equal(copied.evaluate(rows, False, True)[2], shared.domain(rows)[0])
 
 
 def test_parts_without_kernel_leave_the_model_to_torch():
