@@ -30,11 +30,12 @@ class Follower:
         limits = workflow.path_limits(
             self.loaded, dq_max=dq_max * factors if dq_max > 0.0 else None
         )
-        self._low, self._high = limits.q_min, limits.q_max
+        half = self.loaded.half_play  # commands lead what the actuators do
+        self._low, self._high = limits.q_min - half, limits.q_max + half
         self._ik = InverseKinematics(
-            self.loaded.module,
-            q_min=limits.q_min,
-            q_max=limits.q_max,
+            self.loaded.model,
+            q_min=self._low,
+            q_max=self._high,
             dq_max=limits.dq_max,
             dt=period,
         )
@@ -42,7 +43,6 @@ class Follower:
         self._tracker = None
         self._target = None
         self._measured = None
-        self._play_state = None
 
     def actuators_at(self, names, positions):
         """Start at measured actuators, in the unit of the log; later calls change nothing."""
@@ -72,13 +72,6 @@ class Follower:
             return None
         q = np.asarray(self._tracker.step(self._target, x_measured=self._measured))
         self._measured = None
-        if (
-            self.loaded.play is not None
-        ):  # the actuators lead the motion by the backlash
-            (commands, self._play_state) = self.loaded.play.command(
-                q[None], self._play_state
-            )
-            q = commands[0]
         return self.log.to_log(q)
 
     @property
