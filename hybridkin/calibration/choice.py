@@ -82,6 +82,8 @@ class GeometryChoice:
         Warnings about the log.
     rivals : tuple of GeometryChoice
         The other sets whose errors are at most a tenth above those of the chosen one.
+    starts : tuple of Start or None
+        Starts of the fits of all sets.
     """
 
     chain: Chain
@@ -91,6 +93,7 @@ class GeometryChoice:
     errors: dict[str, Errors]
     messages: tuple[str, ...] = ()
     rivals: tuple[GeometryChoice, ...] = ()
+    starts: tuple[Start | None, ...] = ()
 
 
 class _Candidate(NamedTuple):
@@ -129,6 +132,7 @@ def choose_geometry(
     loss: str = "linear",
     outside: bool = True,
     parameters: Sequence[str] | None = None,
+    starts: Sequence[Start | None] = (),
 ) -> GeometryChoice:
     """Return the parameters with the smallest calibration error on new motions and extrapolation.
 
@@ -160,6 +164,8 @@ def choose_geometry(
         Whether the score uses `io`, because a correction will be learned; else it is `cv`.
     parameters : sequence of str, optional
         The set to calibrate. The only choice is then whether the tendons are elastic.
+    starts : sequence of Start or None, optional
+        Starts of the fits from a choice on more rows of the same log. Default: they are searched.
 
     Returns
     -------
@@ -181,7 +187,9 @@ def choose_geometry(
     with torch.no_grad():
         candidates = _candidates(chain, q, parameters)
         messages = () if parameters is not None else unmoved(chain, q)
-    starts = _starts(candidates, rows, loss)
+    if len(starts) < len(candidates):
+        starts = _starts(candidates, rows, loss)
+    starts = starts[: len(candidates)]
     best = 0
     near = []
     errors = {}
@@ -209,7 +217,7 @@ def choose_geometry(
         return GeometryChoice(chosen_chain, names, starts[k], name, errors, messages)
 
     rivals = [choice(k) for k in near if k != best and candidates[k].parameters]
-    return replace(choice(best), rivals=tuple(rivals))
+    return replace(choice(best), rivals=tuple(rivals), starts=tuple(starts))
 
 
 def _best(

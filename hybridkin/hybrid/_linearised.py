@@ -65,6 +65,18 @@ class Solution(NamedTuple):
     residual: Tensor  # (N, m)
 
 
+class Reduced(NamedTuple):
+    """A system for one penalty of the other features, reduced to the linear ones.
+
+    If the linear features have the weights w, the others have ``offset - slope @ w``.
+    """
+
+    system: Tensor  # (C n, C n), without the penalty of the linear features
+    right: Tensor  # (C n,)
+    slope: Tensor  # (C P, C n)
+    offset: Tensor  # (C P,)
+
+
 class Linearised:
     """The problem sum_n |y_n - J_n W phi_n|^2 + sum_ck penalty_k W_ck^2.
 
@@ -80,10 +92,18 @@ class Linearised:
         Targets.
     products : Products, optional
         Products of the features. Default: they are computed.
+    n_linear : int, default=0
+        Number of linear features, which come first. Scores of several penalties of these share a
+        factorisation.
     """
 
     def __init__(
-        self, J: Tensor, phi: Tensor, y: Tensor, products: Products | None = None
+        self,
+        J: Tensor,
+        phi: Tensor,
+        y: Tensor,
+        products: Products | None = None,
+        n_linear: int = 0,
     ) -> None:
         self.J = J
         self.phi = phi
@@ -91,17 +111,14 @@ class Linearised:
         self._products = Products(phi) if products is None else products
         self.gram = _gram(J, self._products)
         self.moment = moment(J, y, phi)
+        self.n_linear = n_linear
         self._apart: dict[int, Tensor] = {}  # the Gram matrices of large groups
+        self._reduced: dict[tuple[int, bytes], Reduced] = {}
 
-    def factor(
-        self, penalty: Tensor, less: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Return which features are used (K,), and the Cholesky factor (D, D) of their system.
-
-        `less` is the Gram matrix of rows to subtract.
-        """
+    def factor(self, penalty: Tensor) -> tuple[Tensor, Tensor]:
+        """Return which features are used (K,), and the Cholesky factor (D, D) of their system."""
         finite = torch.isfinite(penalty)
-        gram = self.gram.clone() if less is None else self.gram - less
+        gram = self.gram.clone()
         if not finite.all():
             gram = gram[:, finite][..., finite]
         system = gram.flatten(2).flatten(0, 1)
@@ -165,10 +182,25 @@ class Linearised:
         J = self.J[rows]
         phi = self.phi[rows]
         y = self.y[rows]
-        if group not in self._apart:
-            self._apart[group] = _gram(J, Products(phi))
-        used, L = self.factor(penalty, self._apart[group])
-        readout = solve_kept(self.moment - moment(J, y, phi), used, L)
+        n = self.n_linear
+        linear, others = penalty.tensor_split([n])
+        key = group, others.numpy().tobytes()
+        if key not in self._reduced:
+            if group not in self._apart:
+                self._apart[group] = _gram(J, Products(phi))
+            gram = self.gram - self._apart[group]
+            self._reduced[key] = _reduced(gram, self.moment - moment(J, y, phi), others)
+        reduced = self._reduced[key]
+        used = torch.isfinite(linear)
+        of_used = used.repeat(len(self.gram))
+        system = reduced.system[of_used][:, of_used]
+        system.diagonal().add_(linear[used].repeat(len(self.gram)))
+        L = torch.linalg.cholesky(system)
+        w = torch.cholesky_solve(reduced.right[of_used, None], L)[:, 0]
+        readout = torch.zeros_like(self.moment)
+        readout[:, :n][:, used] = w.view(len(readout), -1)
+        of_others = reduced.offset - reduced.slope[:, of_used] @ w
+        readout[:, n:][:, torch.isfinite(others)] = of_others.view(len(readout), -1)
         return y - moved_by(J, phi, readout)
 
     def _spread(self, used: Tensor, inverse: Tensor) -> Tensor:
@@ -192,6 +224,29 @@ class Linearised:
             spread[a, b, rows] = entries
             spread[b, a, rows] = entries
         return torch.from_numpy(spread).permute(2, 0, 1)
+
+
+def _reduced(gram: Tensor, right: Tensor, penalty: Tensor) -> Reduced:
+    """Return the system of a Gram matrix (C, K, C, K) and a right-hand side (C, K), reduced.
+
+    The last features have the penalties (P,); those with an infinite one are not used.
+    """
+    n = gram.shape[1] - len(penalty)
+    used = torch.isfinite(penalty)
+    linear = gram[:, :n, :, :n].flatten(2).flatten(0, 1)
+    both = gram[:, n:, :, :n][:, used].flatten(2).flatten(0, 1)
+    others = gram[:, n:, :, n:][:, used][..., used].flatten(2).flatten(0, 1)
+    others.diagonal().add_(penalty[used].repeat(len(gram)))
+    right_sides = torch.cat([both, right[:, n:][:, used].reshape(-1, 1)], dim=1)
+    solved = torch.cholesky_solve(right_sides, torch.linalg.cholesky(others))
+    slope = solved[:, :-1]
+    offset = solved[:, -1]
+    return Reduced(
+        linear - both.mT @ slope,
+        right[:, :n].flatten() - both.mT @ offset,
+        slope,
+        offset,
+    )
 
 
 def _gram(J: Tensor, products: Products) -> Tensor:

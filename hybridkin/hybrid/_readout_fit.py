@@ -312,7 +312,8 @@ class _Problem:
             rest, J = self._about(readout)
             J = self._whitened(J * self.units)
             y = self._whitened(rest) + (J @ (self.phi @ readout.mT)[..., None])[..., 0]
-            self._last = readout, Linearised(J, self.phi, y, self.products)
+            linear = Linearised(J, self.phi, y, self.products, self.features.n_linear)
+            self._last = readout, linear
         return self._last[1]
 
     def score(

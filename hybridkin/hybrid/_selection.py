@@ -104,7 +104,9 @@ class Auto(ErrorModel):
         outer = parts[-1].test
         held_out = HeldOut.of(np.array(predictions), rows, fold_of, outer)
         weights, comparison = chosen_blend([*candidates], held_out, rows, spec.geometry)
-        if spec.held_out and weights[0] < 1.0 and _is_small(rows):
+        if spec.expected is not None:
+            comparison["expected_distance"] = spec.expected
+        elif spec.held_out and weights[0] < 1.0 and _is_small(rows):
             unsettled = blend_of(candidates.values(), weights)
             blended = np.tensordot(weights, held_out.predicted, 1)[: len(rows)]
             comparison["expected_distance"] *= _optimism(

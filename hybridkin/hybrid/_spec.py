@@ -125,6 +125,7 @@ class Spec:
     calibration: CalibrationResult | None = None  # how `mechanical` was calibrated
     messages: tuple[str, ...] = ()  # warnings of that choice and calibration
     held_out: bool = True  # whether errors of held-out rows are computed
+    expected: float | None = None  # the mean of these errors [m], if already known
     # Of the commands, with backlash between them and the rows.
     commanded: Directions | None = None
     progress: Callable[[int, int], None] | None = None  # gets (done, total)

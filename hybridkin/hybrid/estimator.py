@@ -273,12 +273,15 @@ class HybridForwardModel(HybridPredictor):
         geometry: GeometryChoice | None = None,
         progress: Callable[[int, int], None] | None = None,
         held_out: bool = True,
+        expected: float | None = None,
     ) -> list[str]:
         """Fit, see `fit_quietly`, and return the messages of all warnings."""
         error_model = self._checked_error_model()
         log = self._checked_rows(X, y, sample_weight, groups, runs, time)
         rows = log.distinct()
-        settings = replace(self._spec(error_model, log), held_out=held_out)
+        settings = replace(
+            self._spec(error_model, log), held_out=held_out, expected=expected
+        )
         messages = few_rows(rows, settings, self.coverage)
         self._fitted_rows = rows.digests()
         spec = settings.with_geometry_chosen(rows, geometry)
@@ -570,6 +573,7 @@ def fit_quietly(
     geometry: GeometryChoice | None = None,
     progress: Callable[[int, int], None] | None = None,
     held_out: bool = True,
+    expected: float | None = None,
     log: tuple[NDArray, NDArray] | None = None,
 ) -> list[str]:
     """Fit as `HybridForwardModel.fit` does and return the messages of its warnings.
@@ -587,10 +591,15 @@ def fit_quietly(
     held_out : bool, default=True
         Whether to compute errors on held-out rows that predictions do not need: those of the
         calibration and of readouts. Without, ``expected_distance`` has the penalties of all rows.
+    expected : float, optional
+        The mean error of this model on held-out motions, known from a comparison: the
+        ``expected_distance`` of "auto" [m].
     log : tuple of ndarray, optional
         All rows (q, x) of the log, if X and y are some of them: all count as fitted.
     """
-    messages = model._fit(X, y, None, groups, None, time, geometry, progress, held_out)
+    messages = model._fit(
+        X, y, None, groups, None, time, geometry, progress, held_out, expected
+    )
     if log is not None:
         model._fitted_rows = np.unique(row_digests(*log))
     return messages

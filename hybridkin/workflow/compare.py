@@ -153,8 +153,14 @@ class Mechanical:
         return {name: error.known() for name, error in errors.items()}
 
     @classmethod
-    def of(cls, robot: RobotDescription, rows: MeasuredLog, loss: str) -> Mechanical:
-        """Return the mechanical model of a robot."""
+    def of(
+        cls,
+        robot: RobotDescription,
+        rows: MeasuredLog,
+        loss: str,
+        of_all: Mechanical | None = None,
+    ) -> Mechanical:
+        """Return the mechanical model of a robot; that of all rows gives starts of its fits."""
         chain = robot.chain
         if chain is None:
             linear = LinearRegression().fit(rows.q, rows.x)
@@ -165,8 +171,16 @@ class Mechanical:
         start = None
         messages = []
         if names == "auto":
+            starts = ()
+            if of_all is not None and of_all.geometry is not None:
+                starts = of_all.geometry.starts
             geometry = choose_geometry(
-                chain, rows.q, rows.x, groups=rows.motions, loss=loss
+                chain,
+                rows.q,
+                rows.x,
+                groups=rows.motions,
+                loss=loss,
+                starts=starts,
             )
             chain = geometry.chain
             names = geometry.parameters
@@ -249,6 +263,7 @@ def compare_by_group(
     rows: MeasuredLog,
     robot: RobotDescription,
     settings: FitSettings,
+    mechanical: Mechanical | None = None,
     *,
     n_jobs: int | None = -1,
     progress: Progress = quiet,
@@ -268,6 +283,8 @@ def compare_by_group(
         Nominal kinematics, and the parameters to calibrate.
     settings : FitSettings
         Loss, folds and models, see `with_play_detected`.
+    mechanical : Mechanical, optional
+        That of all rows, which gives starts for the fits of the folds.
     n_jobs : int, optional
         Largest number of processes.
     progress : callable, optional
@@ -282,7 +299,9 @@ def compare_by_group(
     jobs = []
     for train, test in parts:
         jobs.append(
-            delayed(_one_fold)(robot, settings, rows.rows(train), rows.rows(test))
+            delayed(_one_fold)(
+                robot, settings, rows.rows(train), rows.rows(test), mechanical
+            )
         )
     most = max(1, len(rows.q) // _ROWS_PER_PROCESS[settings.auto])
     # Otherwise torch and BLAS start threads in every process, which wait for each other.
@@ -327,9 +346,10 @@ def _one_fold(
     settings: FitSettings,
     train: MeasuredLog,
     test: MeasuredLog,
+    of_all: Mechanical | None,
 ) -> _FoldResult:
     """Return the errors of every model on test rows after a fit to training rows."""
-    mechanical = Mechanical.of(robot, train, settings.loss)
+    mechanical = Mechanical.of(robot, train, settings.loss, of_all)
     models = {}
     if robot.chain is not None:
         nominal = _nominal(robot, robot.chain, train, settings.loss)

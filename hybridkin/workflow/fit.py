@@ -101,7 +101,9 @@ def fit_log(
     for message in messages:
         warnings.warn(message, stacklevel=2)
     settings = with_play_detected(settings, rows, mechanical)
-    compared = compare_by_group(rows, robot, settings, n_jobs=n_jobs, progress=progress)
+    compared = compare_by_group(
+        rows, robot, settings, mechanical, n_jobs=n_jobs, progress=progress
+    )
     saved = AUTO if settings.auto else _best_to_save(compared)
     report_fit = partial(progress, f"fitting {saved} to all motions")
     report_fit(0, 1)
@@ -115,6 +117,7 @@ def fit_log(
         time=None if settings.play is None else rows.time,
         geometry=mechanical.geometry,
         progress=report_fit,
+        expected=float(compared.errors[saved].mean()),
         log=(complete.q, complete.x),
     )
     progress("writing the report", 0, 1)

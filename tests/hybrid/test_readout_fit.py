@@ -116,8 +116,9 @@ def test_gradient_is_zero_at_the_optimum(robot, kind, rng):
         assert objective(readout + move) > objective(readout)
 
 
-def ridge(rng, n=30, m=3, C=4, K=7):
-    linear = Linearised(uniform(rng, n, m, C), uniform(rng, n, K), uniform(rng, n, m))
+def ridge(rng, n=30, m=3, C=4, K=7, n_linear=0):
+    rows = uniform(rng, n, m, C), uniform(rng, n, K), uniform(rng, n, m)
+    linear = Linearised(*rows, n_linear=n_linear)
     penalty = torch.rand(K, generator=rng, dtype=torch.float64) + 0.1
     penalty[2] = inf
     return linear, penalty
@@ -134,9 +135,10 @@ def solved(linear, penalty, rows):
     return weights.reshape(linear.J.shape[2], -1)
 
 
+@pytest.mark.parametrize("n_linear", [0, 2, 3, 7])
 @pytest.mark.parametrize("sizes", [None, [1] * 30, [3] * 10, [2, 28], [15, 14, 1]])
-def test_rows_left_out_equal_fits_without_them(sizes, rng):
-    linear, penalty = ridge(rng)
+def test_rows_left_out_equal_fits_without_them(sizes, n_linear, rng):
+    linear, penalty = ridge(rng, n_linear=n_linear)
     groups = (
         torch.arange(30)
         if sizes is None
