@@ -34,6 +34,7 @@ from hybridkin.hybrid._features import (
     PoseFeatures,
     Projected,
     QuadraticFeatures,
+    Readout,
 )
 from hybridkin.hybrid._kernel import tuned_kernel
 from hybridkin.hybrid._linearised import Pair
@@ -48,6 +49,8 @@ from hybridkin.learning.regressor_modules import Regressor, error_module
 _LEAST = 0.2  # assumed lower limit of training errors, as a share of the errors before learning
 _LARGEST_LEVERAGE = 0.999
 _MOST = 2000  # rows whose training errors are computed
+# Of an ELMRegressorCV whose number of neurons is known.
+_SHORT_SEARCH = {"weight_scales": (0.2, 0.8), "relevance_rounds": 2, "max_hidden": 0}
 
 NAMED: dict[str, type[ErrorModel]] = {}
 """Error models by name."""
@@ -152,11 +155,21 @@ class FeatureModel(TipModel):
         self.coupling = coupling
         self.alphas = alphas
         self.noise_ratio = noise_ratio
+        self.near = False  # whether penalties are chosen near these
+        self.start: Readout | None = None  # of a fit to other rows
 
     @classmethod
     def of(cls, coupling: str, random_state: Seed) -> Self:
         """Return the error model for these settings of a HybridForwardModel."""
         return cls(coupling)
+
+    def starting_at(self, settled: ErrorModel) -> ErrorModel:
+        """Return the model that chooses its penalties near the settled ones."""
+        if not isinstance(settled, FeatureModel):  # one for each marker
+            return self
+        near = copy.copy(settled)
+        near.near = True
+        return near
 
     @abstractmethod
     def features(self, q: Tensor, mechanical: ForwardModel) -> Features:
@@ -195,6 +208,8 @@ class FeatureModel(TipModel):
                 self.alphas,
                 self.noise_ratio,
                 spec.held_out,
+                self.near,
+                self.start,
             )
         except torch.linalg.LinAlgError as error:  # pyright: ignore
             raise too_far() from error
@@ -208,6 +223,8 @@ class FeatureModel(TipModel):
         settled = copy.copy(self)
         settled.alphas = fit.alphas
         settled.noise_ratio = fit.noise_ratio
+        settled.near = False
+        settled.start = fit.readout
         noise = fit.rmse / points(fit.residual).shape[2] ** 0.5
         return FittedError(
             fit,
@@ -374,6 +391,15 @@ class NetworkModelCV(RegressorModel[ELMRegressorCV]):
 
     def _settled(self, regressor: ELMRegressorCV) -> ErrorModel:
         return NetworkModel(ELMRegressor(**regressor.best_params_))
+
+    def starting_at(self, settled: ErrorModel) -> ErrorModel:
+        """Return the model with the settled number of neurons and a shorter search."""
+        if not isinstance(settled, NetworkModel):  # one for each marker
+            return self
+        network = _copy(self.regressor).set_params(
+            n_hidden=settled.regressor.n_hidden, **_SHORT_SEARCH
+        )
+        return NetworkModelCV(network)
 
     def _noise(
         self, regressor: ELMRegressorCV, module: ForwardModel, rows: Rows

@@ -101,6 +101,8 @@ def fit_readout(
     alphas: Pair | None = None,
     noise_ratio: float = inf,
     left_out: bool = True,
+    near: bool = False,
+    start: Readout | None = None,
 ) -> ReadoutFit:
     """Return the readout that minimises the tip error plus a penalty on its weights.
 
@@ -132,6 +134,10 @@ def fit_readout(
         actuator [m^2 over the squared unit of q]. Infinity: the actuators are exact.
     left_out : bool, default=True
         With `alphas`: whether the held-out residuals are computed; else they are NaN.
+    near : bool, default=False
+        With `alphas`: whether the penalties are chosen anew, in a search that starts there.
+    start : Readout, optional
+        With `alphas`: the readout of a fit to other rows, from which the fit starts.
 
     Returns
     -------
@@ -141,7 +147,7 @@ def fit_readout(
     x = torch.from_numpy(rows.tips.astype(np.float64))
     weight = torch.from_numpy(rows.counts.astype(np.float64))
     members: list[Tensor] | None = None
-    if not left_out and alphas is not None:
+    if alphas is not None and not (left_out or near):
         members = []
     elif rows.groups is not None:
         members = _linearised.members_of(rows.groups)
@@ -149,10 +155,12 @@ def fit_readout(
         problem = _Problem(
             mechanical, features, rows.q, x, weight, coupling == "serial"
         )
-        if alphas is not None:
-            fit = _fitted(problem.in_noise(noise_ratio), members, alphas)
-        else:
+        if alphas is None:
             fit = _chosen_with_noise(problem, members)
+        else:
+            weights = problem.weights_of(start)
+            fit_near = _chosen if near else _fitted
+            fit = fit_near(problem.in_noise(noise_ratio), members, alphas, weights)
     rmse = problem.mean_distance(fit.residual, 2) ** 0.5
     return fit._replace(residual=rows.as_given(fit.residual), rmse=rmse)
 
@@ -170,10 +178,14 @@ def _chosen_with_noise(problem: _Problem, members: list[Tensor] | None) -> Reado
 
 
 def _chosen(
-    problem: _Problem, members: list[Tensor] | None, start: Pair | None = None
+    problem: _Problem,
+    members: list[Tensor] | None,
+    start: Pair | None = None,
+    weights: Tensor | None = None,
 ) -> ReadoutFit:
-    """Return the fit with the penalties of least held-out error."""
-    weights = problem.nothing
+    """Return the fit with the penalties of least held-out error, from weights of a search."""
+    if weights is None:
+        weights = problem.nothing
     alphas = start
     scores = {}
     for _ in range(2):
@@ -369,6 +381,14 @@ class _Problem:
             value = new
             slope = new_slope
         return readout, float(slope.norm()) / scale
+
+    def weights_of(self, readout: Readout | None) -> Tensor:
+        """Return the weights (C, K) nearest to a readout of other features at the rows."""
+        if readout is None or readout.n_outputs != len(self.units):
+            return self.nothing
+        change = readout(self.q)
+        change = torch.where(self.units > 0.0, change / self.units, 0.0)
+        return torch.linalg.lstsq(self.phi, change).solution.mT
 
     def readout(self, weights: Tensor) -> Readout:
         """Return the readout of the original features, in the units of the coordinates."""

@@ -107,7 +107,10 @@ class Auto(ErrorModel):
         if spec.expected is not None:
             comparison["expected_distance"] = spec.expected
         elif spec.held_out and weights[0] < 1.0 and _is_small(rows):
-            unsettled = blend_of(candidates.values(), weights)
+            nearby = []
+            for name, candidate in candidates.items():
+                nearby.append(candidate.starting_at(fits[name].error.settled))
+            unsettled = blend_of(nearby, weights)
             blended = np.tensordot(weights, held_out.predicted, 1)[: len(rows)]
             comparison["expected_distance"] *= _optimism(
                 unsettled, parts[:-1], by_fold, blended
@@ -132,14 +135,14 @@ class Auto(ErrorModel):
             candidates["linear"] = RegressorModel(LinearRegression())
         else:
             candidates["mechanical"] = NoCorrection()
-            candidates["parallel linear"] = LinearModel("parallel")
+            candidates["serial linear"] = LinearModel("serial")
+            candidates["serial quadratic"] = QuadraticModel("serial")
             at_tip = "parallel "
-            kinds = {"linear": LinearModel, "quadratic": QuadraticModel}
             if isinstance(spec.mechanical, ArcChain):
-                kinds["pose"] = ShapeModel
-            for coupling in ("serial", "parallel"):
-                for name, kind in kinds.items():
-                    candidates[f"{coupling} {name}"] = kind(coupling)
+                candidates["serial pose"] = ShapeModel("serial")
+                candidates["parallel pose"] = ShapeModel("parallel")
+            else:
+                candidates["parallel quadratic"] = QuadraticModel("parallel")
         candidates[f"{at_tip}ELM"] = NetworkModelCV(network)
         if n_rows <= _MOST:
             candidates[f"{at_tip}kernel"] = KernelModel()

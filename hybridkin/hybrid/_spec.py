@@ -45,6 +45,10 @@ class ErrorModel(ABC):
         """Return the error model for these settings of a HybridForwardModel."""
         return cls()
 
+    def starting_at(self, settled: ErrorModel) -> ErrorModel:
+        """Return this model for other rows; its choice may start at the settled settings."""
+        return self
+
     @abstractmethod
     def fit(self, rows: Rows, spec: Spec) -> FittedError:
         """Return the error model fitted to rows with their residuals; it does not change itself.

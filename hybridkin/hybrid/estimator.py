@@ -67,11 +67,12 @@ class HybridForwardModel(HybridPredictor):
           leave-one-out error of rows, or of groups; an infinite penalty means no correction;
         - "kernel": Gaussian kernel ridge tuned on 5 folds, for up to 10 000 rows;
         - "drop": the mechanical model alone;
-        - "auto": the blend of these models, features in both couplings, with the least error on
-          held-out groups, or rows; rows outside the fitted ones have a small weight in it. Kernel
-          ridge takes part up to 2000 rows. If the gain over the mechanical model is within its
-          standard error, nothing is added. Group rows by what will be new in use. Without a
-          mechanical model: a linear function, a network and kernel ridge.
+        - "auto": the blend of these models with the least error on held-out groups, or rows; rows
+          outside the fitted ones have a small weight in it. Linear and quadratic features are
+          serial, pose features in both couplings; mechanical models without a shape have parallel
+          quadratic features instead. Kernel ridge takes part up to 2000 rows. If the gain over the
+          mechanical model is within its standard error, nothing is added. Group rows by what will
+          be new in use. Without a mechanical model: a linear function, a network and kernel ridge.
     coupling : {"parallel", "serial"}, default="parallel"
         Where the correction acts. "parallel": at the tip, f_mech(q) + eps(q), eq. (2). "serial":
         inside the robot, f_mech(z(q) + delta(q)). z holds the lengths and bendings of a chain's
