@@ -167,11 +167,13 @@ def fit_readout(
 
 def _chosen_with_noise(problem: _Problem, members: list[Tensor] | None) -> ReadoutFit:
     """Return the fit with chosen penalties, in metres or in units of the actuators' noise."""
-    fit = _chosen(problem, members)
+    fit = _chosen(problem, members, None, problem.nothing)
     noise_ratio = problem.likeliest_ratio(torch.from_numpy(fit.residual))
     if noise_ratio == inf:
         return fit
-    in_noise = _chosen(problem.in_noise(noise_ratio), members, fit.alphas)
+    in_noise = _chosen(
+        problem.in_noise(noise_ratio), members, fit.alphas, problem.nothing
+    )
     if problem.mean_distance(in_noise.residual) < problem.mean_distance(fit.residual):
         return in_noise
     return fit
@@ -180,16 +182,13 @@ def _chosen_with_noise(problem: _Problem, members: list[Tensor] | None) -> Reado
 def _chosen(
     problem: _Problem,
     members: list[Tensor] | None,
-    start: Pair | None = None,
-    weights: Tensor | None = None,
+    alphas: Pair | None,
+    weights: Tensor,
 ) -> ReadoutFit:
-    """Return the fit with the penalties of least held-out error, from weights of a search."""
-    if weights is None:
-        weights = problem.nothing
-    alphas = start
+    """Return the fit with the penalties of least held-out error, from a start of the search."""
     scores = {}
     for _ in range(2):
-        # Linearised first without a correction, then about the one found.
+        # Linearised first about the start, then about the correction found.
         score = partial(problem.score, problem.linearised(weights), members)
         alphas, scores = _linearised.choose(score, alphas)
         weights, _ = problem.minimum(weights, problem.penalty(alphas), _FACTORS)
@@ -198,7 +197,8 @@ def _chosen(
     without = problem.mean_distance(problem.rest.numpy(force=True), 2)
     if problem.mean_distance(fit.residual, 2) > without:
         # The improvement of the linearised problem is not there in the exact one.
-        return _fitted(problem, members, (inf, inf))._replace(scores=scores)
+        nothing = _fitted(problem, members, (inf, inf), problem.nothing)
+        return nothing._replace(scores=scores)
     return fit
 
 
@@ -206,13 +206,11 @@ def _fitted(
     problem: _Problem,
     members: list[Tensor] | None,
     alphas: Pair,
-    start: Tensor | None = None,
+    weights: Tensor,
 ) -> ReadoutFit:
-    """Return the fit with given penalties, from weights `start`; residuals hold out `members`."""
+    """Return the fit with given penalties, from a start; its residuals hold out `members`."""
     penalty = problem.penalty(alphas)
-    weights, gradient = problem.minimum(
-        problem.nothing if start is None else start, penalty
-    )
+    weights, gradient = problem.minimum(weights, penalty)
     left_out = problem.x * nan
     if members != []:
         left_out = problem.in_metres(
