@@ -54,7 +54,7 @@ def test_commands_keep_the_limits_and_the_state_is_theirs(kind, limits, backend)
     sent = [HOME]
     effective = []
     errors = []
-    for target in targets(200):
+    for target in targets(200 if backend == "core" else 80):
         sent.append(np.asarray(tracker.step(target)))
         effective.append(np.asarray(tracker.effective))
         errors.append(tracker.error)
@@ -95,7 +95,7 @@ def test_the_core_commands_what_torch_does(kind, limits):
     assert core.backend == "compiled"
     # Steps in a box that does not hold the motion of the tip are less sure, see InverseKinematics.
     close = {"free": 1e-12, "speed": 1e-9, "acceleration": 1e-6}[limits]
-    for target in targets(120):
+    for target in targets(80):
         put_where(reference, core)
         command = core.step(target)
         expected = reference.step(torch.from_numpy(target))
@@ -107,8 +107,8 @@ def test_the_core_commands_what_torch_does(kind, limits):
 @KINDS
 def test_the_core_follows_a_path_as_torch_does(kind):
     ik = ik_of(OPERATORS[kind], dq_max=0.5)
-    core = ik.track(circle(100), q0=HOME)
-    reference = ik.track(torch.from_numpy(circle(100)), q0=torch.from_numpy(HOME))
+    core = ik.track(circle(50), q0=HOME)
+    reference = ik.track(torch.from_numpy(circle(50)), q0=torch.from_numpy(HOME))
     np.testing.assert_allclose(core.q, reference.q, rtol=0, atol=1e-12)
     np.testing.assert_allclose(core.effective, reference.effective, rtol=0, atol=1e-12)
 

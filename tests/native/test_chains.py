@@ -6,6 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
+from operators import operators
 
 from hybridkin import (
     ConstantCurvatureChain,
@@ -206,3 +207,21 @@ def test_play_to_the_bit(width):
             for ours, theirs in zip((found, *state), (right, *reference), strict=True):
                 assert ours.dtype == np.float64
                 assert_array_equal(ours, theirs.numpy())
+
+
+@pytest.mark.needs_core
+@pytest.mark.parametrize("kind", ["play", "plays", "creep", "plays, creep"])
+def test_hysteresis_is_that_of_numpy(kind):
+    operator = operators(9, 1e-3)[kind]
+    q = np.cumsum(1e-3 * np.random.default_rng(0).normal(size=(400, 9)), axis=0)
+    steps = np.full(len(q), 0.01)
+    start = operator._start(q[0])
+    for way, plain in (
+        (operator.apply, operator._applied),
+        (operator.command, operator._commanded),
+    ):
+        found, end = way(q, dt=steps)
+        expected, last = plain(q, start, steps)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-15)
+        again, _ = way(q, end, dt=steps)
+        np.testing.assert_allclose(again, plain(q, last, steps)[0], rtol=0, atol=1e-15)
