@@ -236,7 +236,7 @@ class HysteresisProblem:
         target = residual + by_correction @ correction.ravel()
         target = target + by_free @ weights[free].ravel()
         columns = np.concatenate([by_correction, by_free, target[..., None]], axis=2)
-        noise = np.square(self.roots * residual).sum() / (self.roots > 0.0).sum()
+        noise = np.average(residual**2, weights=self.roots**2)
         noise += _LEAST_NOISE**2 * np.nanvar(self.measured)
         return self.roots[..., None] * columns, noise, correction
 

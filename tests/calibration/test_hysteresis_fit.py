@@ -1,0 +1,89 @@
+import numpy as np
+import pytest
+import torch
+
+from hybridkin import CreepOperator, HysteresisSeries, PlayOperator, as_forward_model
+from hybridkin.calibration.hysteresis_fit import HysteresisLog, HysteresisProblem
+from hybridkin.calibration.hysteresis_search import _gain, find_hysteresis
+
+M = np.array([[1.0, 0.3, 0.0], [0.0, 0.8, -0.4], [0.2, 0.0, 1.1]])
+
+
+def log_of(operator, groups=8, rows=30, noise=1e-3):
+    """Return a log of a linear robot in which an operator stands before the model."""
+    rng = np.random.default_rng(0)
+    turn = np.linspace(0.0, 6.0, rows)
+    waves = np.stack([np.sin(turn), np.sin(2.0 * turn), np.cos(turn)])
+    q = (rng.uniform(-1.0, 1.0, (groups, 3, 3)) @ waves).transpose(0, 2, 1).reshape(-1, 3)
+    names = np.repeat(np.arange(groups), rows)
+    y = q if operator is None else operator.apply_by_group(q, names)
+    x = y @ M.T + noise * rng.standard_normal(q.shape)
+    model = as_forward_model(lambda q: q @ torch.from_numpy(M.T))
+    time = np.tile(np.arange(rows, dtype=float), groups)
+    return HysteresisLog(model, q, x, np.ones(len(q)), names, names, time)
+
+
+def test_held_out_errors_are_those_of_fits_without_each_fold():
+    log = log_of(None, groups=5, rows=4)
+    distances = HysteresisProblem(log, 0.0, creep=False).fitted(0.0, 0.0).distances
+    inputs = np.column_stack([np.ones(len(log.q)), log.q])
+    expected = np.empty(len(log.q))
+    for train, test in log.folds:
+        readout = np.linalg.lstsq(inputs[train], log.x[train], rcond=None)[0]
+        expected[test] = np.linalg.norm(log.x[test] - inputs[test] @ readout, axis=1)
+    # The weak penalty of the correction, one row, is the difference.
+    np.testing.assert_allclose(distances.mean(), expected.mean(), rtol=0.1)
+    readout = np.linalg.lstsq(inputs, log.x, rcond=None)[0]
+    fitted = np.linalg.norm(log.x - inputs @ readout, axis=1)
+    assert fitted.mean() < 0.8 * distances.mean()
+
+
+@pytest.mark.parametrize("operator", [None, PlayOperator(0.3)])
+def test_what_is_not_there_is_not_taken(operator):
+    found = find_hysteresis(log_of(operator))
+    if operator is None:
+        assert found is None
+    else:
+        assert isinstance(found, PlayOperator)
+        np.testing.assert_allclose(found.width, 0.3, rtol=0.01)
+
+
+def test_shares_of_creep_and_the_width_before_it_are_found():
+    creep = CreepOperator([0.1, 0.2], [1.0, 29.0 ** (2.0 / 3.0)])  # of the grid
+    log = log_of(HysteresisSeries([PlayOperator(0.3), creep]))
+    friction, slow = find_hysteresis(log).operators
+    np.testing.assert_allclose(friction.width, 0.3, rtol=0.02)
+    gains = dict(zip(slow.times, slow.gains, strict=True))
+    for gain, time in zip(creep.gains, creep.times, strict=True):
+        near = min(gains, key=lambda tau: abs(tau - time))
+        np.testing.assert_allclose(gains[near], gain, atol=0.05)
+
+
+def test_a_gain_must_be_above_its_error_and_above_one_percent():
+    before = np.array([1.0, 1.1, 0.9, 1.0])
+    assert _gain(before, before - [0.1, 0.12, 0.08, 0.1])[2]
+    assert not _gain(before, before - [0.3, -0.2, 0.1, -0.1])[2]
+    assert not _gain(before, before - 0.005)[2]
+
+
+def test_missing_markers_and_counts_weigh_the_rows():
+    log = log_of(PlayOperator(0.3))
+    problem = HysteresisProblem(log, 0.3, creep=True)
+    twice = np.repeat(np.arange(len(log.q)), 2)
+    doubled = HysteresisLog(
+        log.model,
+        log.q[twice],
+        log.x[twice],
+        np.ones(len(twice)),
+        log.groups[twice],
+        log.runs[twice],
+        log.time[twice],
+    )
+    weighted = HysteresisLog(
+        log.model, log.q, log.x, 2.0 * np.ones(len(log.q)), log.groups, log.runs, log.time
+    )
+    one = HysteresisProblem(doubled, 0.3, creep=False).fitted(0.2, 0.0)
+    two = HysteresisProblem(weighted, 0.3, creep=False).fitted(0.2, 0.0)
+    np.testing.assert_allclose(one.slopes, two.slopes, atol=1e-9)
+    np.testing.assert_allclose(one.distances[::2], two.distances, rtol=1e-9)
+    assert problem.fitted(0.2, 0.2).gains.max() < 0.02
