@@ -127,7 +127,10 @@ class Auto(ErrorModel):
     def _candidates(self, spec: Spec, n_rows: int) -> dict[str, ErrorModel]:
         """Return the error models by name; of equal candidates the first, simplest one wins."""
         network = ELMRegressorCV(
-            250, max_hidden=1000, random_state=copy.deepcopy(self.random_state)
+            250,
+            relevance_rounds=3,
+            max_hidden=1000,
+            random_state=copy.deepcopy(self.random_state),
         )
         candidates: dict[str, ErrorModel] = {}
         at_tip = ""

@@ -218,7 +218,9 @@ def models_to_save(
         without_error_model: HybridForwardModel(model, "drop"),
         DATA_QUADRATIC: HybridForwardModel(None, quadratic()),
     }
-    network = ELMRegressorCV(250, max_hidden=1000, random_state=0)  # as in auto
+    network = ELMRegressorCV(
+        250, relevance_rounds=3, max_hidden=1000, random_state=0
+    )  # as in auto
     if settings.auto:
         models[DATA_ELM] = HybridForwardModel(None, network)
         models[AUTO] = _auto(robot, model, settings)
