@@ -20,10 +20,13 @@ from pathlib import Path
 import numpy as np
 
 from hybridkin import (
+    CreepOperator,
     ElasticTendonChain,
     ELMRegressor,
     HybridForwardModel,
+    HysteresisSeries,
     InverseKinematics,
+    PrandtlIshlinskiiOperator,
     datasets,
     native,
     robots,
@@ -48,6 +51,12 @@ MODELS = {
     "network": lambda: fitted(ELMRegressor(30, random_state=0)),
     "serial": lambda: fitted("quadratic", coupling="serial"),
 }
+HYSTERESIS = HysteresisSeries(
+    [
+        PrandtlIshlinskiiOperator([0.0, 0.001, 0.003], [0.3, 0.6]),
+        CreepOperator([0.1], [2.0]),
+    ]
+)
 CONTROLLERS = {
     "trunk": lambda: InverseKinematics(TRUNK, dq_max=0.1, ddq_max=2.0, **LIMITS),
     "network": lambda: InverseKinematics(MODELS["network"](), **LIMITS),
@@ -56,6 +65,9 @@ CONTROLLERS = {
         q_min=-0.004,
         q_max=0.004,
         dt=0.01,
+    ),
+    "hysteresis": lambda: InverseKinematics(
+        fitted("linear", play=HYSTERESIS), dq_max=0.1, **LIMITS
     ),
     "pose": lambda: InverseKinematics(tasks.PoseTask(TRUNK), **LIMITS),
     "half-space": lambda: InverseKinematics(
