@@ -14,7 +14,7 @@ from scipy.optimize import nnls
 from hybridkin._core.arrays import LARGEST
 from hybridkin._core.model import ForwardModel
 from hybridkin.calibration.measured import folds
-from hybridkin.chains.creep import CreepOperator, slow_shares
+from hybridkin.chains.creep import CreepOperator
 from hybridkin.chains.hysteresis import HysteresisOperator
 from hybridkin.chains.play import PlayOperator
 from hybridkin.chains.prandtl_ishlinskii import PrandtlIshlinskiiOperator
@@ -140,7 +140,12 @@ class HysteresisProblem:
         changes = np.stack([*-np.diff(plays, axis=0), plays[-1]], axis=1)
         self.changes = changes[log.rows]  # (C, K + 1, n), of which u is a weighted sum
         self.times = log.times if creep else np.empty(0)
-        late = _slow_states(changes, log, self.times)[:, log.rows] - self.changes
+        flat = changes.reshape(len(changes), -1)
+        late = []
+        for time in self.times:
+            half = CreepOperator([0.5], [time])  # y - u = (S(u) - u) / 2
+            late.append(2.0 * (half.apply_by_group(flat, log.runs, log.time) - flat))
+        late = np.reshape(late, (len(late), *changes.shape))[:, log.rows]
         self.late = late.transpose(1, 0, 2, 3)  # (C, J, K + 1, n)
         self.measured = log.x[log.rows]
         roots = np.sqrt(log.counts[log.rows])[:, None]
@@ -239,20 +244,6 @@ class HysteresisProblem:
         noise = np.average(residual**2, weights=self.roots**2)
         noise += _LEAST_NOISE**2 * np.nanvar(self.measured)
         return self.roots[..., None] * columns, noise, correction
-
-
-def _slow_states(changes: NDArray, log: HysteresisLog, times: NDArray) -> NDArray:
-    """Return the slow states (J, N, K, n) of creep that changes (N, K, n) lead to."""
-    slow = np.empty((len(times), *changes.shape))
-    for name in np.unique(log.runs):
-        run = np.flatnonzero(log.runs == name)
-        steps = np.diff(log.time[run], prepend=log.time[run[0]])
-        state = np.tile(changes[run[0]], (len(times), 1, 1))
-        decays = slow_shares(steps, times)[..., None, None]
-        for row, decay in zip(run, decays, strict=True):
-            state = changes[row] + decay * (state - changes[row])
-            slow[:, row] = state
-    return slow
 
 
 class _LeastSquares(NamedTuple):
