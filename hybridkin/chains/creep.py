@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybridkin._core.arrays import real_array
-from hybridkin._core.kernel_numbers import HK_CREEP_ROUNDING, HK_MAX_CREEPS
+from hybridkin._core.kernel_numbers import HK_MAX_CREEPS
 from hybridkin.chains.hysteresis import HysteresisOperator
 from hybridkin.native.hysteresis import Stage
 
@@ -103,9 +103,9 @@ class CreepOperator(HysteresisOperator[CreepState]):
 
     def stages(self, n: int) -> list[Stage]:
         """Return the operator of n actuators as one stage of creep."""
-        times = self.times
-        gains = np.broadcast_to(self._gains(times), (len(times), n))
-        return [Stage(-len(times), (gains, times))]
+        size = len(self.times)
+        gains = np.broadcast_to(self.gains.reshape(size, -1), (size, n))
+        return [Stage(-size, (gains, self.times))]
 
     def packed(self, state: CreepState) -> NDArray:
         """Return a state as the kernels keep it (J + 2, n); its result is not known."""
@@ -114,51 +114,6 @@ class CreepOperator(HysteresisOperator[CreepState]):
     def unpacked(self, rows: NDArray) -> CreepState:
         """Return the state of rows (J + 2, n) of `packed`."""
         return CreepState(rows[0], rows[1:-1])
-
-    def _applied(
-        self, rows: NDArray, start: CreepState, steps: NDArray
-    ) -> tuple[NDArray, CreepState]:
-        gains = self._gains(rows)
-        at_once = 1.0 - gains.sum(axis=0)
-        command, slow = start
-        result = np.empty_like(rows)
-        decays = slow_shares(steps, self.times).astype(rows.dtype)
-        for t, decay in enumerate(decays):
-            command = rows[t]
-            slow = command + decay[:, None] * (slow - command)
-            result[t] = at_once * command + (gains * slow).sum(axis=0)
-        return result, CreepState(command, slow)
-
-    def _commanded(
-        self, rows: NDArray, start: CreepState, steps: NDArray
-    ) -> tuple[NDArray, CreepState]:
-        gains = self._gains(rows)
-        command, slow = start
-        result = np.empty_like(rows)
-        decays = slow_shares(steps, self.times).astype(rows.dtype)
-        for t, decay in enumerate(decays):
-            # y = (1 - sum of late) q + late @ slow, with the shares that have not come yet.
-            late = gains * decay[:, None]
-            at_once = 1.0 - late.sum(axis=0)
-            moved = (rows[t] - (late * slow).sum(axis=0)) / at_once
-            # Rounding is no reversal, after which a backlash before this operator would jump.
-            size = np.abs(rows[t]) + (late * np.abs(slow)).sum(axis=0)
-            eps = np.finfo(rows.dtype).eps
-            rounding = HK_CREEP_ROUNDING * eps * size / at_once
-            command = np.where(np.abs(moved - command) <= rounding, command, moved)
-            slow = command + decay[:, None] * (slow - command)
-            result[t] = command
-        return result, CreepState(command, slow)
-
-    def _gains(self, rows: NDArray) -> NDArray:
-        """Return the gains (J, 1) or (J, n) in the precision of rows."""
-        return self.gains.reshape(len(self.gains), -1).astype(rows.dtype)
-
-
-def slow_shares(steps: NDArray, times: NDArray) -> NDArray:
-    """Return what is left of a change after steps (T,) for time constants (J,), (T, J)."""
-    with np.errstate(over="ignore", under="ignore"):  # far longer or shorter steps
-        return np.exp(-steps[:, None] / times)
 
 
 def _are_shares(gains: NDArray) -> bool:

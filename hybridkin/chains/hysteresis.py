@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from hybridkin._core.arrays import check_shape, labels, real_array
+from hybridkin.chains._stages import follow_in_numpy
 from hybridkin.native.hysteresis import Stage, follow
 from hybridkin.native.library import available
 
@@ -156,13 +157,14 @@ class HysteresisOperator(ABC, Generic[_State]):
         self, rows: NDArray, start: _State, steps: NDArray, lead: bool
     ) -> tuple[NDArray, _State]:
         """Return effective changes (or with `lead` commands), and the last state."""
-        if len(rows) and rows.dtype == np.float64 and available():
-            state = self.packed(start).astype(np.float64)
-            result = follow(self.stages(rows.shape[1]), rows, steps, state, lead)
-            return result, self.unpacked(state)
-        if lead:
-            return self._commanded(rows, start, steps)
-        return self._applied(rows, start, steps)
+        if not len(rows):
+            return rows, start
+        follow_rows = follow_in_numpy
+        if rows.dtype == np.float64 and available():
+            follow_rows = follow
+        state = self.packed(start).astype(rows.dtype)
+        result = follow_rows(self.stages(rows.shape[1]), rows, steps, state, lead)
+        return result, self.unpacked(state)
 
     @property
     @abstractmethod
@@ -172,18 +174,6 @@ class HysteresisOperator(ABC, Generic[_State]):
     @abstractmethod
     def _start(self, row: NDArray) -> _State:
         """Return the state without hysteresis at a row (n,)."""
-
-    @abstractmethod
-    def _applied(
-        self, rows: NDArray, start: _State, steps: NDArray
-    ) -> tuple[NDArray, _State]:
-        """Return the effective changes of commands (T, n) after steps (T,), and the last state."""
-
-    @abstractmethod
-    def _commanded(
-        self, rows: NDArray, start: _State, steps: NDArray
-    ) -> tuple[NDArray, _State]:
-        """Return the commands of effective changes (T, n) after steps (T,), and the last state."""
 
     def _checked(
         self, motion: Any, state: _State | None, name: str

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,7 +9,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybridkin._core.arrays import real_array
 from hybridkin.chains.hysteresis import HysteresisOperator
-from hybridkin.chains.play import played
 from hybridkin.native.hysteresis import Stage
 
 __all__ = ["HysteresisState", "PrandtlIshlinskiiOperator"]
@@ -108,8 +106,10 @@ class PrandtlIshlinskiiOperator(HysteresisOperator[HysteresisState]):
 
     def stages(self, n: int) -> list[Stage]:
         """Return the operator of n actuators as one stage of all plays."""
-        half, slopes = self._half_and_slopes(np.empty((0, n)))
-        return [Stage(len(half), (np.broadcast_to(half, slopes.shape), slopes))]
+        slopes = np.ones((len(self.widths), n))  # the last are 1
+        slopes[:-1] = self.slopes.reshape(len(self.slopes), -1)
+        half = np.broadcast_to(0.5 * self.widths[:, None], slopes.shape)
+        return [Stage(len(half), (half, slopes))]
 
     def packed(self, state: HysteresisState) -> NDArray:
         """Return a state as the kernels keep it (K + 2, n)."""
@@ -118,52 +118,6 @@ class PrandtlIshlinskiiOperator(HysteresisOperator[HysteresisState]):
     def unpacked(self, rows: NDArray) -> HysteresisState:
         """Return the state of rows (K + 2, n) of `packed`."""
         return HysteresisState(rows[0], rows[-1], rows[1:-1])
-
-    def _half_and_slopes(self, rows: NDArray) -> tuple[NDArray, NDArray]:
-        """Return half the widths (K, 1), and the slopes (K, n), of which the last are 1."""
-        slopes = np.ones((len(self.widths), rows.shape[1]), rows.dtype)
-        slopes[:-1] = self.slopes.reshape(len(self.slopes), -1)
-        return 0.5 * self.widths[:, None].astype(rows.dtype), slopes
-
-    def _applied(
-        self, rows: NDArray, start: HysteresisState, steps: NDArray
-    ) -> tuple[NDArray, HysteresisState]:
-        half, slopes = self._half_and_slopes(rows)
-        plays = [
-            played(rows, effective, half_width)
-            for effective, half_width in zip(start.plays, half, strict=True)
-        ]
-        result = plays[-1].copy()
-        for k, (inner, outer) in enumerate(pairwise(plays)):
-            result += slopes[k] * (inner - outer)
-        if not len(rows):
-            return result, start
-        last = np.stack([effective[-1] for effective in plays])
-        return result, HysteresisState(rows[-1], result[-1].copy(), last)
-
-    def _commanded(
-        self, rows: NDArray, start: HysteresisState, steps: NDArray
-    ) -> tuple[NDArray, HysteresisState]:
-        command, effective, plays = start
-        half, slopes = self._half_and_slopes(rows)
-        actuators = np.arange(rows.shape[1])
-        result = np.empty_like(rows)
-        for t, row in enumerate(rows):
-            direction = np.sign(row - effective)
-            # Along this direction, play k moves from this command on, at this effective change.
-            begins = direction * plays + half
-            levels = np.empty_like(begins)
-            levels[0] = direction * effective
-            levels[1:] = levels[0] + np.cumsum(slopes[:-1] * np.diff(begins, axis=0), 0)
-            moving = (levels < direction * row).sum(axis=0) - 1  # the widest one
-            at = moving, actuators
-            beyond = (direction * row - levels[at]) / slopes[at]
-            ahead = direction * (begins[at] + beyond)
-            command = np.where(direction == 0.0, command, ahead)
-            plays = np.clip(plays, command - half, command + half)
-            effective = row
-            result[t] = command
-        return result, HysteresisState(command, effective, plays)
 
 
 def _are_valid(numbers: NDArray, dimensions: tuple[int, ...]) -> bool:

@@ -98,24 +98,6 @@ class HysteresisSeries(HysteresisOperator[tuple]):
             rows = rows[n_rows - 1 :]
         return tuple(states)
 
-    def _applied(
-        self, rows: NDArray, start: tuple, steps: NDArray
-    ) -> tuple[NDArray, tuple]:
-        ends = []
-        for operator, state in zip(self.operators, start, strict=True):
-            rows, end = operator._applied(rows, state, steps)
-            ends.append(end)
-        return rows, tuple(ends)
-
-    def _commanded(
-        self, rows: NDArray, start: tuple, steps: NDArray
-    ) -> tuple[NDArray, tuple]:
-        ends = []
-        for operator, state in zip(self.operators[::-1], start[::-1], strict=True):
-            rows, end = operator._commanded(rows, state, steps)
-            ends.append(end)
-        return rows, tuple(ends[::-1])
-
     def _checked_state(self, state: Any, n: int) -> tuple:
         if not isinstance(state, tuple) or len(state) != len(self.operators):
             raise TypeError(

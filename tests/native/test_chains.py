@@ -16,6 +16,7 @@ from hybridkin import (
     RigidChain,
 )
 from hybridkin._core.plan import Plan
+from hybridkin.chains._stages import follow_in_numpy
 from hybridkin.native.library import Program
 
 pytestmark = pytest.mark.needs_core
@@ -215,13 +216,13 @@ def test_hysteresis_is_that_of_numpy(kind):
     operator = operators(9, 1e-3)[kind]
     q = np.cumsum(1e-3 * np.random.default_rng(0).normal(size=(400, 9)), axis=0)
     steps = np.full(len(q), 0.01)
-    start = operator._start(q[0])
-    for way, plain in (
-        (operator.apply, operator._applied),
-        (operator.command, operator._commanded),
-    ):
+    stages = operator.stages(9)
+    for way, lead in ((operator.apply, False), (operator.command, True)):
+        state = operator.packed(operator._start(q[0]))
         found, end = way(q, dt=steps)
-        expected, last = plain(q, start, steps)
+        expected = follow_in_numpy(stages, q, steps, state, lead)
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-15)
         again, _ = way(q, end, dt=steps)
-        np.testing.assert_allclose(again, plain(q, last, steps)[0], rtol=0, atol=1e-15)
+        expected = follow_in_numpy(stages, q, steps, state, lead)
+        np.testing.assert_allclose(again, expected, rtol=0, atol=1e-15)
+
