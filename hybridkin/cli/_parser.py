@@ -233,9 +233,9 @@ def _fit(command: argparse.ArgumentParser) -> None:
     The check of the log comes first. Errors (a frozen sensor, wrong units, NaN) stop the fit with
     advice and exit code 2. Warnings are printed and stand in the report.
 
-    The fit looks for backlash (also called play) and dry friction: the tip then depends on where
-    the tendons came from. Backlash is kept only if it lowers the errors on held-out motions. Its
-    motions must have names, and their rows must be in the order of time. --play 0: no backlash.
+    The fit looks for backlash (also called play), smooth friction and creep: the tip then depends
+    on where the tendons came from. They are kept only if they lower the errors on held-out motions.
+    Motions must have names, and their rows must be in the order of time. --play 0: none of these.
     """
     add = command.add_argument
     add("log", type=Path, metavar="LOG", help="CSV, npz or parquet file")
@@ -273,7 +273,7 @@ def _fit(command: argparse.ArgumentParser) -> None:
         default="detect",
         metavar="auto|WIDTH",
         help='backlash (play) of the actuators in the "auto" hybrid: its total width in the unit '
-        "of q; auto: estimated in every fold (auto if the log shows backlash)",
+        "of q; auto: backlash, friction and creep, found in every fold (auto if the log shows any)",
     )
     few = "use at most N rows, every k-th of a longer log; 0: all rows (2000)"
     number = between(-1, float("inf"), int)
@@ -373,8 +373,8 @@ def _track(command: argparse.ArgumentParser) -> None:
 
     The first rows have the status LEAD_IN. They lead to the path from where the robot stands:
     --from rest (no tendon pulled), --from=A,B,... (a value of every actuator in the unit and sign
-    of the log), or --from path (no such rows). For a model with backlash (play) the columns of the
-    actuators are what to send, and the columns effective_... what the actuators do.
+    of the log), or --from path (no such rows). For a model with backlash or creep the columns of
+    the actuators are what to send, and the columns effective_... what the actuators do.
     """
     add = command.add_argument
     _add_model(command)
