@@ -205,4 +205,4 @@ def test_track_with_play_tells_what_to_send_and_what_it_does(playful, tmp_path, 
     target = 1e-3 * np.column_stack([table["target_" + axis] for axis in "xyz"])
     model = load_model(playful / "model.safetensors")
     assert np.linalg.norm(model.predict(sent) - target, axis=1).max() < 1e-4
-    assert "actuators: 0.4 mm" in run(capsys, "describe", playful)[1]
+    assert "The actuators have backlash 0.4 mm." in run(capsys, "describe", playful)[1]

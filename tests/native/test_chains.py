@@ -225,4 +225,3 @@ def test_hysteresis_is_that_of_numpy(kind):
         again, _ = way(q, end, dt=steps)
         expected = follow_in_numpy(stages, q, steps, state, lead)
         np.testing.assert_allclose(again, expected, rtol=0, atol=1e-15)
-
