@@ -338,7 +338,7 @@ def _timed(
     robot.tick(x[0], None, None)  # sets what is given
     # The call alone: `tracker.step` adds Python around it.
     call, place, at = robot._follow, robot._call.place, robot.q
-    target = robot._inputs[min(robot._inputs)]
+    target = robot._inputs[0].numbers
     times, starts = np.empty((len(q), RUNS), dtype=np.int64), np.empty_like(q)
     clock = time.perf_counter_ns
     for i in range(len(q)):
