@@ -89,14 +89,14 @@ def search_width(
             error, bounds=bounds, method="bounded", options=options
         )
         best = min(best, float(minimum.x), key=error)
-    gain, std_error, kept = _gain(errors_of(0.0), errors_of(best))
+    gain = _gain(errors_of(0.0), errors_of(best))
     return WidthSearch(
         best,
         np.array(widths),
         np.array([error(width) for width in widths]),
-        gain,
-        std_error,
-        kept,
+        gain.mean,
+        gain.std_error,
+        gain.clear,
     )
 
 
@@ -130,17 +130,15 @@ def find_hysteresis(log: HysteresisLog) -> HysteresisOperator | None:
     else:
         backlash = _Candidate.of(log, width, _NONE)
         with_creep = _Candidate.of(log, width, _CREEP)
-        if _gain(backlash.errors, with_creep.errors)[2]:
+        if _gain(backlash.errors, with_creep.errors).clear:
             with_creep = _with_width_again(log, with_creep)
         candidates += [backlash, creep, with_creep]
         candidates += [_Candidate.of(log, width, spreads) for spreads in _SMOOTH]
         width = with_creep.width
         candidates += [_Candidate.of(log, width, both) for both in _SMOOTH_AND_CREEP]
     least = min(candidates, key=_Candidate.error)
-    for candidate in candidates:
-        if not _gain(candidate.errors, least.errors)[2]:
-            return candidate.operator
-    return None
+    as_good = (c for c in candidates if not _gain(c.errors, least.errors).clear)
+    return next(as_good).operator
 
 
 class _Candidate(NamedTuple):
@@ -180,10 +178,18 @@ def _with_width_again(log: HysteresisLog, candidate: _Candidate) -> _Candidate:
     return min(tried, key=_Candidate.error)
 
 
-def _gain(before: NDArray, after: NDArray) -> tuple[float, float, bool]:
-    """Return the mean reduction of the errors of groups, its standard error, and if it is clear."""
+class _Gain(NamedTuple):
+    """Mean reduction of the errors of groups [m], its standard error, and whether it is clear."""
+
+    mean: float
+    std_error: float
+    clear: bool
+
+
+def _gain(before: NDArray, after: NDArray) -> _Gain:
+    """Return the gain of errors of groups (G,) over those before."""
     gains = before - after
-    gain = float(gains.mean())
+    mean = float(gains.mean())
     std_error = float(gains.std(ddof=1) / np.sqrt(len(gains)))
-    clear = gain > max(std_error, _LEAST_GAIN * float(before.mean()))
-    return gain, std_error, clear
+    clear = mean > max(std_error, _LEAST_GAIN * float(before.mean()))
+    return _Gain(mean, std_error, clear)

@@ -258,9 +258,14 @@ def play_widths(model: HybridForwardModel | None) -> list[float] | None:
 
 
 def hysteresis_in_words(model: HybridForwardModel) -> str:
-    """Return the kinds of hysteresis that the actuators have, with their widths."""
-    if model.play_ is None:
-        return "no hysteresis"
+    """Return the kinds of hysteresis that the actuators have, with their widths.
+
+    Parameters
+    ----------
+    model : HybridForwardModel
+        A model with hysteresis.
+    """
+    assert model.play_ is not None
     words = []
     for part in model.play_.parts:
         width = _in_metres(model, part.width).max()
