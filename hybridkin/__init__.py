@@ -3,6 +3,7 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from hybridkin._core.first_use import on_first_use
 from hybridkin._core.version import __version__
 
 if TYPE_CHECKING:
@@ -97,17 +98,25 @@ _NAMES_OF = {
     "saving.saved_model": ("load_model", "save_model"),
     "viewer": ("view",),
 }
-_MODULE_OF = {name: module for module, names in _NAMES_OF.items() for name in names}
-_FOLDER_OF = {"robots": "chains.", "tasks": "ik.", "trajectories": "ik."}
+_FOLDER_OF = {
+    "datasets": "",
+    "native": "",
+    "plots": "",
+    "robots": "chains.",
+    "tasks": "ik.",
+    "trajectories": "ik.",
+    "workflow": "",
+}
+
+
+_open_name = on_first_use(__name__, _NAMES_OF)
 
 
 def __getattr__(name: str) -> Any:
     """Open public names on first use: torch and scikit-learn take seconds to import."""
-    if name in _MODULE_OF:
-        return getattr(import_module(f"hybridkin.{_MODULE_OF[name]}"), name)
-    if name in __all__:
-        return import_module(f"hybridkin.{_FOLDER_OF.get(name, '')}{name}")
-    raise AttributeError(f"module 'hybridkin' has no attribute {name!r}")
+    if name in _FOLDER_OF:
+        return import_module(f"hybridkin.{_FOLDER_OF[name]}{name}")
+    return _open_name(name)
 
 
 def __dir__() -> list[str]:

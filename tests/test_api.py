@@ -85,6 +85,39 @@ def test_only_plots_uses_matplotlib_and_only_the_command_line_prints():
                 assert node.func.id != "print" or folder_of(path) == "cli"
 
 
+def loaded_by(code):
+    """Return the names of all modules that a new process has loaded after this code."""
+    code += "; import sys; print(*sys.modules, file=sys.stderr)"
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    return set(done.stderr.split())
+
+
+ROBOT = Path(__file__).parents[1] / "examples/robots/ftdcr_v4.toml"
+HEAVY = {"matplotlib", "pandas", "pytorch_kinematics", "scipy.optimize", "scipy.sparse", "sklearn"}
+
+
+@pytest.mark.slow
+def test_what_needs_no_torch_does_not_load_it():
+    assert "torch" not in loaded_by("import hybridkin")
+    assert "torch" not in loaded_by("from hybridkin.cli._parser import parser; parser()")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "code",
+    [
+        "robot = hybridkin.robots.read_description({robot!r}); robot.chain",
+        "import torch; hybridkin.ForceTendonChain([0.01], [0.1]).backbone(torch.ones(3))",
+        "from hybridkin.cli.main import main; main(['describe', {robot!r}])",
+    ],
+)
+def test_a_chain_and_its_description_load_neither_learning_nor_optimisation(code):
+    loaded = loaded_by("import hybridkin; " + code.format(robot=str(ROBOT)))
+    assert not HEAVY & loaded
+    for name in ("hybrid.estimator", "calibration.calibrate", "ik.solver", "workflow.compare"):
+        assert f"hybridkin.{name}" not in loaded
+
+
 @pytest.mark.slow
 def test_import_is_light():
     code = (

@@ -12,7 +12,6 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import issparse
 from torch import Tensor
 
 from hybridkin._core.forks import THREADS
@@ -62,7 +61,7 @@ def real_array(value: Numbers | Transform, name: str) -> NDArray:
         raise ValueError(
             f"`{name}` has masked entries; drop these rows, or fill them with NaN."
         )
-    if issparse(value):
+    if hasattr(value, "toarray"):
         raise TypeError(
             f"`{name}` must be dense, got a sparse matrix; use `.toarray()`."
         )

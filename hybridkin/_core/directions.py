@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy  # its folders are imported when they are used
 from numpy.typing import NDArray
-from scipy.optimize import linprog
 
 _EXCITED = 0.01  # of the largest spread
 # of the largest value: a range below it is none.
@@ -97,7 +97,9 @@ def few_terms(directions: NDArray) -> NDArray:
     def shortest(entry: NDArray) -> NDArray:
         fixed = np.pad(entry, (0, P))[None]
         zeros = np.zeros(2 * P)
-        solution = linprog(cost, above, zeros, fixed, [1.0], bounds=(None, None))
+        solution = scipy.optimize.linprog(
+            cost, above, zeros, fixed, [1.0], bounds=(None, None)
+        )
         coefficients = entry  # the nearest vector, if there is no solution
         if solution.x is not None:
             coefficients = solution.x[:K]

@@ -9,8 +9,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 
 import torch
 from numpy.typing import NDArray
-from sklearn.base import BaseEstimator
-from sklearn.utils.validation import check_is_fitted
 from torch import Tensor, nn
 from torch.autograd import grad
 
@@ -375,7 +373,10 @@ def as_forward_model(model: object) -> ForwardModel:
     if isinstance(model, Fitted):
         return as_forward_model(model.module_)
     if not callable(model):
-        if isinstance(model, BaseEstimator):
+        if hasattr(model, "get_params"):
+            # Takes a second; the estimator has loaded it.
+            from sklearn.utils.validation import check_is_fitted
+
             check_is_fitted(model)
         raise TypeError(
             "`model` must be a torch module, a callable q -> x or a fitted regressor with a "

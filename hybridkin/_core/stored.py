@@ -6,17 +6,14 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from sklearn.base import BaseEstimator
 from torch import Tensor
 
 from hybridkin._core.arrays import as_array, check_shape
-
-_Estimator = TypeVar("_Estimator", bound=BaseEstimator)
 
 
 class Layout(NamedTuple):
@@ -205,38 +202,3 @@ def plain(value: object) -> Any:
     if isinstance(value, (list, tuple)):
         return [plain(entry) for entry in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def params_of(estimator: BaseEstimator) -> dict[str, Any]:
-    """Return the parameters of an estimator as JSON values.
-
-    The device, and a random state that is not a number, become None.
-    """
-    params = plain(estimator.get_params(deep=False))
-    for name in {"device", "random_state"} & {*params}:
-        if type(params[name]) is not int:
-            params[name] = None
-    return params
-
-
-def estimator_of(cls: type[_Estimator], params: dict[str, Any]) -> _Estimator:
-    """Return an estimator with the given parameters; unknown ones are ignored."""
-    defaults = cls().get_params(deep=False)
-    settings = {}
-    for name, value in params.items():
-        if name not in defaults:
-            continue
-        if isinstance(defaults[name], tuple) and type(value) is list:
-            value = tuple(value)
-        settings[name] = value
-    return cls(**settings)
-
-
-def restore_columns(estimator: Any, stored: Stored, n: int) -> None:
-    """Set the number of columns, and their names if there are any, as scikit-learn keeps them."""
-    estimator.n_features_in_ = n
-    names = stored.list_of(str, "feature_names_in")
-    if names and len(names) != n:
-        raise ValueError(f"`feature_names_in` must be {n} names, got {len(names)}")
-    if names:
-        estimator.feature_names_in_ = np.array(names, dtype=object)

@@ -12,8 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import torch
 
+from hybridkin._core.arrays import shaped
+from hybridkin._core.rotations import rotation
 from hybridkin._core.units import METRES, UNITS
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
@@ -330,7 +332,8 @@ def _base(table: Mapping[str, Any]) -> np.ndarray:
     pose = np.eye(4)
     pose[:3, 3] = table.get("position", 0.0)
     turn = table.get("rotation_vector_deg", [0.0, 0.0, 0.0])
-    pose[:3, :3] = Rotation.from_rotvec(turn, degrees=True).as_matrix()
+    angles = np.radians(shaped(turn, "rotation_vector_deg", [3]))
+    pose[:3, :3] = rotation(torch.from_numpy(angles))[0].numpy()
     return pose
 
 

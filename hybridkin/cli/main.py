@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from hybridkin.workflow import LoadedModel, MeasuredLog, PathLimits, Report
 
 _DT = 0.02
+_LIGHT = ("describe", "init")  # commands that compute little
 _INSIDE = 0.8  # least share of a path in the domain, else the exit code is 1
 # What the user can correct is printed without a traceback.
 _OF_INPUT = (ValueError, TypeError, OSError, ImportError, MemoryError)
@@ -52,7 +53,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser().parse_args(argv)
     stages = Stages(arguments.quiet)
     try:
-        _ = hybridkin.robots  # loads the libraries whose threads are limited
+        # Loads the libraries whose threads are limited.
+        if arguments.command in _LIGHT:
+            _ = hybridkin.robots
+        else:
+            _ = hybridkin.HybridForwardModel
         # Several threads cost many times the CPU time: the matrices are small.
         with (
             contextlib.closing(stages),

@@ -1,15 +1,20 @@
 """Measured and simulated data: pairs of actuator vectors and tip positions, in SI units."""
 
+from typing import TYPE_CHECKING
+
+from hybridkin._core.first_use import on_first_use
 from hybridkin.datasets._log_checks import LogFinding, LogReport, check_log
 from hybridkin.datasets._logs import Log, load_log, log_columns
-from hybridkin.datasets._recordings import (
-    load_armlab,
-    load_asl_trunk,
-    load_asu_bellows,
-    load_ftdcr,
-    load_soromox_tentacle,
-)
-from hybridkin.datasets._shipped import load_trunk, paper_split
+
+if TYPE_CHECKING:
+    from hybridkin.datasets._recordings import (
+        load_armlab,
+        load_asl_trunk,
+        load_asu_bellows,
+        load_ftdcr,
+        load_soromox_tentacle,
+    )
+    from hybridkin.datasets._shipped import load_trunk, paper_split
 
 __all__ = [
     "Log",
@@ -26,3 +31,16 @@ __all__ = [
     "log_columns",
     "paper_split",
 ]
+
+# Their results are Bunches of scikit-learn.
+_NAMES_OF = {
+    "_recordings": (
+        "load_armlab",
+        "load_asl_trunk",
+        "load_asu_bellows",
+        "load_ftdcr",
+        "load_soromox_tentacle",
+    ),
+    "_shipped": ("load_trunk", "paper_split"),
+}
+__getattr__ = on_first_use(__name__, _NAMES_OF)

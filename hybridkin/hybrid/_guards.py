@@ -479,6 +479,10 @@ class GroupDistance(PortableModule):
             nearest = torch.cdist(q @ axes, rows @ axes).argmin(1)
         return ((q - rows[nearest]) @ axes).square().sum(1)
 
+    def distances(self, q: Tensor) -> Tensor:
+        """Return the distances (N,) of rows q (N, n); the range of an actuator is 2."""
+        return self.domain_distance(q).sqrt() * self.farthest
+
 
 class Plane(PortableModule):
     """The plane of q in which a log lies; outside it neither log nor mechanics say what happens.

@@ -13,15 +13,13 @@ from sklearn.kernel_ridge import KernelRidge
 from sklearn.linear_model import LinearRegression
 
 from hybridkin._core.arrays import LARGEST
+from hybridkin._core.estimators import estimator_of, params_of, restore_columns
 from hybridkin._core.model import PortableModule, as_forward_model
 from hybridkin._core.stored import (
     KINDS_OF_MODELS,
     Restore,
     Stored,
-    estimator_of,
-    params_of,
     plain,
-    restore_columns,
 )
 
 # Their chains are among the kinds that a description may hold.

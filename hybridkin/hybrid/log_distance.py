@@ -10,12 +10,8 @@ from hybridkin.hybrid._guards import GroupDistance
 
 
 def held_out_distances(train: NDArray, groups: NDArray, test: NDArray) -> NDArray:
-    """Return the distances of held-out rows (N, n) from training rows, see `distances`."""
+    """Return the distances of held-out rows (N, n) from training rows; an actuator spans 2."""
     measure = GroupDistance.fit(torch.from_numpy(train), groups)
-    return np.zeros(len(test)) if measure is None else distances(measure, test)
-
-
-def distances(measure: GroupDistance, q: NDArray) -> NDArray:
-    """Return the distances of rows q (N, n) from the log; the range of an actuator is 2."""
-    relative = measure.domain_distance(torch.from_numpy(q)).sqrt()
-    return (relative * measure.farthest).numpy()
+    if measure is None:
+        return np.zeros(len(test))
+    return measure.distances(torch.from_numpy(test)).numpy()

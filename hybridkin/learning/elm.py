@@ -13,7 +13,8 @@ from sklearn.utils.validation import check_is_fitted
 
 from hybridkin._core.arrays import copied, real_array
 from hybridkin._core.blocks import in_blocks
-from hybridkin._core.stored import Stored, estimator_of, params_of, restore_columns
+from hybridkin._core.estimators import estimator_of, params_of, restore_columns
+from hybridkin._core.stored import Stored
 from hybridkin.learning._ridge import (
     BLOCK_ELEMENTS,
     Statistics,

@@ -1,20 +1,25 @@
 """From a log to a model, a report and a track: the functions behind the command line."""
 
-from hybridkin.workflow.compare import FitSettings
+from typing import TYPE_CHECKING
+
+from hybridkin._core.first_use import on_first_use
 from hybridkin.workflow.description import Description, describe
-from hybridkin.workflow.domain import PathLimits, path_limits
-from hybridkin.workflow.evaluate import Evaluation, evaluate_log
-from hybridkin.workflow.export import export_model
-from hybridkin.workflow.film import animate_track
-from hybridkin.workflow.fit import fit_log
-from hybridkin.workflow.fit_record import FitRecord
 from hybridkin.workflow.log import LogError, MeasuredLog, read_log
 from hybridkin.workflow.model import LOG_SUFFIXES, LoadedModel, open_model
-from hybridkin.workflow.path import read_path, scaled_path, shape_path
-from hybridkin.workflow.planning import next_rows
 from hybridkin.workflow.report import Report
-from hybridkin.workflow.track import TrackRecord, track_path
-from hybridkin.workflow.verify import Verification, verify_track
+
+if TYPE_CHECKING:
+    from hybridkin.workflow.compare import FitSettings
+    from hybridkin.workflow.domain import PathLimits, path_limits
+    from hybridkin.workflow.evaluate import Evaluation, evaluate_log
+    from hybridkin.workflow.export import export_model
+    from hybridkin.workflow.film import animate_track
+    from hybridkin.workflow.fit import fit_log
+    from hybridkin.workflow.fit_record import FitRecord
+    from hybridkin.workflow.path import read_path, scaled_path, shape_path
+    from hybridkin.workflow.planning import next_rows
+    from hybridkin.workflow.track import TrackRecord, track_path
+    from hybridkin.workflow.verify import Verification, verify_track
 
 __all__ = [
     "LOG_SUFFIXES",
@@ -44,3 +49,35 @@ __all__ = [
     "track_path",
     "verify_track",
 ]
+
+# A description of a robot needs no fit and no inverse kinematics.
+_NAMES_OF = {
+    "compare": ("FitSettings",),
+    "domain": (
+        "PathLimits",
+        "path_limits",
+    ),
+    "evaluate": (
+        "Evaluation",
+        "evaluate_log",
+    ),
+    "export": ("export_model",),
+    "film": ("animate_track",),
+    "fit": ("fit_log",),
+    "fit_record": ("FitRecord",),
+    "path": (
+        "read_path",
+        "scaled_path",
+        "shape_path",
+    ),
+    "planning": ("next_rows",),
+    "track": (
+        "TrackRecord",
+        "track_path",
+    ),
+    "verify": (
+        "Verification",
+        "verify_track",
+    ),
+}
+__getattr__ = on_first_use(__name__, _NAMES_OF)

@@ -8,8 +8,8 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
+import scipy  # its folders are imported when they are used
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 from typing_extensions import Self
 
 
@@ -107,7 +107,7 @@ class Promise:
     at_rows : float
         Mean error at rows of the log [m].
     per_distance : float
-        Its growth with the distance, see `distances` [m].
+        Its growth with the distance, see `GroupDistance.distances` [m].
     p95 : float
         95 % quantile of the errors, relative to the mean.
     """
@@ -120,7 +120,7 @@ class Promise:
     def of(cls, errors: NDArray, distances: NDArray) -> Promise:
         """Return the promise from errors (N,) of held-out rows and their distances (N,)."""
         columns = np.column_stack([np.ones_like(errors), distances])
-        at_rows, per_distance = nnls(columns, errors)[0]
+        at_rows, per_distance = scipy.optimize.nnls(columns, errors)[0]
         if (
             at_rows == 0.0
         ):  # a robot without error at the rows of its log is not credible

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+import hybridkin
 from hybridkin._core.arrays import as_array, as_path
 from hybridkin._core.digests import row_digests
 from hybridkin._core.directions import in_terms
@@ -16,14 +18,15 @@ from hybridkin._core.model import ForwardModel, as_forward_model
 from hybridkin.chains import robots
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
-from hybridkin.chains.hysteresis import HysteresisOperator
-from hybridkin.hybrid.estimator import HybridForwardModel
-from hybridkin.hybrid.log_distance import distances
-from hybridkin.learning.elm import ELMRegressor
 from hybridkin.native.library import evaluate
-from hybridkin.saving.saved_model import load_model, model_header
+from hybridkin.saving.header import model_header
 from hybridkin.workflow.errors import ExpectedErrors, HeldOutErrors, Promise
 from hybridkin.workflow.report import millimetres
+
+if TYPE_CHECKING:
+    from hybridkin.chains.hysteresis import HysteresisOperator
+    from hybridkin.hybrid.estimator import HybridForwardModel
+    from hybridkin.learning.elm import ELMRegressor
 
 LOG_SUFFIXES = (".csv", ".tsv", ".txt", ".npz", ".parquet", ".pq")
 """Endings of files that are treated as logs."""
@@ -59,7 +62,9 @@ class LoadedModel:
     @property
     def hybrid(self) -> HybridForwardModel | None:
         """The model if it is a hybrid, else None."""
-        if isinstance(self.model, HybridForwardModel):
+        if isinstance(self.model, Chain):
+            return None  # at once: a chain does not load the hybrid
+        if isinstance(self.model, hybridkin.HybridForwardModel):
             return self.model
         return None
 
@@ -212,7 +217,8 @@ class LoadedModel:
         tested = self.hybrid.fitted_module_.tested
         if tested is None:
             return promise.at(np.zeros(len(q)))
-        return promise.at(distances(tested, q + self.hybrid.change_.shift))
+        moved = torch.from_numpy(q + self.hybrid.change_.shift)
+        return promise.at(tested.distances(moved).numpy())
 
     def expected_errors(self, q: NDArray) -> dict[str, NDArray]:
         """Return by name the errors (N,) [m] to expect of the robot where the actuators do q."""
@@ -320,7 +326,7 @@ def open_model(path: str | Path, robot: str | Path | None = None) -> LoadedModel
         )
     if path.is_dir():
         path = path / _MODEL
-    model = load_model(path)
+    model = hybridkin.load_model(path)
     beside = path.with_name(_ROBOT)
     if robot is None and path.name == _MODEL and beside.is_file():
         robot = beside

@@ -11,7 +11,7 @@ from saved_models import FOLDER, predictions, write_models
 
 from hybridkin import load_model
 from hybridkin.saving._file import VERSION, write
-from hybridkin.saving.saved_model import model_header
+from hybridkin.saving.header import model_header
 
 STORED = sorted(FOLDER.glob("*.safetensors"))
 NAMES = [path.stem for path in STORED]

@@ -25,7 +25,7 @@ from hybridkin import (
     save_model,
 )
 from hybridkin.saving._file import write
-from hybridkin.saving.saved_model import model_header
+from hybridkin.saving.header import model_header
 
 KINDS = (
     *("chain", "chain_of_all_parts", "elastic_chain", "rigid", "elm", "elm_cv", "mechanical"),
