@@ -8,6 +8,7 @@ from hybridkin._core.version import __version__
 
 if TYPE_CHECKING:
     from hybridkin import datasets, native, plots, workflow
+    from hybridkin._core.commands import Commands
     from hybridkin._core.model import ForwardModel, as_forward_model, jacobian
     from hybridkin.calibration.calibrate import CalibrationResult, calibrate
     from hybridkin.calibration.play_fit import PlayFit, fit_play
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "CalibrationResult",
+    "Commands",
     "ConstantCurvatureChain",
     "CreepOperator",
     "CreepState",
@@ -77,6 +79,7 @@ __all__ = [
 ]
 
 _NAMES_OF = {
+    "_core.commands": ("Commands",),
     "_core.model": ("ForwardModel", "as_forward_model", "jacobian"),
     "calibration.calibrate": ("CalibrationResult", "calibrate"),
     "calibration.play_fit": ("PlayFit", "fit_play"),

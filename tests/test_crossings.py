@@ -20,6 +20,7 @@ from sklearn.base import clone
 from sklearn.linear_model import LinearRegression
 
 from hybridkin import (
+    Commands,
     ConstantCurvatureChain,
     CreepOperator,
     ElasticTendonChain,
@@ -302,9 +303,9 @@ def _without_warnings_of_few_rows():
 
 def test_parts_add_up(crossing):
     case, (model, _, log, _) = crossing
-    whole = model.predict(log.q, groups=log.groups)
-    mechanical = model.predict_mechanical(log.q, groups=log.groups)
-    error = model.predict_error(log.q, groups=log.groups)
+    whole = model.predict(Commands(log.q, log.groups))
+    mechanical = model.predict_mechanical(Commands(log.q, log.groups))
+    error = model.predict_error(Commands(log.q, log.groups))
     columns = slice(None, 3 if case["output"] == "pose" else None)
     np.testing.assert_allclose((mechanical + error)[:, columns], whole[:, columns], atol=1e-9)
     if case["error_model"] == "drop" and case["change"] in ("none", "adapted"):
@@ -314,13 +315,13 @@ def test_parts_add_up(crossing):
 def test_the_core_agrees_with_torch(crossing):
     case, (model, _, log, _) = crossing
     module = in_columns(model.module_, case["output"])
-    q = torch.from_numpy(model._effective(log.q, log.groups))
+    q = torch.from_numpy(model.effective(Commands(log.q, log.groups)))
     with torch.no_grad():
         x, J = module.forward_and_jacobian(q)
         inside = model.module_.in_domain(q)
-    np.testing.assert_allclose(model.predict(log.q, groups=log.groups), x, atol=1e-9)
-    np.testing.assert_allclose(model.jacobian(log.q, groups=log.groups), J, rtol=1e-7, atol=1e-7)
-    assert (model.in_domain(log.q, groups=log.groups) == inside.numpy()).all()
+    np.testing.assert_allclose(model.predict(Commands(log.q, log.groups)), x, atol=1e-9)
+    np.testing.assert_allclose(model.jacobian(Commands(log.q, log.groups)), J, rtol=1e-7, atol=1e-7)
+    assert (model.in_domain(Commands(log.q, log.groups)) == inside.numpy()).all()
 
 
 def test_the_jacobian_is_the_derivative(crossing):
@@ -348,15 +349,15 @@ def test_a_file_holds_the_model(crossing, tmp_path):
     save_model(model, tmp_path / "model.safetensors")
     again = load_model(tmp_path / "model.safetensors")
     for method in ("predict", "predict_mechanical", "predict_error", "jacobian", "in_domain"):
-        before = getattr(model, method)(log.q, groups=log.groups)
-        after = getattr(again, method)(log.q, groups=log.groups)
+        before = getattr(model, method)(Commands(log.q, log.groups))
+        after = getattr(again, method)(Commands(log.q, log.groups))
         np.testing.assert_allclose(after, before, rtol=1e-12, atol=1e-12, err_msg=method)
     np.testing.assert_array_equal(again.training_range_, model.training_range_)
     if model.play_ is not None:
         np.testing.assert_array_equal(again.play_.width, model.play_.width)
     pickled = pickle.loads(pickle.dumps(model))
     np.testing.assert_array_equal(
-        pickled.predict(log.q, groups=log.groups), model.predict(log.q, groups=log.groups)
+        pickled.predict(Commands(log.q, log.groups)), model.predict(Commands(log.q, log.groups))
     )
 
 
@@ -375,8 +376,8 @@ def test_a_clone_fits_the_same(crossing):
         return  # takes as long as the fit itself; those without backlash are enough
     again = clone(model).fit(log.q, log.x, groups=log.groups)
     np.testing.assert_allclose(
-        again.predict(log.q, groups=log.groups),
-        model.predict(log.q, groups=log.groups),
+        again.predict(Commands(log.q, log.groups)),
+        model.predict(Commands(log.q, log.groups)),
         rtol=0,
         atol=1e-9,
     )

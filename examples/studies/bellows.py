@@ -24,7 +24,7 @@ from sklearn.linear_model import RidgeCV
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import PolynomialFeatures, StandardScaler
 
-from hybridkin import ConstantCurvatureChain, HybridForwardModel, datasets
+from hybridkin import Commands, ConstantCurvatureChain, HybridForwardModel, datasets
 
 AT_REST = 4e-3  # [m] largest motion of the tip in half a second
 EVERY = 10  # of the rows at rest is fitted: their neighbours are alike
@@ -103,15 +103,11 @@ class Recording:
         if model.play is None:
             model.fit(self.q[fitted], self.x[fitted], groups=self.days[fitted])
             return model.predict(q_new)
+        commands = Commands(self.q, self.runs, self.time)
         model.fit(
-            self.q[other],
-            self.x[other],
-            counted[other],
-            groups=self.days[other],
-            runs=self.runs[other],
-            time=self.time[other],
+            commands[other], self.x[other], counted[other], groups=self.days[other]
         )
-        return model.predict(q_new, groups=self.runs[~other], time=self.time[~other])
+        return model.predict(commands[~other])
 
     def error(self, name: str, day: str) -> tuple[float, float, float]:
         """Return mean and largest tip error at rest on a day [mm], and processor time [s]."""

@@ -20,6 +20,7 @@ from sklearn.preprocessing import MinMaxScaler, PolynomialFeatures, StandardScal
 from threadpoolctl import threadpool_limits
 
 from hybridkin import (
+    Commands,
     ConstantCurvatureChain,
     ElasticTendonChain,
     ELMRegressor,
@@ -111,7 +112,7 @@ def examined(case: Case, names: Sequence[str] | None) -> list[dict[str, Any]]:
 def _errors(
     model: HybridForwardModel, q: NDArray, x: NDArray, groups: NDArray | None = None
 ) -> dict[str, float]:
-    errors = np.linalg.norm(model.predict(q, groups=groups) - x, axis=1)
+    errors = np.linalg.norm(model.predict(Commands(q, groups)) - x, axis=1)
     return {
         "mean": float(errors.mean()),
         "max": float(errors.max()),

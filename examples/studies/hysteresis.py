@@ -27,6 +27,7 @@ from scipy.signal import lfilter
 from sklearn.base import clone
 
 from hybridkin import (
+    Commands,
     ELMRegressorCV,
     HybridForwardModel,
     PlayOperator,
@@ -124,7 +125,7 @@ def fits(
 
     def fitted(play: float | str | None) -> HybridForwardModel:
         hybrid = clone(model).set_params(play=play)
-        return hybrid.fit(q, x, weights, groups, runs)
+        return hybrid.fit(Commands(q, runs), x, weights, groups)
 
     none = fitted(None)
     used = slice(None) if weights is None else weights > 0.0
@@ -159,7 +160,7 @@ def simulated(kind: str, hysteresis: Hysteresis, draws: int) -> list[list[str]]:
         x_new = tips(by_group(hysteresis, q_new, new))
 
         for name, model in fits(trunk_model(), q, x, groups).items():
-            predicted = far(model.predict(q_new, groups=new), x_new).mean()
+            predicted = far(model.predict(Commands(q_new, new)), x_new).mean()
             sent = commands(model, q_new, new)
             with torch.no_grad():
                 promised = model.module_(torch.from_numpy(q_new)).numpy()
@@ -192,7 +193,7 @@ def trunk_of_motors(cases: list[Case], data_home: str | None) -> list[list[str]]
         for start, runs in {"run": groups, "runs in a row": joined}.items():
             models = fits(nominal, q, known, groups, runs, weights)
             for name, model in models.items():
-                y = q if model.play_ is None else model.play_.apply_by_group(q, runs)
+                y = model.effective(Commands(q, runs))
                 network = ELMRegressorCV(200, relevance_rounds=0, random_state=0)
                 network.fit(y[~test], x[~test], groups=groups[~test])
                 error = far(network.predict(y[test]), x[test])
@@ -208,7 +209,7 @@ def nine_tendons(cases: list[Case]) -> list[list[str]]:
 
         nominal = HybridForwardModel(case.chain, "drop", calibrate=case.calibrate)
         for name, model in fits(nominal, case.q, case.x, case.groups).items():
-            error = far(model.predict(q_new, groups=new), x_new)
+            error = far(model.predict(Commands(q_new, new)), x_new)
             errors.setdefault(name, []).append(error)
     return [[name, *_by_fold(parts)] for name, parts in errors.items()]
 

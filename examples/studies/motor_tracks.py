@@ -46,6 +46,7 @@ from scipy.spatial import KDTree
 from sklearn.model_selection import GroupKFold
 
 from hybridkin import (
+    Commands,
     HybridForwardModel,
     datasets,
     robots,
@@ -224,7 +225,7 @@ def _fit_in_python(setup: Setup, error_model: str) -> dict[str, float]:
     errors, far = np.empty(len(data.q)), np.empty(len(data.q))
     for train, test in GroupKFold(_FOLDS).split(data.q, groups=data.groups):
         hybrid.fit(data.q[train], data.x[train], groups=data.groups[train])
-        predicted = hybrid.predict(data.q[test], groups=data.groups[test])
+        predicted = hybrid.predict(Commands(data.q[test], data.groups[test]))
         errors[test] = np.linalg.norm(predicted - data.x[test], axis=1)
         far[test] = held_out_distances(data.q[train], data.groups[train], data.q[test])
     held_out = {"mean": float(errors.mean()), "p95": float(np.quantile(errors, 0.95))}

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hybridkin._core.arrays import Numbers, check_shape, labels, real_array
+from hybridkin._core.commands import Commands
 from hybridkin.calibration.calibrate import CalibrationResult, calibrate, fit_geometry
 from hybridkin.calibration.hysteresis_fit import HysteresisLog
 from hybridkin.calibration.hysteresis_search import WidthSearch, search_width
@@ -56,7 +57,7 @@ class PlayFit(WidthSearch):
 
 def fit_play(
     chain: Chain,
-    q: Numbers,
+    q: Numbers | Commands,
     x: Numbers,
     groups: ArrayLike,
     widths: Sequence[float] | None = None,
@@ -74,12 +75,13 @@ def fit_play(
     ----------
     chain : ElasticTendonChain, ConstantCurvatureChain or another Chain
         Start of the calibration; it is not changed.
-    q : array or Tensor of shape (N, n_actuators)
-        Commanded tendon length changes, the rows of each motion in order of time [m].
+    q : array or Tensor of shape (N, n_actuators), or Commands
+        Commanded tendon length changes, the rows of each motion in order of time [m]. Backlash goes
+        on within a run of `Commands`; by default each motion is a run.
     x : array or Tensor of shape (N, 3)
         Measured tip positions [m].
     groups : array-like of shape (N,)
-        Motion of every row; each motion starts with a new play state.
+        Motion of every row. Whole motions are held out.
     widths : sequence of float, optional
         Total play to try, the same for all tendons [unit of q]. Default: 0, 0.05, 0.1, 0.2 and
         0.4 mm, divided by the mean gain of a chain with gains. Zero is always tried. While the
@@ -125,11 +127,13 @@ def fit_play(
         tried = real_array(widths, "widths").ravel()
     tried = np.unique([0.0, *tried]).tolist()
     names = parameters or chain.default_parameters
-    q = real_array(q, "q")
+    commands = q if isinstance(q, Commands) else Commands(real_array(q, "q"))
+    q = real_array(commands.q, "q")
     x = real_array(x, "x")
     check_shape(x, "x", ("N", chain.n_outputs))
     check_shape(q, "q", (len(x), chain.n_actuators), "one row for each row of `x`")
     groups = labels(groups, len(x))
+    runs = groups if commands.runs is None else commands.runs
     nominal, _ = fit_geometry(chain, q, x, names, **calibrate_options)
     log = HysteresisLog(
         nominal.chain,
@@ -137,12 +141,12 @@ def fit_play(
         x.astype(np.float64),
         np.ones(len(x)),
         groups,
-        runs=groups,
+        runs=runs,
         time=np.arange(len(x), dtype=np.float64),
     )
     search = search_width(log, tried)
     if not search.kept:
         search = replace(search, width=0.0)
-    y = PlayOperator(search.width).apply_by_group(q, groups)
+    y = PlayOperator(search.width).apply_by_group(q, runs)
     result = calibrate(chain, y, x, names, **calibrate_options)
     return PlayFit(**vars(search), result=result)

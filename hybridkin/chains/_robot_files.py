@@ -135,7 +135,7 @@ _ROWS: list[tuple[str, str, str, _Test]] = [
         "hold lists [segment, fraction, x, y, z]",
         _many(_many(_is_number, 5)),
     ),
-    ("log", "q_unit groups time", *_TEXT),
+    ("log", "q_unit groups runs time", *_TEXT),
     ("log", "group_suffix", "be text", lambda value: isinstance(value, str)),
     ("log", "x_unit", *_among(*METRES)),
     ("log", "q_sign", "be 1 or -1, or a list of them", _one_or_many(_among(1, -1)[1])),

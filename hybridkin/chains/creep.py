@@ -71,6 +71,7 @@ class CreepOperator(HysteresisOperator[CreepState]):
     """
 
     kind = "creep"
+    creeps = True
 
     def __init__(self, gains: ArrayLike, times: ArrayLike) -> None:
         self.gains = real_array(gains, "gains").astype(float)

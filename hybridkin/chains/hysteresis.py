@@ -31,10 +31,13 @@ class HysteresisOperator(ABC, Generic[_State]):
     width : ndarray of shape () or (n,)
         Largest distance between two commands with the same effective change, if actuators stay at
         each of them [unit of q].
+    creeps : bool
+        Whether the result depends on the times of the commands.
     """
 
     kind: str
     width: NDArray
+    creeps = False
 
     @property
     def parts(self) -> tuple[HysteresisOperator, ...]:

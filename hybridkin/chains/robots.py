@@ -29,7 +29,7 @@ __all__ = [
 BHA_LENGTH_LIMITS = (0.10, 0.40)
 """Shortest and longest chamber of the Bionic Handling Assistant [m]."""
 
-_COLUMNS = ("groups", "time")
+_COLUMNS = ("groups", "runs", "time")
 
 
 def bionic_handling_assistant(tool: float = 0.0) -> ConstantCurvatureChain:
@@ -78,8 +78,8 @@ class LogFormat:
         -1 if the log counts a pulled (shortened) tendon as positive.
     group_suffix : str
         A motion whose name ends in this suffix belongs to the motion named without it.
-    groups, time : str or None
-        Columns of the motion of each row, and of its time stamp [s].
+    groups, runs, time : str or None
+        Columns of the motion of each row, of its run (see `Commands`), and of its time stamp [s].
     """
 
     q: tuple[str, ...]
@@ -90,6 +90,7 @@ class LogFormat:
     group_suffix: str = ""
     groups: str | None = None
     time: str | None = None
+    runs: str | None = None
 
     @property
     def q_factor(self) -> NDArray:
@@ -320,6 +321,8 @@ def read_description(path: str | Path) -> RobotDescription:
             q_sign = -1                     # -1: a pulled tendon counts as positive; or one each
             groups = "motion"               # column with the motion of each row, optional
             group_suffix = "_hold"          # rows of motion "a_hold" belong to motion "a"
+            runs = "session"                # column with the run of each row: motions that follow
+                                            # each other without a break; optional
             time = "t"                      # column of the time stamp [s], optional
 
             [limits]                        # of the actuators, optional; one number or one each

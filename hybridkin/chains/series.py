@@ -60,6 +60,7 @@ class HysteresisSeries(HysteresisOperator[tuple]):
                 f"`operators` must be for equally many actuators, got {sizes}."
             )
         self._actuators = sizes[0] if sizes else "n"
+        self.creeps = any(operator.creeps for operator in self.operators)
         self.kind = " and ".join(operator.kind for operator in self.operators)
         self.width = np.asarray(sum(operator.width for operator in self.operators))
 

@@ -610,6 +610,8 @@ def _add_log(command: argparse.ArgumentParser) -> None:
         metavar="COLUMN",
         help="column that names the motion of a row; or none",
     )
+    text = "column that names the run, motions without a break between them; or none"
+    add("--runs", metavar="COLUMN", help=text)
     add("--time", metavar="COLUMN", help="column of the time [s]; or none")
     add("--delimiter", metavar="CHAR", help=_DELIMITER)
     text = "leave out motions by name, such as '*tendon*'; may be repeated"

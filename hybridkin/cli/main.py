@@ -493,7 +493,7 @@ def _log_format(
 ) -> LogFormat:
     """Return how the log is written: as described, with what the options say instead."""
     entries = {}
-    for name in ("q", "x", "q_unit", "x_unit", "q_sign", "groups", "time"):
+    for name in ("q", "x", "q_unit", "x_unit", "q_sign", "groups", "runs", "time"):
         value = vars(arguments)[name]
         if value is not None:
             entries[name] = None if value == "none" else value

@@ -24,6 +24,7 @@ from hybridkin._core.arrays import (
     one_of,
     real_array,
 )
+from hybridkin._core.commands import Commands
 from hybridkin._core.units import METRES, UNITS
 from hybridkin.datasets._log_report import named_rows
 from hybridkin.datasets._npz import arrays_of, check_expansion
@@ -46,7 +47,7 @@ class Log:
         Tip positions [m], or positions of K markers, the last of which is the tip. NaN if a marker
         was not measured.
     groups : ndarray of shape (N,) or None
-        Motion, run or day of each row.
+        Motion or day of each row.
     time : ndarray of shape (N,) or None
         Time stamps [s].
     line : ndarray of shape (N,) of int or None
@@ -61,6 +62,8 @@ class Log:
         Units of "q" and "x" in this object and in the file.
     source : str
         Source of the log, for example its path.
+    runs : ndarray of shape (N,) or None
+        Run of each row: motions that follow each other without a break are one run.
     """
 
     q: NDArray
@@ -75,6 +78,7 @@ class Log:
     units: Mapping[str, str] = field(default_factory=lambda: {"q": "m", "x": "m"})
     file_units: Mapping[str, str] = field(default_factory=lambda: {"q": "m", "x": "m"})
     source: str = "in memory"
+    runs: NDArray | None = None
 
     def __post_init__(self) -> None:
         for name in ("q", "x", "time"):
@@ -89,8 +93,10 @@ class Log:
                 f"`Log` needs q of shape (N, n) and x of shape (N, 3), or (N, 3 K) of K markers, "
                 f"got {q} and {x}."
             )
-        if self.groups is not None:
-            object.__setattr__(self, "groups", labels(self.groups, q[0]))
+        for name in ("groups", "runs"):
+            column = getattr(self, name)
+            if column is not None:
+                object.__setattr__(self, name, labels(column, q[0], name))
         for name, column in (("time", self.time), ("line", self.line)):
             if column is not None:
                 check_shape(np.asarray(column), name, [q[0]], "one for each row")
@@ -114,10 +120,16 @@ class Log:
             lines.append(f"time from {self.time[0]:.6g} to {self.time[-1]:.6g} s")
         return "\n  ".join(lines)
 
+    @property
+    def commands(self) -> Commands:
+        """The actuator vectors with their runs, without such a column the motions, and times."""
+        runs = self.groups if self.runs is None else self.runs
+        return Commands(self.q, runs, self.time)
+
     def rows(self, chosen: NDArray | slice) -> Self:
         """Return a log of some of the rows."""
         columns = {}
-        for name in ("q", "x", "groups", "time", "line"):
+        for name in ("q", "x", "groups", "runs", "time", "line"):
             column = getattr(self, name)
             if column is not None:
                 columns[name] = column[chosen]
@@ -137,6 +149,7 @@ def load_log(
     x: Sequence[str],
     groups: str | None = None,
     *,
+    runs: str | None = None,
     time: str | None = None,
     q_unit: str = "m",
     x_unit: str = "m",
@@ -158,7 +171,10 @@ def load_log(
         Columns of the tip position, or of the positions of K markers, the last of which is the tip.
         A row without some markers is kept, with NaN for these.
     groups : str or None, default=None
-        Column that names the motion, run or day of a row, for splits by groups.
+        Column that names the motion or day of a row, for splits by groups.
+    runs : str or None, default=None
+        Column that names the run of a row, for models with hysteresis, see `Commands`. Default:
+        every motion is a run.
     time : str or None, default=None
         Column of the time stamp [s]. In npz and parquet files also dates, which become seconds
         since 1970 (UTC), and durations.
@@ -179,7 +195,8 @@ def load_log(
     Returns
     -------
     Log
-        In SI units; ``groups`` are strings. ``groups`` and ``time`` are None if not requested.
+        In SI units; ``groups`` and ``runs`` are strings. They and ``time`` are None if not
+        requested.
 
     Raises
     ------
@@ -223,9 +240,10 @@ def load_log(
     if time is not None:
         names.append(time)
     values = table.values(names, time)
-    motions = None
-    if groups is not None:
-        motions = table.motions(groups, len(values))
+    labelled = {}
+    for argument, column in {"groups": groups, "runs": runs}.items():
+        if column is not None:
+            labelled[argument] = table.labels(argument, column, len(values))
     commands = values[:, : len(q)]
     tips = values[:, len(q) : len(names) - (time is not None)]
     complete = countable(tips).reshape(len(tips), -1, 3).all(axis=2)
@@ -233,8 +251,8 @@ def load_log(
     valid = countable(commands).all(axis=1) & complete.any(axis=1)
     if time is not None:
         valid &= countable(values[:, -1])
-    if motions is not None:
-        valid &= ~np.isin(motions, _UNNAMED)
+    for labels_of_rows in labelled.values():
+        valid &= ~np.isin(labels_of_rows, _UNNAMED)
     kind = "line"
     places = table.lines
     if places is None:
@@ -263,7 +281,6 @@ def load_log(
     return Log(
         commands * factor,
         tips * METRES[x_unit],
-        groups=None if motions is None else motions[valid],
         time=None if time is None else values[valid, -1],
         line=places[valid],
         invalid_lines=places[~valid],
@@ -273,6 +290,7 @@ def load_log(
         units={"q": si_unit, "x": "m"},
         file_units={"q": q_unit, "x": x_unit},
         source=str(path),
+        **{argument: names[valid] for argument, names in labelled.items()},
     )
 
 
@@ -345,7 +363,7 @@ class _Table(NamedTuple):
         """Return the column of that name."""
         if not isinstance(name, str):
             raise TypeError(
-                f"`groups` and `time` must be names of columns, got {name!r:.80}."
+                f"`groups`, `runs` and `time` must be names of columns, got {name!r:.80}."
             )
         count = self.header.count(name)
         path = str(self.path)
@@ -403,17 +421,17 @@ class _Table(NamedTuple):
             raise ValueError(f"{str(self.path)!r} has {header} rows.")
         return np.column_stack([*columns.values()])
 
-    def motions(self, name: str, n_rows: int) -> NDArray:
-        """Return the column of that name as names of motions."""
-        motions = [str(value).strip() for value in self.column(name)]
-        longest = max(map(len, motions), default=0)
-        if len(motions) != n_rows or longest > _LONGEST:
+    def labels(self, argument: str, name: str, n_rows: int) -> NDArray:
+        """Return the column of that name as labels of the rows."""
+        labels = [str(value).strip() for value in self.column(name)]
+        longest = max(map(len, labels), default=0)
+        if len(labels) != n_rows or longest > _LONGEST:
             raise ValueError(
-                f"`groups` must name the motion of each of {n_rows} rows in at most {_LONGEST} "
-                f"characters, but column {name!r} of {str(self.path)!r} has {len(motions)} rows of "
-                f"up to {longest} characters; check the file."
+                f"`{argument}` must name each of {n_rows} rows in at most {_LONGEST} characters, "
+                f"but column {name!r} of {str(self.path)!r} has {len(labels)} rows of up to "
+                f"{longest} characters; check the file."
             )
-        return np.array(motions)
+        return np.array(labels)
 
 
 def _checked_factor(n: int, q_unit: str, x_unit: str, q_sign: ArrayLike) -> NDArray:

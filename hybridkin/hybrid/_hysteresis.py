@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from hybridkin._core.model import as_forward_model
 from hybridkin.calibration.hysteresis_fit import HysteresisLog
@@ -16,6 +16,15 @@ from hybridkin.chains.play import PlayOperator
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._spec import Spec
 from hybridkin.learning.elm_cv import ELMRegressorCV
+
+
+class Past(NamedTuple):
+    """Hysteresis after the last row: its run, its time [s], and the state of the operator."""
+
+    run: object
+    time: float
+    state: tuple
+
 
 _PLAIN: dict[str, Any] = {"relevance_rounds": 0, "max_hidden": 0, "random_state": 0}
 
@@ -94,3 +103,30 @@ def choose_hysteresis(spec: Spec, rows: Rows) -> HysteresisOperator | None:
             rows.times,
         )
     )
+
+
+def continued(
+    operator: HysteresisOperator, rows: Rows, past: Past | None
+) -> tuple[NDArray, Past | None]:
+    """Return the motion of the actuators (N, n), which go on from the past, and the new past."""
+    moved = np.empty_like(rows.X)
+    runs = rows.run_of_rows
+    times = rows.times
+    for run in dict.fromkeys(runs.tolist()):
+        rows_of_run = np.flatnonzero(runs == run)
+        first = times[rows_of_run[0]]
+        state = None
+        before = first - 1.0
+        if past is not None and past.run == run:
+            state = past.state
+            if rows.time is not None:
+                before = past.time
+        if before > first:
+            raise ValueError(
+                f"`time` must not decrease within a run, but {first:g} s follows {before:g} s; "
+                "give a new run another name."
+            )
+        steps = np.diff(times[rows_of_run], prepend=before)
+        moved[rows_of_run], state = operator.apply(rows.X[rows_of_run], state, steps)
+        past = Past(run, float(times[rows_of_run[-1]]), state)
+    return moved, past

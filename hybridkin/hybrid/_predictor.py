@@ -15,6 +15,7 @@ from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.metrics import r2_score
 from sklearn.utils.validation import check_is_fitted
 
+from hybridkin._core.commands import Commands
 from hybridkin._core.html import html_table
 from hybridkin._core.model import ForwardModel, as_forward_model
 from hybridkin._core.plausible import PlausibleRows
@@ -57,6 +58,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     radius_: Radius | None
     _learned: Learned
     _noise: float
+    _timed: bool | None  # whether the fit had times; None: not known, of an older file
     _fitted_rows: NDArray
     _single_output: bool
     _fitted_range: TrainingRange
@@ -67,23 +69,15 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self,
         X: object,
         return_radius: bool = False,
-        groups: ArrayLike | None = None,
-        time: ArrayLike | None = None,
     ) -> Any:
         """Return tip positions f_mech(q) + w(q) eps(q).
 
         Parameters
         ----------
-        X : array-like of shape (N, n)
-            Actuator vectors; with `play`, the rows of each motion in order of time.
+        X : array-like of shape (N, n) or Commands
+            Actuator vectors; with `play` in order of time, for several runs or times as `Commands`.
         return_radius : bool, default=False
             Whether to return the estimated error radius as well; requires `coverage`.
-        groups : array-like of shape (N,), optional
-            Run of every row, only used with `play`: each run starts without hysteresis. Default:
-            one run.
-        time : array-like of shape (N,), optional
-            Time of every row, ascending in each run, if the fit had times; only used with creep
-            [s]. Default: one second from row to row.
 
         Returns
         -------
@@ -96,38 +90,32 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             the domain (`in_domain`), and everywhere if the fit had too few groups.
         """
         if not return_radius:
-            return self._evaluated(self._tips, X, groups, time)[0]
+            return self._evaluated(self._tips, X)[0]
         check_is_fitted(self)
         if self.radius_ is None:
             raise ValueError(
                 "`return_radius` needs a model that was fitted with `coverage`, for example "
                 "HybridForwardModel(..., coverage=0.9); this one was fitted without."
             )
-        x, distance = self._evaluated(
-            partial(self._tips, distance=True, enough=1.0), X, groups, time
-        )
+        x, distance = self._evaluated(partial(self._tips, distance=True, enough=1.0), X)
         return x, self.radius_.at(distance <= 1.0).astype(x.dtype)
 
     def predict_mechanical(
         self,
-        X: ArrayLike,
-        groups: ArrayLike | None = None,
-        time: ArrayLike | None = None,
+        X: object,
     ) -> NDArray:
         """Return the mechanical part f_mech(q), shaped like `predict` [m]."""
-        return self._evaluated(self._mechanical_tips, X, groups, time)[0]
+        return self._evaluated(self._mechanical_tips, X)[0]
 
     def predict_error(
         self,
-        X: ArrayLike,
-        groups: ArrayLike | None = None,
-        time: ArrayLike | None = None,
+        X: object,
     ) -> NDArray:
         """Return the learned part w(q) eps(q), shaped like `predict` [m], rotations [rad]."""
-        return self._evaluated(self._tip_errors, X, groups, time, warn=False)[0]
+        return self._evaluated(self._tip_errors, X, warn=False)[0]
 
     def score(
-        self, X: ArrayLike, y: ArrayLike, sample_weight: ArrayLike | None = None
+        self, X: object, y: ArrayLike, sample_weight: ArrayLike | None = None
     ) -> float:
         """Return R^2 of `predict`, averaged over the columns of y, without missing markers."""
         x = self.predict(X)
@@ -145,31 +133,25 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     def jacobian(
         self,
-        X: ArrayLike,
-        groups: ArrayLike | None = None,
-        time: ArrayLike | None = None,
+        X: object,
     ) -> NDArray:
         """Return the full Jacobian dx/dq of the sum, shape (N, m, n) or, for 1-D y, (N, n).
 
         For poses, the last three rows give the angular velocity in the measuring frame.
         """
-        return self._evaluated(partial(self._tips, jacobian=True), X, groups, time)[1]
+        return self._evaluated(partial(self._tips, jacobian=True), X)[1]
 
     def predict_and_jacobian(
         self,
-        X: ArrayLike,
-        groups: ArrayLike | None = None,
-        time: ArrayLike | None = None,
+        X: object,
     ) -> tuple[NDArray, NDArray]:
         """Return `predict(X)` and `jacobian(X)` in one pass."""
-        x, J = self._evaluated(partial(self._tips, jacobian=True), X, groups, time)
+        x, J = self._evaluated(partial(self._tips, jacobian=True), X)
         return x, J
 
     def in_domain(
         self,
-        X: ArrayLike,
-        groups: ArrayLike | None = None,
-        time: ArrayLike | None = None,
+        X: object,
     ) -> NDArray[np.bool_]:
         """Return whether each row lies in the domain, close to the training rows (see `guard`).
 
@@ -180,12 +162,8 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
         Parameters
         ----------
-        X : array-like of shape (N, n)
-            Actuator vectors.
-        groups : array-like of shape (N,), optional
-            Run of every row, only used with `play`.
-        time : array-like of shape (N,), optional
-            Time of every row, only used with creep [s].
+        X : array-like of shape (N, n) or Commands
+            Actuator vectors, as for `predict`.
 
         Returns
         -------
@@ -193,22 +171,43 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             Without a guard all True, except along those directions.
         """
         distance = partial(self._tips, value=False, distance=True, enough=1.0)
-        return self._evaluated(distance, X, groups, time, warn=False)[0] <= 1.0
+        return self._evaluated(distance, X, warn=False)[0] <= 1.0
+
+    def effective(self, X: object) -> NDArray:
+        """Return what the actuators do for commands X [unit of q]; without `play`, X itself.
+
+        Parameters
+        ----------
+        X : array-like of shape (N, n) or Commands
+            Commands, as for `predict`.
+
+        Returns
+        -------
+        ndarray of shape (N, n)
+            The input of `module_`.
+
+        Raises
+        ------
+        ValueError
+            If the actuators creep, the fit had times, and these rows have none.
+        """
+        check_is_fitted(self, "module_")
+        commands = Commands.of(X)
+        rows = check_inputs(self, commands.q)
+        if self.play_ is None or not len(rows):
+            return rows
+        if len(rows) > 1:
+            self._check_times(commands.time is not None)
+        return self.play_.apply_by_group(rows, commands.run_of_rows, commands.time)
 
     def error_weight(
         self,
-        X: ArrayLike,
-        groups: ArrayLike | None = None,
-        time: ArrayLike | None = None,
+        X: object,
     ) -> NDArray:
         """Return the weight w(q) in [0, 1] of the error model at each row, shape (N,)."""
         weight = as_forward_model(self.fitted_module_.error_weight)
         return self._evaluated(
-            lambda q: evaluate(weight, q + self.change_.shift),
-            X,
-            groups,
-            time,
-            warn=False,
+            lambda q: evaluate(weight, q + self.change_.shift), X, warn=False
         )[0]
 
     @property
@@ -273,15 +272,21 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         messages = [*chain.unit_messages(rows, "X"), chain.contradiction(rows, "X")]
         return [message for message in messages if message is not None]
 
-    def _effective(
-        self, X: NDArray, groups: ArrayLike | None, time: ArrayLike | None = None
-    ) -> NDArray:
-        """Return the motion of the actuators: with `play`, not the commands X themselves."""
-        if self.play_ is None or not len(X):
-            return X
-        if groups is None:
-            groups = np.zeros(len(X))
-        return self.play_.apply_by_group(X, groups, time)
+    def _check_times(self, timed: bool) -> None:
+        """Raise if creep counts seconds and rows have no times; warn the other way round."""
+        creeps = self.play_ is not None and self.play_.creeps
+        if not creeps or self._timed in (None, timed):
+            return
+        if self._timed:
+            raise ValueError(
+                "`X` must have times, as the actuators creep: Commands(q, runs, time), with "
+                "`time` in seconds as in the fit; for `hybridkin` name the column by --time."
+            )
+        message = (
+            "`X` has times, but the fit had none: its creep takes each row for one second. Fit to "
+            "rows with times, or leave them out."
+        )
+        warnings.warn(message, stacklevel=4)
 
     def _follow_robot(self) -> None:
         """Set the module and its mechanical model after the change and the drift of the robot."""
@@ -338,8 +343,6 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self,
         function: Callable[[NDArray], Sequence[NDArray]],
         X: object,
-        groups: ArrayLike | None,
-        time: ArrayLike | None,
         warn: bool = True,
     ) -> list[NDArray]:
         """Return the results of a function of rows q for the rows of X, in the dtype of X."""
@@ -349,8 +352,8 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             rows = X
             q = X
         else:
-            rows = check_inputs(self, X)
-            q = self._effective(rows, groups, time).astype(np.float64, copy=False)
+            rows = self.effective(X)
+            q = rows.astype(np.float64, copy=False)
             if warn:
                 for message in self._doubts(q):
                     warnings.warn(message, stacklevel=3)

@@ -101,6 +101,7 @@ def stored_hybrid(model: HybridForwardModel) -> Stored:
         feature_names_in=vars(model).get("feature_names_in_", []),
         single_output=model._single_output,
         noise=model._noise,
+        timed=model._timed,
         learned=model._learned.kind,
         rejected=model._learned.rejected,
         held_out=model._learned.held_out,
@@ -192,9 +193,12 @@ def hybrid_of(stored: Stored, training: object) -> HybridForwardModel:
     if not (torch.isfinite(x).all() and torch.isfinite(J).all()):
         raise ValueError("the arrays do not give finite numbers")
     model._fitted_range = TrainingRange(*stored.array("training_range", (2, n)))
-    model.calibration_ = model.radius_ = model._play_state = None
+    model.calibration_ = model.radius_ = model._past = None
     model.candidates_ = None
     model.play_ = _play_of(stored, n)
+    model._timed = None
+    if "timed" in stored.settings:
+        model._timed = stored.value("timed", (bool, None))
     if "radius" in stored.arrays:
         radius = stored.array("radius", (3,), finite=False).tolist()
         inside, coverage, n_rows = radius

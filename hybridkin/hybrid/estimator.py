@@ -15,6 +15,7 @@ from sklearn.utils.validation import check_is_fitted
 from torch import nn
 
 from hybridkin._core.arrays import labels, number, table
+from hybridkin._core.commands import Commands
 from hybridkin._core.digests import row_digests
 from hybridkin._core.model import PoseModel, as_forward_model
 from hybridkin.calibration.choice import GeometryChoice
@@ -35,7 +36,7 @@ from hybridkin.hybrid._adapt import (
 from hybridkin.hybrid._drift import Drift
 from hybridkin.hybrid._fit import few_rows, fit_hybrid, fit_messages
 from hybridkin.hybrid._html import fitted_rows
-from hybridkin.hybrid._hysteresis import play_of
+from hybridkin.hybrid._hysteresis import Past, continued, play_of
 from hybridkin.hybrid._module import TipCorrection
 from hybridkin.hybrid._predictor import HybridPredictor
 from hybridkin.hybrid._radius import Radius, conformal_radius
@@ -45,6 +46,11 @@ from hybridkin.hybrid._settings import CONSTRAINTS, error_model_of
 from hybridkin.hybrid._spec import ErrorModel, Spec, residuals
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.hidden_layer import check_rows
+
+_NO_TIMES = (
+    "`X` has no times, but the actuators creep: a row counts as one second, also in trackers. Give "
+    "Commands(X, runs, time) with times in seconds."
+)
 
 
 class HybridForwardModel(HybridPredictor):
@@ -97,8 +103,8 @@ class HybridForwardModel(HybridPredictor):
         times the longest correction of a training row.
     play : float, array-like of shape (n,), HysteresisOperator or "auto", optional
         Backlash (also called play) of the actuators [unit of q]. Rows are then commands in order of
-        time, and the model maps the motion of the actuators, see `PlayOperator`. "auto" chooses by
-        the error on held-out groups: nothing, a `PlayOperator`, a `PrandtlIshlinskiiOperator`, or
+        time, see `Commands`, and the model maps the motion of the actuators. "auto" chooses by the
+        error on held-out groups: nothing, a `PlayOperator`, a `PrandtlIshlinskiiOperator`, or
         a `CreepOperator`, alone or after one of them (`HysteresisSeries`). Each run of the log
         starts without hysteresis, see `fit`. An operator is taken as it is. Trackers send commands
         that lead by it. Default: no backlash, rows in any order.
@@ -211,15 +217,14 @@ class HybridForwardModel(HybridPredictor):
         y: object,
         sample_weight: ArrayLike | None = None,
         groups: ArrayLike | None = None,
-        runs: ArrayLike | None = None,
-        time: ArrayLike | None = None,
     ) -> HybridForwardModel:
         """Calibrate the mechanical model if asked, learn its residual, and return this estimator.
 
         Parameters
         ----------
-        X : array-like of shape (N, n)
-            Actuator vectors q [m]; for revolute joints [rad].
+        X : array-like of shape (N, n) or Commands
+            Actuator vectors q [m]; for revolute joints [rad]. `Commands` have runs and times: with
+            `play`, hysteresis goes on within a run, also from group to group.
         y : array-like of shape (N, m) or (N,)
             Measured tip positions x [m]; poses (N, 6); K markers (N, 3 K), NaN if missing.
         sample_weight : array-like of shape (N,), optional
@@ -229,13 +234,6 @@ class HybridForwardModel(HybridPredictor):
             Motion of every row. Whole motions are held out by the calibration
             (``calibration_.cv_rmse``), by error models that choose by groups, and for the radius.
             Rows farther from the log than its groups are from each other are not `in_domain`.
-        runs : array-like of shape (N,), optional
-            With `play`, the run of every row: rows of a run follow each other in time without a
-            break, so hysteresis goes on from group to group. Each run starts without hysteresis.
-            Default: each group is a run.
-        time : array-like of shape (N,), optional
-            With `play`, the time of every row, ascending in each run; only creep needs it [s].
-            Default: one second from row to row.
 
         Returns
         -------
@@ -256,10 +254,10 @@ class HybridForwardModel(HybridPredictor):
             function of q; if tendons of a ConstantCurvatureChain contradict each other, as slack
             tendons do (`predict` and the Jacobians warn too); if no row moves along directions of X
             that move the tip, in which corrections are then constant; if numbers look like
-            millimetres; if there are too few groups for `coverage`; and the warnings of
-            `calibrate`.
+            millimetres; if there are too few groups for `coverage`; if the actuators creep
+            and the rows have no times; and the warnings of `calibrate`.
         """
-        for message in self._fit(X, y, sample_weight, groups, runs, time):
+        for message in self._fit(X, y, sample_weight, groups):
             warnings.warn(message, stacklevel=2)
         return self
 
@@ -269,8 +267,6 @@ class HybridForwardModel(HybridPredictor):
         y: object,
         sample_weight: ArrayLike | None = None,
         groups: ArrayLike | None = None,
-        runs: ArrayLike | None = None,
-        time: ArrayLike | None = None,
         geometry: GeometryChoice | None = None,
         progress: Callable[[int, int], None] | None = None,
         held_out: bool = True,
@@ -278,7 +274,7 @@ class HybridForwardModel(HybridPredictor):
     ) -> list[str]:
         """Fit, see `fit_quietly`, and return the messages of all warnings."""
         error_model = self._checked_error_model()
-        log = self._checked_rows(X, y, sample_weight, groups, runs, time)
+        log = self._checked_rows(X, y, sample_weight, groups)
         rows = log.distinct()
         settings = replace(
             self._spec(error_model, log), held_out=held_out, expected=expected
@@ -288,8 +284,11 @@ class HybridForwardModel(HybridPredictor):
         spec = settings.with_geometry_chosen(rows, geometry)
         self.play_, of_play = play_of(self.play, spec, log.in_runs())
         messages += of_play
-        self._play_state: tuple | None = None
+        self._past: Past | None = None
+        self._timed = log.time is not None
         if self.play_ is not None:
+            if self.play_.creeps and not self._timed:
+                messages.append(_NO_TIMES)
             settings = replace(settings, commanded=rows.directions)
             spec = replace(spec, commanded=rows.directions)
             rows = log.effective(self.play_).distinct()
@@ -326,13 +325,15 @@ class HybridForwardModel(HybridPredictor):
     ) -> HybridForwardModel:
         """Update the model with new measurements in order of time, after a payload or wear.
 
+        With `play`, hysteresis goes on from the last call; a new run of `Commands` starts anew.
+
         The mechanical model and the error model do not change. The new residual is learned as an
         affine function of q in which old measurements fade: ``f_hyb(q) + B [1, q]``. This follows
         one motion. If the base or the actuator zeros have changed since the fit, use `adapt`.
 
         Parameters
         ----------
-        X : array-like of shape (N, n)
+        X : array-like of shape (N, n) or Commands
             Actuator vectors; a single row is allowed.
         y : array-like of shape (N, m) or (N,)
             Measured tips [m].
@@ -358,8 +359,9 @@ class HybridForwardModel(HybridPredictor):
             _check_positive("alpha", alpha, np.inf)
         rows = self._checked_rows(X, y, sample_weight, reset=False)
         if self.play_ is not None:
-            X, self._play_state = self.play_.apply(rows.X, self._play_state)
-            rows = replace(rows, X=X)
+            self._check_times(rows.time is not None)
+            moved, self._past = continued(self.play_, rows, self._past)
+            rows = replace(rows, X=moved)
         self._warn_of_units(rows)
         rows = self.change_.before(rows, self.output)
         fitted = self.fitted_module_
@@ -381,8 +383,6 @@ class HybridForwardModel(HybridPredictor):
         *,
         parameters: Sequence[str] = PARAMETERS,
         groups: ArrayLike | None = None,
-        runs: ArrayLike | None = None,
-        time: ArrayLike | None = None,
     ) -> HybridForwardModel:
         """Adapt the model to a robot that has changed since the fit, from a few new rows.
 
@@ -396,16 +396,14 @@ class HybridForwardModel(HybridPredictor):
 
         Parameters
         ----------
-        X : array-like of shape (k, n)
-            New actuator vectors, one or more; with `play`, the rows of a group in order of time.
+        X : array-like of shape (k, n) or Commands
+            New actuator vectors, one or more; with `play` in order of time, as for `fit`.
         y : array-like of shape (k, m) or (k,)
             Measured tips [m]; poses (k, 6), see `output`.
         parameters : sequence of str, default=("base", "actuator_zeros")
             What may have changed.
         groups : array-like of shape (k,), optional
             Motion of every row. Rows of one motion have similar errors and count as fewer rows.
-        runs, time : array-like of shape (k,), optional
-            Run and time of every row [s], as for `fit`.
 
         Returns
         -------
@@ -435,9 +433,10 @@ class HybridForwardModel(HybridPredictor):
         True
         """
         check_is_fitted(self, "module_")
-        rows = self._checked_rows(X, y, None, groups, runs, time, reset=False)
+        rows = self._checked_rows(X, y, None, groups, reset=False)
         check_parameters(parameters, rows.tips.shape[1] % 3 == 0)
         if self.play_ is not None:
+            self._check_times(rows.time is not None)
             rows = rows.effective(self.play_)
         self._warn_of_units(rows)
         self.change_, message = likeliest_change(
@@ -446,7 +445,7 @@ class HybridForwardModel(HybridPredictor):
         if message is not None:
             warnings.warn(message, stacklevel=2)
         self._drift = self._drift.emptied()
-        self._play_state = None
+        self._past = None
         self._follow_robot()
         return self
 
@@ -505,12 +504,11 @@ class HybridForwardModel(HybridPredictor):
         y: Any,
         weights: ArrayLike | None,
         groups: Any = None,
-        runs: Any = None,
-        time: Any = None,
         reset: bool = True,
     ) -> Rows:
         """Return the measured rows, checked."""
-        X = table(X, "X")
+        commands = Commands.of(X)
+        X = commands.q
         y = table(y, "y")
         missing = self._missing_markers(y)
         y = None if y is None else np.where(missing, 0.0, y)
@@ -522,12 +520,11 @@ class HybridForwardModel(HybridPredictor):
             X = X.copy()
         if groups is not None:
             groups = labels(groups, len(X))
-        if runs is not None:
-            runs = labels(runs, len(X), "runs")
-        rows = Rows(X, y, cast("NDArray | None", weights), groups, runs)
-        if time is None:
-            return rows
-        return replace(rows, time=checked_times(time, rows.run_of_rows))
+        weights = cast("NDArray | None", weights)
+        rows = Rows(X, y, weights, groups, commands.runs, commands.time)
+        if rows.time is not None and self.play is not None:
+            checked_times(rows.time, rows.run_of_rows)
+        return rows
 
     def _missing_markers(self, y: Any) -> NDArray[np.bool_]:
         """Return which entries of y (N, 3 K) are missing markers; each row must keep a marker."""
@@ -566,11 +563,10 @@ def _check_positive(name: str, value: object, high: float) -> None:
 
 def fit_quietly(
     model: HybridForwardModel,
-    X: NDArray,
+    X: object,
     y: NDArray,
     groups: ArrayLike | None = None,
     *,
-    time: ArrayLike | None = None,
     geometry: GeometryChoice | None = None,
     progress: Callable[[int, int], None] | None = None,
     held_out: bool = True,
@@ -583,7 +579,7 @@ def fit_quietly(
     ----------
     model : HybridForwardModel
         The estimator; it is fitted in place.
-    X, y, groups, time
+    X, y, groups
         As for its `fit`.
     geometry : GeometryChoice, optional
         What to calibrate. Default: chosen on the rows.
@@ -598,9 +594,7 @@ def fit_quietly(
     log : tuple of ndarray, optional
         All rows (q, x) of the log, if X and y are some of them: all count as fitted.
     """
-    messages = model._fit(
-        X, y, None, groups, None, time, geometry, progress, held_out, expected
-    )
+    messages = model._fit(X, y, None, groups, geometry, progress, held_out, expected)
     if log is not None:
         model._fitted_rows = np.unique(row_digests(*log))
     return messages

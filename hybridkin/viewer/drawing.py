@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from hybridkin._core.commands import Commands
 from hybridkin._core.model import ForwardModel
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
@@ -94,7 +95,7 @@ class Body:
 
     def _marked(self, robot: SteeredRobot) -> NDArray:
         """Return the markers (K, 3) as the model predicts them."""
-        return robot.loaded.predict(robot.q[None]).reshape(-1, 3)
+        return robot.loaded.predict(Commands(robot.q[None])).reshape(-1, 3)
 
     def _tensions(self, robot: SteeredRobot) -> tuple[NDArray, NDArray]:
         """Return colours (n, 3) of the actuators, and which are slack (n,)."""

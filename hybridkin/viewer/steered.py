@@ -172,10 +172,7 @@ class SteeredRobot:
         """Return motions of the actuators (N, n) and tips (N, 3) of the known rows of a log."""
         tips = log.x[:, -3:]
         measured = np.isfinite(log.q).all(axis=1) & np.isfinite(tips).all(axis=1)
-        groups = None if log.groups is None else np.asarray(log.groups)[measured]
-        time = None if log.time is None else np.asarray(log.time)[measured]
-        q = self.loaded.effective(log.q[measured], groups, time)
-        return q, tips[measured]
+        return self.loaded.effective(log.commands[measured]), tips[measured]
 
     def commands(self) -> NDArray:
         """Return the commands (T, n) since the start, at most ten minutes, in the log's unit.
@@ -184,6 +181,5 @@ class SteeredRobot:
         """
         with self._lock:
             motion = np.array(self._history)
-        play = self.loaded.play
-        sent = motion if play is None else play.command(motion)[0]
+        sent = self.loaded.commands(motion, np.arange(len(motion)) / RATE)
         return self.loaded.log_format().to_log(sent)

@@ -256,7 +256,7 @@ def with_play_detected(
     in_order = rows.named and not rows.n_late
     if mechanical.start is not None and settings.auto and in_order:
         model = HybridForwardModel(mechanical.model, "drop", play="auto")
-        fit_quietly(model, rows.q, rows.x, rows.motions, time=rows.time)
+        fit_quietly(model, rows.commands, rows.x, rows.motions)
         play = None if model.play_ is None else "auto"
     return replace(settings, play=play)
 
@@ -362,10 +362,9 @@ def _one_fold(
     for name, model in models.items():
         fit_quietly(
             model,
-            train.q,
+            train.commands,
             train.x,
             train.motions,
-            time=None if settings.play is None else train.time,
             geometry=mechanical.geometry,
             held_out=False,
         )
@@ -395,10 +394,8 @@ def _held_out(
     model: HybridForwardModel, module: ForwardModel, test: MeasuredLog
 ) -> NDArray:
     """Return the errors (N, K) of the markers on test rows by a module of the fitted model."""
-    q = test.q
-    if model.play_ is not None:
-        q = model.play_.apply_by_group(q, test.motions, test.time)
-    return distances(evaluate(module, np.array(q, dtype=float))[0], test.x)
+    q = model.effective(test.commands)
+    return distances(evaluate(module, q)[0], test.x)
 
 
 def _in_all(fold_results: list[_FoldResult]) -> list[str]:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import hybridkin
+from hybridkin._core.commands import Commands
 from hybridkin.calibration.measured import distances
 from hybridkin.datasets import Log, LogReport
 from hybridkin.hybrid.estimator import HybridForwardModel
@@ -140,11 +141,9 @@ def evaluate_log(
     measured.check(force)
     if loaded.play is not None:
         measured.check_order("A model with backlash (play)")
-    # Else one motion.
-    motion = measured.motions if measured.named else np.zeros(len(log.q))
-    predicted = loaded.predict(log.q, motion, log.time)
+    predicted = loaded.predict(measured.commands)
     markers = distances(predicted, log.x)
-    errors = _row_errors(loaded, log, motion, markers)
+    errors = _row_errors(loaded, measured.commands, markers)
     fitted = loaded.was_fitted(log.q, log.x, measured.motions)
     fitted_errors = None
     new_errors = None
@@ -170,22 +169,21 @@ def evaluate_log(
     report = Report(f"{loaded.name}: errors on {Path(log.source).name}", record)
     _write_errors(report, loaded.hybrid)
     if out is not None:
-        _add_figures(report, loaded, measured, predicted, motion)
+        _add_figures(report, loaded, measured, predicted)
         report.write(out)
     return report
 
 
 def _row_errors(
-    loaded: LoadedModel, log: Log, motion: NDArray, markers: NDArray
+    loaded: LoadedModel, commands: Commands, markers: NDArray
 ) -> _RowErrors:
-    q = log.q
-    in_domain = np.full(len(q), np.nan)
+    in_domain = np.full(len(commands), np.nan)
     in_radius = in_domain
     hybrid = loaded.hybrid
     if hybrid is not None:
-        in_domain = hybrid.in_domain(q, motion, log.time).astype(float)
+        in_domain = hybrid.in_domain(commands).astype(float)
     if hybrid is not None and hybrid.radius_ is not None:
-        _, radius = hybrid.predict(q, True, motion, log.time)
+        _, radius = hybrid.predict(commands, return_radius=True)
         inside = np.nanmax(markers, axis=1) <= radius
         in_radius = np.where(np.isinf(radius), np.nan, inside)
     return _RowErrors(np.nanmean(markers, axis=1), in_domain, in_radius)
@@ -232,7 +230,6 @@ def _add_figures(
     loaded: LoadedModel,
     log: MeasuredLog,
     predicted: NDArray,
-    motion: NDArray,
 ) -> None:
     plots = hybridkin.plots
     errors = np.nanmean(distances(predicted, log.x), axis=1)
@@ -241,7 +238,7 @@ def _add_figures(
     row = int(np.argsort(errors)[int(0.95 * len(errors))])
     body = None
     if loaded.chain is not None:
-        q = loaded.effective(log.q, motion, log.time)[row]
+        q = loaded.effective(log.commands)[row]
         body = plots.BackboneDisplay.from_estimator(loaded.chain, q).points[0]
     tips = plots.WorkspaceDisplay(log.x[:, -3:], predicted[:, -3:], body, row)
     tips.plot(ax, unit="mm")

@@ -6,6 +6,7 @@ from functools import partial
 from pathlib import Path
 
 import hybridkin
+from hybridkin._core.commands import Commands
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.workflow.model import LoadedModel
 from hybridkin.workflow.report import Progress, Report, quiet
@@ -54,7 +55,7 @@ def animate_track(
         )
     log = read_track(path, loaded.log_format())
     out = Path(out)
-    q = loaded.effective(log.q, time=log.time)
+    q = loaded.effective(Commands(log.q, time=log.time))
     if log.groups is not None:  # the way to the path is no part of it
         on_path = log.groups != LEAD_IN
         log = log.rows(on_path)

@@ -111,10 +111,9 @@ def fit_log(
     model.set_params(coverage=settings.coverage)
     fit_quietly(
         model,
-        rows.q,
+        rows.commands,
         rows.x,
         rows.motions,
-        time=None if settings.play is None else rows.time,
         geometry=mechanical.geometry,
         progress=report_fit,
         expected=float(compared.errors[saved].mean()),

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridkin._core.commands import Commands
 from hybridkin.chains import robots
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
@@ -64,6 +65,13 @@ class MeasuredLog(Log):
         return np.asarray(self.groups)
 
     @property
+    def commands(self) -> Commands:
+        """The actuator vectors with runs and times; a log without named motions is one run."""
+        if not self.named and self.runs is None:
+            return Commands(self.q, time=self.time)
+        return super().commands
+
+    @property
     def split(self) -> str:
         """The kind of the motions, in words."""
         if self.named:
@@ -72,19 +80,20 @@ class MeasuredLog(Log):
 
     @property
     def n_late(self) -> int:
-        """Number of rows that are earlier than the row above of the same motion."""
+        """Number of rows that are earlier than the row above of the same run."""
         if self.time is None:
             return 0
-        order = np.argsort(self.motions, kind="stable")
-        same = self.motions[order][1:] == self.motions[order][:-1]
+        runs = self.commands.run_of_rows
+        order = np.argsort(runs, kind="stable")
+        same = runs[order][1:] == runs[order][:-1]
         return int((same & (np.diff(self.time[order]) < 0)).sum())
 
     def check_order(self, why: str) -> None:
-        """Raise if rows of a motion are not in order of time; `why` begins the message."""
+        """Raise if rows of a run are not in order of time; `why` begins the message."""
         if self.n_late:
             raise ValueError(
-                f"{why} needs the rows of a motion in order of time, but {self.n_late} rows are "
-                "earlier than the row above; sort the log by motion and time."
+                f"{why} needs the rows of a run in order of time, but {self.n_late} rows are "
+                "earlier than the row above; sort the log by run (motion) and time."
             )
 
     def check(self, force: bool) -> None:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 import hybridkin
 from hybridkin._core.arrays import as_array, as_path
+from hybridkin._core.commands import Commands
 from hybridkin._core.digests import row_digests
 from hybridkin._core.directions import in_terms
 from hybridkin._core.model import ForwardModel, as_forward_model
@@ -114,18 +115,11 @@ class LoadedModel:
             return 0.0
         return 0.5 * self.play.width
 
-    def effective(
-        self, q: NDArray, groups: NDArray | None = None, time: NDArray | None = None
-    ) -> NDArray:
-        """Return the motion of the actuators (N, n) for commands q of one motion, or of groups.
-
-        Their times (N,) matter with creep [s].
-        """
-        if self.play is None:
-            return q
-        if groups is None:
-            groups = np.zeros(len(q))
-        return self.play.apply_by_group(q, groups, time)
+    def effective(self, commands: Commands) -> NDArray:
+        """Return what the actuators do for commands (N, n)."""
+        if self.hybrid is None:
+            return commands.q
+        return self.hybrid.effective(commands)
 
     def commands(self, q: NDArray, time: NDArray | None = None) -> NDArray:
         """Return the commands (N, n) that move the actuators along q (N, n), row after row.
@@ -138,16 +132,12 @@ class LoadedModel:
         commands, _ = self.play.command(q, dt=steps)
         return commands
 
-    def predict(
-        self, q: NDArray, groups: NDArray | None = None, time: NDArray | None = None
-    ) -> NDArray:
-        """Return tips (N, 3) [m], or all markers.
-
-        Motions `groups` matter with backlash, times with creep [s].
-        """
+    def predict(self, commands: Commands) -> NDArray:
+        """Return tips (N, 3) [m], or all markers, for commands (N, n)."""
         if self.hybrid is not None:
-            return self.hybrid.predict(q, groups=groups, time=time)
-        return evaluate(as_forward_model(self.model), np.array(q, dtype=float))[0]
+            return self.hybrid.predict(commands)
+        q = np.array(commands.q, dtype=float)
+        return evaluate(as_forward_model(self.model), q)[0]
 
     def tips(self, q: NDArray) -> NDArray:
         """Return tips (N, 3) [m] for the motion q (N, n) of the actuators, without backlash."""

@@ -94,7 +94,7 @@ def next_rows(
         where = f"along the path, which the model reaches to within {millimetres(far)}"
     measured_q = None
     if measured is not None:
-        measured_q = loaded.effective(measured.q, measured.motions, measured.time)
+        measured_q = loaded.effective(measured.commands)
     progress("choosing configurations", 0, 1)
     rows, errors = choose_rows(
         loaded.model, candidates, n, measured=measured_q, target=target

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from hybridkin._core.arrays import as_array
+from hybridkin._core.commands import Commands
 from hybridkin._core.rotations import rigid_motion
 from hybridkin.chains.play import PlayOperator
 from hybridkin.datasets import Log
@@ -151,7 +152,7 @@ def verify_track(
         check_out(out, "verify", force=force)
     loaded.check_columns(log.q)
     sent = read_track(track, loaded.log_format())
-    motion = loaded.effective(sent.q, time=sent.time)
+    motion = loaded.effective(Commands(sent.q, time=sent.time))
     rows = _rows_of(log, sent)
     x = log.x[:, -3:]
     used = np.isfinite(x).all(axis=1)

@@ -165,6 +165,19 @@ def test_evaluate_knows_where_the_motions_of_play_begin(playful, tmp_path, capsy
     assert "order of time, but 14 rows" in errors
 
 
+def test_a_column_of_runs_lets_backlash_go_on_from_motion_to_motion(playful, tmp_path, capsys):
+    lines = (playful / "log.csv").read_text().splitlines()
+    parts = [f"{lines[0]},part"]
+    parts += [f"{line},{k // 5}" for k, line in enumerate(lines[1:])]
+    log = tmp_path / "parts.csv"
+    log.write_text("\n".join(parts))
+    by_part = ["evaluate", playful, log, "--groups", "part"]
+    assert document(capsys, *by_part)[1]["all"]["mean"] > 1e-4
+    record = document(capsys, *by_part, "--runs", "motion")[1]
+    assert record["all"]["mean"] < 1e-4
+    assert len(record["motions"]) == len(lines) // 5
+
+
 @pytest.mark.slow
 def test_code_and_trackers_tell_unit_sign_and_backlash_of_q(playful, tmp_path, capsys):
     out = tmp_path / "c"

@@ -51,6 +51,19 @@ def test_dates_and_durations_are_seconds(tmp_path, unit):
         assert_allclose(log.time, FIRST + SECONDS, rtol=1e-15)
 
 
+def test_runs_are_a_column_of_their_own(tmp_path):
+    runs = np.array(["a", "a", "a", "b", "nan", "b"])
+    log = load_log(
+        npz(tmp_path, r=runs), **NAMES, groups="m", runs="r", time="t", drop_invalid=True
+    )
+    assert log.runs.tolist() == ["a", "a", "a", "b", "b"]
+    assert log.commands[3:].run_of_rows.tolist() == ["b", "b"]
+    assert_array_equal(log.rows(slice(2, None)).commands.time, [2, 3, 5])
+    assert load_log(npz(tmp_path), **NAMES, groups="m").commands.runs[-1] == "v"
+    with pytest.raises(ValueError, match="`runs` must name each of 6 rows"):
+        load_log(npz(tmp_path, r=np.array(["x" * 300] * N)), **NAMES, runs="r")
+
+
 def test_a_missing_date_is_a_missing_value(tmp_path):
     dates = np.datetime64("2024-01-01") + np.arange(N).astype("m8[s]")
     dates[2] = "NaT"

@@ -123,7 +123,7 @@ def test_an_adapted_model_is_the_fit_moved_and_shifted(case):
     model = copy.deepcopy(fitted).adapt(q, x)
     shift, motion = model.change_
     turn = motion[:3, :3]
-    q = model._effective(q, None)[:20]
+    q = model.effective(q)[:20]
     model.play_ = None
     at = torch.from_numpy(q)
     then = torch.from_numpy(q + shift)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from hybridkin import ConstantCurvatureChain, HybridForwardModel, InverseKinematics, tasks
+from hybridkin import Commands, ConstantCurvatureChain, HybridForwardModel, InverseKinematics, tasks
 from hybridkin.chains.play import PlayOperator
 
 CHAIN = ConstantCurvatureChain([0.01, 0.01], lengths=[0.1, 0.1])
@@ -45,6 +45,6 @@ def test_commands_stay_as_balanced_as_those_of_the_log(error_model):
     found = ik.track(path, q0=q[0]).q
     off = np.abs((found - plane[0].numpy()) @ NORMALS)
     assert off.max() < WIDTH
-    assert model.in_domain(q[::20], groups=motions[::20]).mean() > 0.9
+    assert model.in_domain(Commands(q[::20], motions[::20])).mean() > 0.9
     pulled = q[::20] + 10.0 * WIDTH * NORMALS.sum(axis=1)
     assert not model.module_.in_domain(torch.from_numpy(pulled)).any()

@@ -1,13 +1,17 @@
 """Hybrid models of robots that creep, and hysteresis that goes on from group to group."""
 
+import copy
+
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
-from sklearn import config_context
+from sklearn.metrics import r2_score
 from sklearn.model_selection import GroupKFold, cross_validate
 
 from hybridkin import (
+    Commands,
     CreepOperator,
     HybridForwardModel,
     HysteresisSeries,
@@ -45,30 +49,27 @@ def log(operator, n, seed, runs=None):
     return q, tips(y) + noise, groups, time
 
 
-def mean_error(model, operator, **given):
+def mean_error(model, operator):
     """Return the mean error of predictions on new motions [m]."""
     q, groups, time = motions(6, seed=2)
     x = tips(operator.apply_by_group(q, groups, time))
-    return np.linalg.norm(model.predict(q, groups=groups, **given) - x, axis=1).mean()
+    return np.linalg.norm(model.predict(Commands(q, groups, time)) - x, axis=1).mean()
 
 
 @pytest.fixture(scope="module")
 def fitted():
     q, x, groups, time = log(SLIDE, 16, seed=0)
     model = HybridForwardModel(CHAIN, "quadratic", coupling="serial", play="auto")
-    return model.fit(q, x, groups=groups, time=time)
+    return model.fit(Commands(q, groups, time), x, groups=groups)
 
 
 @pytest.mark.slow
 def test_creep_behind_a_backlash_is_found(fitted):
     assert fitted.play_.kind == "backlash and creep"
-    q, x, groups, time = log(SLIDE, 16, seed=0)
+    q, x, groups, _ = log(SLIDE, 16, seed=0)
     single = HybridForwardModel(CHAIN, "quadratic", coupling="serial", play=0.02)
     single.fit(q, x, groups=groups)
-    time = motions(6, seed=2)[2]
-    assert mean_error(fitted, SLIDE, time=time) < 0.2 * mean_error(single, SLIDE)
-    # Without times the steps are not those of the robot.
-    assert mean_error(fitted, SLIDE, time=time) < 0.7 * mean_error(fitted, SLIDE)
+    assert mean_error(fitted, SLIDE) < 0.2 * mean_error(single, SLIDE)
     assert "backlash and creep" in fitted.html_rows()
 
 
@@ -76,10 +77,10 @@ def test_creep_behind_a_backlash_is_found(fitted):
 def test_creep_alone_is_found_and_nothing_where_nothing_is():
     q, x, groups, time = log(CREEP, 16, seed=0)
     model = HybridForwardModel(CHAIN, "quadratic", coupling="serial", play="auto")
-    assert isinstance(model.fit(q, x, groups=groups, time=time).play_, CreepOperator)
-    assert mean_error(model, CREEP, time=motions(6, seed=2)[2]) < 1e-3
+    assert isinstance(model.fit(Commands(q, groups, time), x, groups=groups).play_, CreepOperator)
+    assert mean_error(model, CREEP) < 1e-3
     q, x, groups, time = log(PlayOperator(0.0), 16, seed=0)
-    assert model.fit(q, x, groups=groups, time=time).play_ is None
+    assert model.fit(Commands(q, groups, time), x, groups=groups).play_ is None
 
 
 @pytest.mark.slow
@@ -88,8 +89,8 @@ def test_a_file_holds_friction_and_creep(fitted, tmp_path):
     loaded = load_model(tmp_path / "model.safetensors")
     assert repr(loaded.play_) == repr(fitted.play_)
     q, groups, time = motions(2, seed=4)
-    expected = fitted.predict(q, groups=groups, time=time)
-    assert_array_equal(loaded.predict(q, groups=groups, time=time), expected)
+    expected = fitted.predict(Commands(q, groups, time))
+    assert_array_equal(loaded.predict(Commands(q, groups, time)), expected)
 
 
 def test_a_series_that_a_file_cannot_hold_is_refused(tmp_path):
@@ -106,15 +107,15 @@ def test_hysteresis_goes_on_within_a_run_and_starts_anew_with_the_next():
     runs = groups // 4
     x = tips(wide.apply_by_group(q, runs))
     model = HybridForwardModel(CHAIN, "linear", play=0.03)
-    model.fit(q, x, groups=groups, runs=runs)
+    model.fit(Commands(q, runs), x, groups=groups)
     still = HybridForwardModel(CHAIN, "linear")
     still.fit(wide.apply_by_group(q, runs), x, groups=groups)
     expected = still.predict(wide.apply_by_group(q, runs))
-    assert_array_equal(model.predict(q, groups=runs), expected)
-    assert np.abs(model.predict(q, groups=groups) - expected).max() > 1e-3
+    assert_array_equal(model.predict(Commands(q, runs)), expected)
+    assert np.abs(model.predict(Commands(q, groups)) - expected).max() > 1e-3
     # The change since the fit is found from rows of such runs as well.
     moved = model.adapt(
-        q, x + np.array([0.0, 0.0, 0.1]), parameters=["base"], groups=groups, runs=runs
+        Commands(q, runs), x + np.array([0.0, 0.0, 0.1]), parameters=["base"], groups=groups
     )
     assert_allclose(moved.change_.motion[2, 3], 0.1, rtol=0.0, atol=1e-3)
 
@@ -127,11 +128,11 @@ def test_the_choice_uses_the_runs():
     x = tips(PlayOperator(0.02).apply_by_group(q, groups))
     x += 5e-4 * np.random.default_rng(1).standard_normal(x.shape)
     model = HybridForwardModel(CHAIN, "linear", coupling="serial", play="auto")
-    model.fit(q, x, groups=parts, runs=groups)
+    model.fit(Commands(q, groups), x, groups=parts)
     assert abs(model.play_.width - 0.02) < 0.001
-    error = np.linalg.norm(model.predict(q, groups=groups) - x, axis=1).mean()
+    error = np.linalg.norm(model.predict(Commands(q, groups)) - x, axis=1).mean()
     model.fit(q, x, groups=parts)
-    alone = np.linalg.norm(model.predict(q, groups=groups) - x, axis=1).mean()
+    alone = np.linalg.norm(model.predict(Commands(q, groups)) - x, axis=1).mean()
     assert error < 0.9 * alone
 
 
@@ -159,12 +160,12 @@ def test_logs_as_they_come(log_of):
     elif log_of == "still":
         time = np.zeros(len(q))  # of a log without a clock: no creep, but friction
     model = HybridForwardModel(chain, "linear", coupling="serial", play="auto")
-    model.fit(q, x, weights, groups=groups, time=time)
+    model.fit(Commands(q, groups, time), x, weights, groups=groups)
     if log_of == "still":
         assert "creep" not in model.play_.kind
         return
     assert "creep" in model.play_.kind
-    error = np.nanmean(np.abs(model.predict(q, groups=groups, time=time) - x))
+    error = np.nanmean(np.abs(model.predict(Commands(q, groups, time)) - x))
     assert error < 0.01
 
 
@@ -172,26 +173,65 @@ def test_wrong_runs_and_times_are_named():
     q, x, groups, time = log(CREEP, 4, seed=0)
     model = HybridForwardModel(CHAIN, "linear", play=0.02)
     with pytest.raises(ValueError, match="`runs` must"):
-        model.fit(q, x, runs=groups[:-1])
+        Commands(q, groups[:-1])
+    with pytest.raises(ValueError, match="`time` must have shape"):
+        Commands(q, time=time[:-1])
     with pytest.raises(ValueError, match="`time` must not decrease within a motion"):
-        model.fit(q, x, time=time[::-1])
-    model.fit(q, x, groups=groups, runs=-groups, time=time)
+        model.fit(Commands(q, time=time[::-1]), x)
+    model.fit(Commands(q, -groups, time), x, groups=groups)
     with pytest.raises(ValueError, match="`time` must be finite"):
-        model.predict(q, groups=groups, time=np.full(len(q), np.nan))
-    with pytest.raises(ValueError, match="`runs` must"):
-        model.adapt(q[:5], x[:5], runs=groups)
+        model.predict(Commands(q, groups, np.full(len(q), np.nan)))
 
 
-def test_cross_validation_hands_over_runs_and_times():
-    q, x, groups, time = log(CREEP, 6, seed=0)
-    model = HybridForwardModel(CHAIN, "linear", play=0.02)
-    with config_context(enable_metadata_routing=True):
-        model.set_fit_request(groups=True, runs=True, time=True)
-        results = cross_validate(
-            model,
-            q,
-            x,
-            cv=GroupKFold(3),
-            params={"groups": groups, "runs": groups // 2, "time": time},
-        )
-    assert np.isfinite(results["test_score"]).all()
+@pytest.mark.parametrize("as_frame", [False, True])
+def test_scikit_learn_splits_runs_and_times(as_frame):
+    q, x, groups, time = log(SLIDE, 6, seed=0)
+    commands = Commands(pd.DataFrame(q).add_prefix("q") if as_frame else q, groups, time)
+    model = HybridForwardModel(CHAIN, "linear", play=SLIDE)
+    results = cross_validate(model, commands, x, groups=groups, cv=GroupKFold(3))
+    scores = []
+    for train, test in GroupKFold(3).split(q, x, groups):
+        model.fit(commands[train], x[train])
+        y = SLIDE.apply_by_group(q[test], groups[test], time[test])
+        scores.append(r2_score(x[test], model.module_(torch.from_numpy(y)).detach()))
+    assert_allclose(results["test_score"], scores, rtol=1e-12)
+
+
+def test_a_model_knows_whether_its_fit_had_times(tmp_path):
+    q, x, groups, time = log(CREEP, 4, seed=0)
+    timed = HybridForwardModel(CHAIN, "linear", play=CREEP)
+    timed.fit(Commands(q, groups, time), x, groups=groups)
+    untimed = HybridForwardModel(CHAIN, "linear", play=CREEP)
+    with pytest.warns(UserWarning, match="`X` has no times, but the actuators creep"):
+        untimed.fit(q, x, groups=groups)
+    save_model(timed, tmp_path / "timed.safetensors")
+    for model in (timed, load_model(tmp_path / "timed.safetensors")):
+        with pytest.raises(ValueError, match=r"`X` must have times, .*in seconds"):
+            model.predict(Commands(q, groups))
+        with pytest.raises(ValueError, match="`X` must have times"):
+            model.partial_fit(q[:1], x[:1])
+        with pytest.raises(ValueError, match="`X` must have times"):
+            model.adapt(q[:5], x[:5])
+        assert model.predict(q[:1]).shape == (1, 3)  # one row needs no times
+    save_model(untimed, tmp_path / "untimed.safetensors")
+    for model in (untimed, load_model(tmp_path / "untimed.safetensors")):
+        with pytest.warns(UserWarning, match="the fit had none: its creep takes each row"):
+            timed_rows = model.predict(Commands(q, groups, np.tile(np.arange(40.0), 4)))
+        assert_allclose(timed_rows, model.predict(Commands(q, groups)), rtol=0, atol=1e-15)
+
+
+def test_partial_fits_go_on_within_a_run():
+    q, x, groups, time = log(SLIDE, 6, seed=0)
+    x = x + np.array([0.0, 0.0, 0.02])  # a load
+    whole = HybridForwardModel(CHAIN, "linear", play=SLIDE)
+    whole.fit(Commands(q, groups, time), x, groups=groups)
+    parts = copy.deepcopy(whole)
+    runs = groups // 3
+    whole.partial_fit(Commands(q, runs, time), x + 0.01)
+    for rows in (slice(0, 50), slice(50, 130), slice(130, 240)):
+        parts.partial_fit(Commands(q[rows], runs[rows], time[rows]), x[rows] + 0.01)
+    assert_allclose(parts.predict(q[:1]), whole.predict(q[:1]), rtol=1e-9)
+    with pytest.raises(ValueError, match="`time` must not decrease within a run"):
+        parts.partial_fit(Commands(q[:3], runs[-3:], time[:3]), x[:3])
+    y = whole.effective(Commands(q, runs, time))
+    assert_array_equal(y, SLIDE.apply_by_group(q, runs, time))

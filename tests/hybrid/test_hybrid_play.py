@@ -8,6 +8,7 @@ import torch
 from numpy.testing import assert_allclose, assert_array_equal
 
 from hybridkin import (
+    Commands,
     HybridForwardModel,
     InverseKinematics,
     PlayOperator,
@@ -63,6 +64,11 @@ def test_the_width_is_found_where_a_marker_is_missing(log):
     assert abs(of_the_other.width - WIDTH) < 0.1 * WIDTH
     fitted = fit_play(chain, q, x, groups, widths=[0.5 * WIDTH, WIDTH], parameters=("radii",))
     assert fitted.width == WIDTH
+    parts = np.arange(len(q)) // 20  # two of each run
+    fitted = fit_play(chain, Commands(q, groups), x, parts, [WIDTH], parameters=("radii",))
+    assert fitted.result.rmse < 5e-4
+    alone = fit_play(chain, q, x, parts, [WIDTH], parameters=("radii",))
+    assert alone.result.rmse > 2.0 * fitted.result.rmse
 
 
 def test_a_given_play_is_that_of_the_operator(log):
@@ -72,7 +78,7 @@ def test_a_given_play_is_that_of_the_operator(log):
     still = HybridForwardModel(CHAIN, "linear").fit(y, x, groups=groups)
     y = PlayOperator(WIDTH).apply_by_group(q_new, groups_new)
     for method in ("predict", "jacobian", "predict_mechanical", "in_domain"):
-        found = getattr(model, method)(q_new, groups=groups_new)
+        found = getattr(model, method)(Commands(q_new, groups_new))
         assert_array_equal(found, getattr(still, method)(y), err_msg=method)
     first = groups_new == groups_new[0]
     assert_array_equal(model.predict(q_new[first]), still.predict(y[first]))  # one motion
@@ -151,5 +157,5 @@ def test_clear_errors(log):
     with pytest.warns(UserWarning, match="less than the range"):
         HybridForwardModel(CHAIN, "drop", play=0.5).fit(q, x)
     model = HybridForwardModel(CHAIN, "drop", play=WIDTH).fit(q, x, groups=groups)
-    with pytest.raises(ValueError, match="`groups`"):
-        model.predict(q, groups=groups[:3])
+    with pytest.raises(ValueError, match="`runs`"):
+        model.predict(Commands(q, groups[:3]))

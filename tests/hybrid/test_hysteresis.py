@@ -9,6 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from hybridkin import (
+    Commands,
     HybridForwardModel,
     PlayOperator,
     PrandtlIshlinskiiOperator,
@@ -58,11 +59,11 @@ def test_smooth_loops_take_more_than_one_play(fitted):
     q, groups = motions(6, seed=2)
     x = tips(smooth_friction(q, groups))
     assert isinstance(fitted.play_, PrandtlIshlinskiiOperator)
-    error = np.linalg.norm(fitted.predict(q, groups=groups) - x, axis=1).mean()
+    error = np.linalg.norm(fitted.predict(Commands(q, groups)) - x, axis=1).mean()
     train, train_groups = motions(16, seed=0)
     single = HybridForwardModel(CHAIN, "quadratic", coupling="serial", play=0.02)
     single.fit(train, tips(smooth_friction(train, train_groups)), groups=train_groups)
-    before = np.linalg.norm(single.predict(q, groups=groups) - x, axis=1).mean()
+    before = np.linalg.norm(single.predict(Commands(q, groups)) - x, axis=1).mean()
     assert error < 0.25 * before
 
 
@@ -85,8 +86,8 @@ def test_a_file_holds_the_operator(fitted, tmp_path):
     loaded = load_model(tmp_path / "model.safetensors")
     assert_array_equal(loaded.play_.slopes, fitted.play_.slopes)
     assert_array_equal(loaded.play_.widths, fitted.play_.widths)
-    expected = fitted.predict(q, groups=groups)
-    assert_array_equal(loaded.predict(q, groups=groups), expected)
+    expected = fitted.predict(Commands(q, groups))
+    assert_array_equal(loaded.predict(Commands(q, groups)), expected)
 
 
 @pytest.mark.slow
@@ -123,7 +124,7 @@ def test_every_kind_of_model_can_have_it(kind):
         chain = as_forward_model(lambda q: CHAIN(q))
     model = HybridForwardModel(chain, "drop", play="auto", **options).fit(q, x, groups=groups)
     assert isinstance(model.play_, PrandtlIshlinskiiOperator)
-    assert np.nanmax(np.abs(model.predict(q, groups=groups) - x)) < 0.1
+    assert np.nanmax(np.abs(model.predict(Commands(q, groups)) - x)) < 0.1
 
 
 @pytest.mark.slow
@@ -132,7 +133,7 @@ def test_a_backlash_stays_one_backlash():
     x = tips(PlayOperator(0.02).apply_by_group(q, groups))
     x += 5e-4 * np.random.default_rng(1).standard_normal(x.shape)
     model = HybridForwardModel(CHAIN, "linear", coupling="serial", play="auto")
-    error = np.linalg.norm(model.fit(q, x, groups=groups).predict(q, groups=groups) - x, axis=1)
+    error = np.linalg.norm(model.fit(q, x, groups=groups).predict(Commands(q, groups)) - x, axis=1)
     given = HybridForwardModel(CHAIN, "linear", coupling="serial", play=0.02)
-    least = np.linalg.norm(given.fit(q, x, groups=groups).predict(q, groups=groups) - x, axis=1)
+    least = np.linalg.norm(given.fit(q, x, groups=groups).predict(Commands(q, groups)) - x, axis=1)
     assert error.mean() < 1.05 * least.mean()

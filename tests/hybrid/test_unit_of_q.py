@@ -5,7 +5,13 @@ import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
 
-from hybridkin import ConstantCurvatureChain, HybridForwardModel, InverseKinematics, choose_rows
+from hybridkin import (
+    Commands,
+    ConstantCurvatureChain,
+    HybridForwardModel,
+    InverseKinematics,
+    choose_rows,
+)
 
 GAIN, ZEROS = 2.5e-5, np.array([500.0, -200.0, 0.0, 30.0, 1000.0, 2048.0])
 PLAIN = ConstantCurvatureChain([0.01, 0.008], lengths=[0.1, 0.08])
@@ -72,7 +78,7 @@ def test_serial_coupling_and_play(log):
         HybridForwardModel(chain, play=width, random_state=0).fit(rows, x, groups=groups)
         for chain, width, rows in ((PLAIN, 5e-4, q), (COUNTED, 5e-4 / GAIN, counts(q)))
     ]
-    x, y = (m.predict(r, groups=groups) for m, r in zip(found, (q, counts(q)), strict=True))
+    x, y = (m.predict(Commands(r, groups)) for m, r in zip(found, (q, counts(q)), strict=True))
     assert_allclose(y, x, atol=1e-8)
 
 
