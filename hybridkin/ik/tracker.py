@@ -48,6 +48,8 @@ class Tracker(Portable):
         The present command: the result of the last `step`, or the argument of `reset`.
     effective : array of shape (n,)
         What the actuators do, where the model is evaluated [unit of q]: `q` without hysteresis.
+    state : tuple or None
+        State of the hysteresis after that command, for `reset`; None without hysteresis.
     x : array of shape (3,)
         The model's tip at the start of the last step [m], in the shape of the task.
     error : float
@@ -115,6 +117,12 @@ class Tracker(Portable):
             return self._robot.effective()
 
     @property
+    def state(self) -> Any:
+        """State of the hysteresis after the present command, as from `apply` of `play_`."""
+        with self._lock:
+            return self._robot.hysteresis
+
+    @property
     def x(self) -> NDArray | Tensor:
         """The model's tip before the last step [m], in the shape of the task."""
         return self._given_back(self._last().x)
@@ -177,8 +185,8 @@ class Tracker(Portable):
         q : array-like of shape (n,)
             Command, in the unit of q. From outside the limits it returns at `dq_max`.
         state : tuple, optional
-            State of the hysteresis, as from `apply` of the model's `play_` with the commands until
-            now. Default: without hysteresis at q.
+            State of the hysteresis: `state` of a tracker, or as from `apply` of the model's `play_`
+            with the commands until now. Default: without hysteresis at q.
         """
         start = as_tensor(q, "q", self._settings.task.device)
         n = self._settings.n_actuators

@@ -174,14 +174,36 @@ def test_a_tracker_goes_on_from_a_state(kind):
     _, state = OPERATORS[kind].apply(np.array(sent), dt=DT)
     again = ik_of(OPERATORS[kind]).tracker(HOME)
     again.reset(tracker.q, state)
+    read = ik_of(OPERATORS[kind]).tracker(HOME)
+    read.reset(tracker.q, tracker.state)
     copied = pickle.loads(pickle.dumps(tracker))
     np.testing.assert_allclose(again.effective, tracker.effective, rtol=0, atol=1e-14)
     for target in path[20:]:
         q = tracker.step(target)
         np.testing.assert_allclose(again.step(target), q, rtol=0, atol=1e-12)
         np.testing.assert_array_equal(copied.step(target), q)
+        np.testing.assert_allclose(read.step(target), q, rtol=0, atol=1e-12)
+    assert ik_of(None).tracker(HOME).state is None
     with pytest.raises(ValueError, match="has none"):
         ik_of(None).tracker(HOME).reset(HOME, state)
+
+
+@pytest.mark.parametrize("convert", [np.asarray, torch.from_numpy])
+def test_a_pause_with_creep_is_part_of_the_state(convert):
+    operator = OPERATORS["plays, creep"]
+    tracker = ik_of(operator).tracker(convert(HOME))
+    for target in circle(20):
+        tracker.step(convert(target))
+    _, rested = operator.apply(tracker.q[None], tracker.state, dt=[1e5])
+    moved = np.abs(
+        np.asarray(tracker.effective) - np.asarray(operator.apply(tracker.q[None], rested)[0])
+    )
+    tracker.reset(tracker.q, rested)
+    np.testing.assert_allclose(
+        tracker.effective, operator.apply(tracker.q[None], rested)[0][0], rtol=0, atol=1e-14
+    )
+    assert moved.max() > 1e-4
+    assert type(tracker.state[0].command) is type(tracker.q)
 
 
 def test_from_outside_the_limits_the_command_returns_at_its_speed():
