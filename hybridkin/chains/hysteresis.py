@@ -228,7 +228,7 @@ def checked_times(time: ArrayLike, names: NDArray) -> NDArray:
     check_shape(times, "time", (len(names),), "one time for each row")
     if not np.isfinite(times).all():
         raise ValueError("`time` must be finite, got NaN or infinity.")
-    for name in np.unique(names):
+    for name in np.unique(names).tolist():
         if (np.diff(times[names == name]) < 0.0).any():
             raise ValueError(
                 f"`time` must not decrease within a motion, but does in {name!r:.80}. Sort its "
