@@ -69,6 +69,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self,
         X: object,
         return_radius: bool = False,
+        groups: ArrayLike | None = None,
     ) -> Any:
         """Return tip positions f_mech(q) + w(q) eps(q).
 
@@ -78,6 +79,8 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             Actuator vectors; with `play` in order of time, for several runs or times as `Commands`.
         return_radius : bool, default=False
             Whether to return the estimated error radius as well; requires `coverage`.
+        groups : array-like of shape (N,), optional
+            Motion of every row, only used with `play`: as in a fit, each motion is a run.
 
         Returns
         -------
@@ -89,6 +92,9 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             the tips if the groups of the fit and the new ones are exchangeable. Infinite outside
             the domain (`in_domain`), and everywhere if the fit had too few groups.
         """
+        if groups is not None:
+            commands = Commands.of(X)
+            X = Commands(commands.q, groups, commands.time)
         if not return_radius:
             return self._evaluated(self._tips, X)[0]
         check_is_fitted(self)

@@ -80,6 +80,8 @@ def test_a_given_play_is_that_of_the_operator(log):
     for method in ("predict", "jacobian", "predict_mechanical", "in_domain"):
         found = getattr(model, method)(Commands(q_new, groups_new))
         assert_array_equal(found, getattr(still, method)(y), err_msg=method)
+    by_motion = model.predict(q_new, groups=groups_new)
+    assert_array_equal(by_motion, model.predict(Commands(q_new, groups_new)))
     first = groups_new == groups_new[0]
     assert_array_equal(model.predict(q_new[first]), still.predict(y[first]))  # one motion
 
