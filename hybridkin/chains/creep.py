@@ -108,6 +108,14 @@ class CreepOperator(HysteresisOperator[CreepState]):
         gains = np.broadcast_to(self.gains.reshape(size, -1), (size, n))
         return [Stage(-size, (gains, self.times))]
 
+    def _inside(self, q: NDArray, steps: ArrayLike) -> NDArray:
+        """Return the slow states (T, J, n)."""
+        slow = []
+        for time in self.times:
+            half, _ = CreepOperator([0.5], [time]).apply(q, dt=steps)
+            slow.append(2.0 * half - q)
+        return np.stack(slow, axis=1)
+
     def packed(self, state: CreepState) -> NDArray:
         """Return a state as the kernels keep it (J + 2, n); its result is not known."""
         return np.vstack([state.command, state.slow, state.command])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -132,21 +133,32 @@ class HysteresisOperator(ABC, Generic[_State]):
             For wrong shapes, entries that are not finite or times that decrease.
         """
         rows = real_array(q, "q")
-        check_shape(rows, "q", ("N", "n"))
-        names = labels(groups, len(rows))
-        times = None if time is None else checked_times(time, names)
         effective = np.empty_like(rows)
-        for name in np.unique(names):
-            motion = names == name
-            steps: ArrayLike = 1.0
-            if times is not None:
-                steps = np.diff(times[motion], prepend=times[motion][:1])
+        for motion, steps in _motions(rows, groups, time):
             effective[motion], _ = self.apply(rows[motion], dt=steps)
         return _like(effective, q)
+
+    def inner_states(
+        self, q: NDArray, groups: ArrayLike, time: ArrayLike | None = None
+    ) -> NDArray:
+        """Return what is inside of the operator after every row, beside its result (N, R, n).
+
+        The arguments are those of `apply_by_group`. A single backlash has no such states.
+        """
+        states = [self._inside(q[:1], 0.0)[:0]]
+        order = [np.arange(0)]
+        for motion, steps in _motions(q, groups, time):
+            states.append(self._inside(q[motion], steps))
+            order.append(motion)
+        return np.concatenate(states)[np.argsort(np.concatenate(order))]
 
     @abstractmethod
     def stages(self, n: int) -> list[Stage]:
         """Return the operator of n actuators as stages, for kernels."""
+
+    def _inside(self, q: NDArray, steps: ArrayLike) -> NDArray:
+        """Return the inner states (T, R, n) of a motion, see `inner_states`."""
+        return np.empty((len(q), 0, q.shape[1]))
 
     @abstractmethod
     def packed(self, state: _State) -> NDArray:
@@ -212,6 +224,21 @@ class HysteresisOperator(ABC, Generic[_State]):
     def _state_for(self, state: _State, caller: NDArray | Tensor) -> _State:
         """Return a state in tensors if the caller gave one."""
         return type(state)(*(_like(part, caller) for part in state))
+
+
+def _motions(
+    q: NDArray, groups: ArrayLike, time: ArrayLike | None
+) -> Iterator[tuple[NDArray, ArrayLike]]:
+    """Yield the rows of each motion, and the time since the row before of each row [s]."""
+    check_shape(q, "q", ("N", "n"))
+    names = labels(groups, len(q))
+    times = None if time is None else checked_times(time, names)
+    for name in np.unique(names):
+        rows = np.flatnonzero(names == name)
+        if times is None:
+            yield rows, 1.0
+        else:
+            yield rows, np.diff(times[rows], prepend=times[rows[:1]])
 
 
 def checked_times(time: ArrayLike, names: NDArray) -> NDArray:

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybridkin._core.arrays import real_array
 from hybridkin.chains.hysteresis import HysteresisOperator
+from hybridkin.chains.play import PlayOperator
 from hybridkin.native.hysteresis import Stage
 
 __all__ = ["HysteresisState", "PrandtlIshlinskiiOperator"]
@@ -110,6 +111,11 @@ class PrandtlIshlinskiiOperator(HysteresisOperator[HysteresisState]):
         slopes[:-1] = self.slopes.reshape(len(self.slopes), -1)
         half = np.broadcast_to(0.5 * self.widths[:, None], slopes.shape)
         return [Stage(len(half), (half, slopes))]
+
+    def _inside(self, q: NDArray, steps: ArrayLike) -> NDArray:
+        """Return the plays (T, K, n)."""
+        plays = [PlayOperator(width).apply(q)[0] for width in self.widths]
+        return np.stack(plays, axis=1)
 
     def packed(self, state: HysteresisState) -> NDArray:
         """Return a state as the kernels keep it (K + 2, n)."""

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from hybridkin.chains.hysteresis import HysteresisOperator
@@ -82,6 +82,14 @@ class HysteresisSeries(HysteresisOperator[tuple]):
     def stages(self, n: int) -> list[Stage]:
         """Return the stages of all operators."""
         return [stage for operator in self.operators for stage in operator.stages(n)]
+
+    def _inside(self, q: NDArray, steps: ArrayLike) -> NDArray:
+        """Return the inner states (T, R, n) of all operators."""
+        states = []
+        for operator in self.operators:
+            states.append(operator._inside(q, steps))
+            q, _ = operator.apply(q, dt=steps)
+        return np.concatenate(states, axis=1)
 
     def packed(self, state: tuple) -> NDArray:
         """Return a state as the kernels keep it: each operator begins with the result before."""

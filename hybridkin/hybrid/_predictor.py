@@ -62,6 +62,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     _fitted_rows: NDArray
     _single_output: bool
     _fitted_range: TrainingRange
+    _state_range: TrainingRange | None  # of the states inside of the hysteresis
     _drift: Drift
     _plausible_rows: PlausibleRows | None
 
@@ -104,7 +105,8 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 "HybridForwardModel(..., coverage=0.9); this one was fitted without."
             )
         x, distance = self._evaluated(partial(self._tips, distance=True, enough=1.0), X)
-        return x, self.radius_.at(distance <= 1.0).astype(x.dtype)
+        inside = (distance <= 1.0) & self._are_states_seen(X)
+        return x, self.radius_.at(inside).astype(x.dtype)
 
     def predict_mechanical(
         self,
@@ -166,6 +168,11 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         directions that no training row moved, the domain ends after a tenth of the range. The
         errors of rows outside the domain are not known, even where eps has its full weight.
 
+        With `play`, smooth friction and creep have states, which follow from the commands of a run.
+        A row is outside if its states are farther from those of the log than a tenth of the range,
+        and than groups of the log are from each other: for example in a run that begins where no
+        run of the log was, or after a long rest.
+
         Parameters
         ----------
         X : array-like of shape (N, n) or Commands
@@ -177,7 +184,8 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             Without a guard all True, except along those directions.
         """
         distance = partial(self._tips, value=False, distance=True, enough=1.0)
-        return self._evaluated(distance, X, warn=False)[0] <= 1.0
+        inside = self._evaluated(distance, X, warn=False)[0] <= 1.0
+        return inside & self._are_states_seen(X)
 
     def effective(self, X: object) -> NDArray:
         """Return what the actuators do for commands X [unit of q]; without `play`, X itself.
@@ -277,6 +285,16 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         rows = torch.from_numpy(q)
         messages = [*chain.unit_messages(rows, "X"), chain.contradiction(rows, "X")]
         return [message for message in messages if message is not None]
+
+    def _are_states_seen(self, X: object) -> NDArray[np.bool_]:
+        """Return whether the log had the states inside of the hysteresis (N,)."""
+        commands = Commands.of(X)
+        if self.play_ is None or self._state_range is None:
+            return np.ones(len(commands), dtype=bool)
+        rows = check_inputs(self, commands.q)
+        states = self.play_.inner_states(rows, commands.run_of_rows, commands.time)
+        seen = self._state_range.moved(-self.change_.shift)
+        return seen.beyond(states).max(axis=(1, 2), initial=0.0) <= 0.0
 
     def _check_times(self, timed: bool) -> None:
         """Raise if creep counts seconds and rows have no times; warn the other way round."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from math import ceil, inf
 from typing import NamedTuple
@@ -43,7 +44,10 @@ class Radius(NamedTuple):
 
 
 def conformal_radius(
-    spec: Spec, rows: Rows, coverage: float
+    spec: Spec,
+    rows: Rows,
+    coverage: float,
+    moved: Callable[[NDArray], Rows] | None = None,
 ) -> tuple[Radius, list[str]]:
     """Return the radius that covers a share `coverage` of held-out tips, and warnings.
 
@@ -51,25 +55,37 @@ def conformal_radius(
     without them. Without groups every row is a group. The errors in the domain of these fits give
     the radius; with several markers the largest error of a row counts.
 
+    Parameters
+    ----------
+    spec : Spec
+        Settings of the fits.
+    rows : Rows
+        The measured rows.
+    coverage : float
+        Share of the tips.
+    moved : callable, optional
+        Returns the rows with the motion of the actuators, by hysteresis that was found without
+        some of them, given as places. Default: the rows themselves.
+
     References
     ----------
     Lee, Barber & Willett, Distribution-free inference with hierarchical data (2023), the rank by
     groups; Vovk, Annals of Mathematics and AI 74 (2015), the pooling over folds.
     """
     spec = replace(spec, held_out=False)
-    X = rows.X
     y = rows.tips
     groups = rows.groups
     if groups is None:
         groups = np.arange(len(y))
     inside = np.zeros(len(y), dtype=bool)
     errors = np.full(len(y), np.nan)
-    for train, test in folds(X, rows.groups):
-        part = rows.take(train)
+    for train, test in folds(rows.X, rows.groups):
+        all_rows = rows if moved is None else moved(test)
+        part = all_rows.take(train).distinct()
         if part.groups is not None and len(np.unique(part.groups)) == 1:
             part = replace(part, groups=None)  # of a single motion, rows are held out
         module = fit_hybrid(spec, part).module
-        q = torch.from_numpy(X[test].astype(np.float64))
+        q = all_rows.take(test).q
         with torch.no_grad():
             inside[test] = module.in_domain(q).numpy()
             x = module(q).numpy()

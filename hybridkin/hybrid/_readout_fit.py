@@ -159,11 +159,8 @@ def fit_readout(
             fit = _chosen_with_noise(problem, members)
         else:
             weights = problem.weights_of(start)
-            problem_in_noise = problem.in_noise(noise_ratio)
-            if near:
-                fit = _chosen(problem_in_noise, members, alphas, weights, rounds=1)
-            else:
-                fit = _fitted(problem_in_noise, members, alphas, weights)
+            fit_near = _chosen if near else _fitted
+            fit = fit_near(problem.in_noise(noise_ratio), members, alphas, weights)
     rmse = problem.mean_distance(fit.residual, 2) ** 0.5
     return fit._replace(residual=rows.as_given(fit.residual), rmse=rmse)
 
@@ -187,11 +184,10 @@ def _chosen(
     members: list[Tensor] | None,
     alphas: Pair | None,
     weights: Tensor,
-    rounds: int = 2,
 ) -> ReadoutFit:
     """Return the fit with the penalties of least held-out error, from a start of the search."""
     scores = {}
-    for _ in range(rounds):
+    for _ in range(2):
         # Linearised first about the start, then about the correction found.
         score = partial(problem.score, problem.linearised(weights), members)
         alphas, scores = _linearised.choose(score, alphas)

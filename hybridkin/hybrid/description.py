@@ -88,6 +88,7 @@ def stored_hybrid(model: HybridForwardModel) -> Stored:
             **model.change_._asdict(),
             "training_range": model._fitted_range,
             **_stored_play(model.play_),
+            "state_range": model._state_range,
             "radius": model.radius_,
             "fitted_rows": model._fitted_rows,
         },
@@ -199,6 +200,10 @@ def hybrid_of(stored: Stored, training: object) -> HybridForwardModel:
     model._timed = None
     if "timed" in stored.settings:
         model._timed = stored.value("timed", (bool, None))
+    model._state_range = None
+    if "state_range" in stored.arrays:
+        states = stored.array("state_range", (2, "R", n))
+        model._state_range = TrainingRange(*states)
     if "radius" in stored.arrays:
         radius = stored.array("radius", (3,), finite=False).tolist()
         inside, coverage, n_rows = radius

@@ -1,0 +1,142 @@
+"""The domain and the radius of models with hysteresis: states that the log had, and others."""
+
+import numpy as np
+import pytest
+import torch
+from numpy.testing import assert_array_equal
+
+from hybridkin import (
+    Commands,
+    CreepOperator,
+    HybridForwardModel,
+    HysteresisSeries,
+    PlayOperator,
+    PrandtlIshlinskiiOperator,
+    load_model,
+    robots,
+    save_model,
+)
+
+CHAIN = robots.bionic_handling_assistant()
+FRICTION = PrandtlIshlinskiiOperator([0.0, 0.01, 0.02, 0.2], [0.5, 0.7, 0.8])
+CREEP = CreepOperator([0.1, 0.2], [4.0, 400.0])
+ROWS = 40
+
+
+def motions(n, seed, corner=0.0):
+    """Return motions back and forth, which begin at 0.25 m or up to `corner` away from it."""
+    rng = np.random.default_rng(seed)
+    turn = np.linspace(0.0, 2.0 * np.pi, ROWS)
+    waves = np.stack([np.sin(turn), np.sin(2.0 * turn), np.cos(turn) - 1.0])
+    q = 0.25 + (rng.uniform(-0.03, 0.03, (n, 9, 3)) @ waves).transpose(0, 2, 1)
+    late = np.linspace(0.0, 1.0, ROWS)[:, None]
+    start = corner * rng.choice([-1.0, 1.0], (n, 1, 9))
+    q = q + (1.0 - late) * (start if corner else 0.0)
+    runs = np.repeat(np.arange(n), ROWS)
+    return Commands(q.reshape(-1, 9), runs, np.arange(len(runs), dtype=float))
+
+
+def many_plays(commands):
+    """Return the sum of 25 plays of widths up to 8 cm, none of them those of a fit."""
+    half = np.linspace(0.0, 0.04, 25)
+    density = np.exp(-half / 0.012)
+    plays = [PlayOperator(2.0 * r).apply_by_group(commands.q, commands.runs) for r in half]
+    return np.tensordot(density / density.sum(), plays, 1)
+
+
+def tips(y, noise=0.0):
+    with torch.no_grad():
+        bent = torch.from_numpy(y) + 0.03 * torch.from_numpy(y[:, ::-1] - 0.25).square()
+        x = CHAIN(bent).numpy()
+    return x + noise * np.random.default_rng(1).standard_normal(x.shape)
+
+
+def distances(model, commands, x):
+    return np.linalg.norm(model.predict(commands) - x, axis=1)
+
+
+def fitted(operator, **settings):
+    commands = motions(16, seed=0)
+    x = tips(operator.apply_by_group(commands.q, commands.runs, commands.time))
+    model = HybridForwardModel(CHAIN, "linear", play=operator, **settings)
+    return model.fit(commands, x, groups=commands.runs)
+
+
+def test_runs_that_begin_elsewhere_are_outside_the_domain(tmp_path):
+    model = fitted(FRICTION, coverage=0.9)
+    assert model.in_domain(motions(8, seed=2)).mean() > 0.9
+    elsewhere = motions(8, seed=3, corner=0.05)
+    y = torch.from_numpy(model.effective(elsewhere))
+    assert model.module_.in_domain(y).float().mean() > 0.2  # for what the actuators do
+    assert not model.in_domain(elsewhere).any()
+    _, radius = model.predict(elsewhere, return_radius=True)
+    assert np.isinf(radius).all()
+    save_model(model, tmp_path / "model.safetensors")
+    loaded = load_model(tmp_path / "model.safetensors")
+    q = np.concatenate([motions(8, seed=2).q, elsewhere.q])
+    both = Commands(q, np.arange(len(q)) // ROWS, np.arange(float(len(q))))
+    assert_array_equal(loaded.in_domain(both), model.in_domain(both))
+    assert 0.4 < model.in_domain(both).mean() < 0.5
+
+
+def test_states_follow_the_zeros_of_the_actuators():
+    model = fitted(FRICTION)
+    today = motions(8, seed=2)
+    shift = np.full(9, 0.02)
+    x = tips(FRICTION.apply_by_group(today.q, today.runs))
+    moved = Commands(today.q - shift, today.runs, today.time)
+    before = model.in_domain(today)
+    model.adapt(moved, x, parameters=["actuator_zeros"], groups=moved.runs)
+    np.testing.assert_allclose(model.change_.shift, shift, atol=2e-3)
+    assert (model.in_domain(moved) == before).mean() > 0.95
+
+
+def test_creep_after_a_long_rest_at_an_end_is_outside_the_domain():
+    model = fitted(CREEP)
+    commands = motions(8, seed=2)
+    swing = np.abs(commands.q - 0.25).reshape(8, ROWS, 9).sum(axis=2)
+    end = swing.argmax(axis=1) + ROWS * np.arange(8)  # of every motion, where it rests
+    runs = np.insert(commands.runs, end, commands.runs[end])
+    q = np.insert(commands.q, end, commands.q[end], axis=0)
+    rests = np.zeros(len(q), dtype=bool)
+    rests[end + 1 + np.arange(8)] = True
+    later = np.concatenate([np.maximum.accumulate(rests[runs == run]) for run in range(8)])
+    for pause, least, most in ((1.0, 0.8, 1.0), (3600.0, 0.0, 0.5)):
+        time = np.arange(float(len(q))) + pause * np.cumsum(rests)
+        inside = model.in_domain(Commands(q, runs, time))
+        assert inside[~later].mean() > 0.9
+        assert least <= inside[later].mean() <= most
+
+
+@pytest.mark.parametrize("operator", [FRICTION, CREEP, HysteresisSeries([FRICTION, CREEP])])
+def test_inner_states_are_those_of_single_steps(operator):
+    commands = motions(3, seed=0)
+    order = np.argsort(np.arange(120) % ROWS, kind="stable")  # motions by turns
+    commands = commands[order]
+    states = operator.inner_states(commands.q, commands.runs, commands.time)
+    for run in range(3):
+        state = None
+        rows = np.flatnonzero(commands.runs == run)
+        for row, step in zip(rows, np.diff(commands.time[rows], prepend=0.0), strict=True):
+            _, state = operator.apply(commands.q[row : row + 1], state, [step])
+            parts = state if isinstance(operator, HysteresisSeries) else [state]
+            inside = [part.plays if "plays" in part._fields else part.slow for part in parts]
+            np.testing.assert_allclose(states[row], np.concatenate(inside), atol=1e-14)
+    assert PlayOperator(0.01).inner_states(commands.q, commands.runs).shape == (120, 0, 9)
+
+
+@pytest.mark.slow
+def test_the_radius_covers_new_motions_with_hysteresis():
+    commands = motions(24, seed=0)
+    x = tips(many_plays(commands), 5e-4)
+    model = HybridForwardModel(CHAIN, "quadratic", coupling="serial", play="auto", coverage=0.9)
+    model.fit(commands, x, groups=commands.runs)
+    new = motions(48, seed=1)
+    error = distances(model, new, tips(many_plays(new), 5e-4))
+    inside = model.in_domain(new)
+    assert inside.mean() > 0.85
+    covered = (error <= model.radius_.inside)[inside].mean()
+    assert 0.84 < covered < 0.97
+    elsewhere = motions(24, seed=2, corner=0.05)
+    assert distances(model, elsewhere, tips(many_plays(elsewhere))).mean() > model.radius_.inside
+    assert not model.in_domain(elsewhere).any()
