@@ -14,6 +14,7 @@ if TYPE_CHECKING:
         load_ftdcr,
         load_soromox_tentacle,
     )
+    from hybridkin.datasets._repeatability import repeatability
     from hybridkin.datasets._shipped import load_trunk, paper_split
 
 __all__ = [
@@ -30,6 +31,7 @@ __all__ = [
     "load_trunk",
     "log_columns",
     "paper_split",
+    "repeatability",
 ]
 
 # Their results are Bunches of scikit-learn.
@@ -41,6 +43,7 @@ _NAMES_OF = {
         "load_ftdcr",
         "load_soromox_tentacle",
     ),
+    "_repeatability": ("repeatability",),
     "_shipped": ("load_trunk", "paper_split"),
 }
 __getattr__ = on_first_use(__name__, _NAMES_OF)

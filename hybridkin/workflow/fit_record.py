@@ -103,7 +103,8 @@ class FitRecord(Training):
     auto : dict or None
         The choices of "auto", see ``HybridForwardModel.cv_results_``.
     words : list of str
-        What the saved model chose, its error radius, and motions that the log lacks.
+        How much of the errors is static, hysteresis, and not repeatable; what the saved model
+        chose, its error radius, and motions that the log lacks.
     tried : dict of str to dict
         If the robot says "auto", the errors of all sets of parameters that were tried [m]: on
         held-out motions, "cv", and outside the fitted rows, "io".
@@ -141,10 +142,8 @@ def write_comparison(report: Report[FitRecord]) -> None:
     report.text(
         "## Errors on held-out motions",
         f"{record.rows} rows{thinned}, {record.n_motions} {record.split}. Each of "
-        f"{len(record.choices_by_fold)} folds holds out whole motions. Geometry, hysteresis, "
-        "penalties and networks are chosen and fitted without them, in searches that start at the "
-        "choices for all motions. Those also decide whether hysteresis is looked for, and how many "
-        "neurons a network has at most. The other folds choose the weights of a blend.",
+        f"{len(record.choices_by_fold)} folds holds out whole motions. The other motions choose "
+        "and fit everything: geometry, features, penalties and blend.",
         _KINDS_OF_MODELS,
     )
     columns = ("mean", "std_error", "std", "p95", "max", "std_folds")
