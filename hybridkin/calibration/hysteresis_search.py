@@ -16,6 +16,7 @@ from hybridkin.chains.hysteresis import HysteresisOperator
 _CLOSE = 0.002  # tolerance of a refined width, relative to it
 _LEAST = 0.0025  # first width, relative to the stroke
 _LEAST_GAIN = 0.01  # relative to the error
+_CERTAIN = 2.0  # standard errors of the gain over no hysteresis
 # Standard deviations of the priors of slopes and gains, from few to many free weights.
 _NONE = 0.0, 0.0
 _CREEP = 0.0, 0.2
@@ -104,9 +105,10 @@ def find_hysteresis(log: HysteresisLog) -> HysteresisOperator | None:
     """Return the hysteresis of the actuators; None if none lowers the error on held-out groups.
 
     Tried are no friction, one backlash of the best width, and Prandtl-Ishlinskii operators about
-    this width, each with and without creep. The simplest is taken to which the one of least error
-    has no clear gain: a mean gain over the groups above its standard error, and above 1 % of the
-    error, which the linear correction can feign.
+    this width, each with and without creep. The one of least error must be better than none with
+    certainty: its mean gain over the groups is above twice the standard error, and above 1 % of the
+    error, which the linear correction can feign. Then the simplest is taken to which it has no
+    clear gain, above one standard error and 1 %.
 
     Parameters
     ----------
@@ -123,20 +125,16 @@ def find_hysteresis(log: HysteresisLog) -> HysteresisOperator | None:
         widths[1:1] = doubled[doubled < widest].tolist()
     width = search_width(log, widths, refine=True).width
 
-    candidates = [_Candidate.of(log, 0.0, _NONE)]
+    none = _Candidate.of(log, 0.0, _NONE)
     creep = _Candidate.of(log, 0.0, _CREEP)
-    if width == 0.0:
-        candidates.append(creep)
-    else:
+    candidates = [creep]
+    if width > 0.0:
         backlash = _Candidate.of(log, width, _NONE)
-        with_creep = _Candidate.of(log, width, _CREEP)
-        if _gain(backlash.errors, with_creep.errors).clear:
-            with_creep = _with_width_again(log, with_creep)
-        candidates += [backlash, creep, with_creep]
-        candidates += [_Candidate.of(log, width, spreads) for spreads in _SMOOTH]
-        width = with_creep.width
-        candidates += [_Candidate.of(log, width, both) for both in _SMOOTH_AND_CREEP]
+        if _gain(none.errors, backlash.errors).clear:
+            candidates = [backlash, creep, *_with_friction(log, backlash)]
     least = min(candidates, key=_Candidate.error)
+    if not _gain(none.errors, least.errors).certain:
+        return None
     as_good = (c for c in candidates if not _gain(c.errors, least.errors).clear)
     return next(as_good).operator
 
@@ -162,6 +160,17 @@ class _Candidate(NamedTuple):
         return float(self.errors.mean())
 
 
+def _with_friction(log: HysteresisLog, backlash: _Candidate) -> list[_Candidate]:
+    """Return candidates with friction other than one backlash, from few to many free weights."""
+    width = backlash.width
+    with_creep = _Candidate.of(log, width, _CREEP)
+    if _gain(backlash.errors, with_creep.errors).clear:
+        with_creep = _with_width_again(log, with_creep)
+    smooth = [_Candidate.of(log, width, spreads) for spreads in _SMOOTH]
+    smooth_creep = [_Candidate.of(log, width, both) for both in _SMOOTH_AND_CREEP]
+    return [with_creep, *smooth, *smooth_creep]
+
+
 def _with_width_again(log: HysteresisLog, candidate: _Candidate) -> _Candidate:
     """Return backlash and creep with the width of least error, for a width without creep."""
     tried = [candidate]
@@ -179,11 +188,12 @@ def _with_width_again(log: HysteresisLog, candidate: _Candidate) -> _Candidate:
 
 
 class _Gain(NamedTuple):
-    """Mean reduction of the errors of groups [m], its standard error, and whether it is clear."""
+    """Mean reduction of the errors of groups [m], and its standard error."""
 
     mean: float
     std_error: float
-    clear: bool
+    clear: bool  # above the standard error, and above 1 % of the error
+    certain: bool  # and above twice the standard error
 
 
 def _gain(before: NDArray, after: NDArray) -> _Gain:
@@ -192,4 +202,4 @@ def _gain(before: NDArray, after: NDArray) -> _Gain:
     mean = float(gains.mean())
     std_error = float(gains.std(ddof=1) / np.sqrt(len(gains)))
     clear = mean > max(std_error, _LEAST_GAIN * float(before.mean()))
-    return _Gain(mean, std_error, clear)
+    return _Gain(mean, std_error, clear, clear and mean > _CERTAIN * std_error)

@@ -2,10 +2,17 @@ import numpy as np
 import pytest
 import torch
 
-from hybridkin import CreepOperator, HysteresisSeries, PlayOperator, as_forward_model
+from hybridkin import (
+    CreepOperator,
+    HysteresisSeries,
+    PlayOperator,
+    as_forward_model,
+    robots,
+)
 from hybridkin.calibration.hysteresis_fit import HysteresisLog, HysteresisProblem
 from hybridkin.calibration.hysteresis_search import _gain, find_hysteresis
 
+TRUNK = robots.bionic_handling_assistant()
 M = np.array([[1.0, 0.3, 0.0], [0.0, 0.8, -0.4], [0.2, 0.0, 1.1]])
 
 
@@ -21,6 +28,48 @@ def log_of(operator, groups=8, rows=30, noise=1e-3):
     model = as_forward_model(lambda q: q @ torch.from_numpy(M.T))
     time = np.tile(np.arange(rows, dtype=float), groups)
     return HysteresisLog(model, q, x, np.ones(len(q)), names, names, time)
+
+
+def static_log(error, seed):
+    """Return a log of a trunk without hysteresis whose model has an error as large as a tenth."""
+    rng = np.random.default_rng(seed)
+    if error == "quadratic":  # straight lines from posture to posture
+        ends = rng.uniform(-1.0, 1.0, (10, 2, 9))
+        along = np.linspace(0.0, 1.0, 8)[:, None]
+        unit = np.concatenate([start + along * (end - start) for start, end in ends])
+        groups = np.repeat(np.arange(10), 8)
+    else:  # one motion of nine sines
+        turn = np.linspace(0.0, 6.0 * np.pi, 300)[:, None]
+        unit = np.sin(turn * rng.uniform(0.5, 2.0, 9) + rng.uniform(0.0, 6.0, 9))
+        groups = np.arange(300) // 30
+    moved = unit
+    if error == "quadratic":
+        form = rng.standard_normal((9, 9, 9)) / 9.0
+        moved = unit + 0.2 * np.einsum("ni,nj,ijk->nk", unit, unit, form)
+    with torch.no_grad():
+        x = TRUNK(torch.from_numpy(0.25 + 0.05 * moved)).numpy()
+    if error == "gravity":
+        side = x[:, :2]
+        out = np.linalg.norm(side, axis=1, keepdims=True)
+        x = x + 0.4 * np.hstack([0.5 * side * out, -(out**2)])
+    x = x + 5e-4 * rng.standard_normal(x.shape)
+    runs = np.zeros(len(x)) if error == "gravity" else groups
+    time = np.arange(len(x), dtype=float)
+    return HysteresisLog(TRUNK, 0.25 + 0.05 * unit, x, np.ones(len(x)), groups, runs, time)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_an_error_of_the_model_is_not_taken_for_hysteresis(seed):
+    assert find_hysteresis(static_log("quadratic", seed)) is None
+
+
+@pytest.mark.slow
+def test_hysteresis_is_rarely_found_where_there_is_none():
+    wrong = 0
+    for seed in range(15):
+        for error in ("quadratic", "gravity"):
+            wrong += find_hysteresis(static_log(error, seed)) is not None
+    assert wrong <= 2  # of 30
 
 
 def test_held_out_errors_are_those_of_fits_without_each_fold():
@@ -61,9 +110,12 @@ def test_shares_of_creep_and_the_width_before_it_are_found():
 
 def test_a_gain_must_be_above_its_error_and_above_one_percent():
     before = np.array([1.0, 1.1, 0.9, 1.0])
-    assert _gain(before, before - [0.1, 0.12, 0.08, 0.1])[2]
-    assert not _gain(before, before - [0.3, -0.2, 0.1, -0.1])[2]
-    assert not _gain(before, before - 0.005)[2]
+    assert _gain(before, before - [0.1, 0.12, 0.08, 0.1]).certain
+    unsure = _gain(before, before - [0.1, -0.04, 0.06, 0.04])
+    assert unsure.clear
+    assert not unsure.certain
+    assert not _gain(before, before - [0.3, -0.2, 0.1, -0.1]).clear
+    assert not _gain(before, before - 0.005).clear
 
 
 def test_missing_markers_and_counts_weigh_the_rows():
