@@ -25,7 +25,7 @@ _FACTORS = np.array([0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0])
 _ROUNDS = 4
 _LEAST_NOISE = 1e-5  # relative to the spread of the tips
 _COMMON = 0.5  # prior correlation of the weights of two actuators
-_AT_ONCE = 0.05  # least share of a change that comes at once
+_MOST_LATE = 0.95  # largest share of a change that comes late
 _LEAST_GAIN = 1e-6  # of creep
 
 
@@ -62,7 +62,7 @@ class HysteresisLog:
     @cached_property
     def rows(self) -> NDArray:
         """The rows whose errors count."""
-        return np.flatnonzero((self.counts > 0) & ~np.isnan(self.x).all(axis=1))
+        return np.flatnonzero(which_count(self.x, self.counts))
 
     @cached_property
     def folds(self) -> list[tuple[NDArray, NDArray]]:
@@ -90,6 +90,17 @@ class HysteresisLog:
         _, group = np.unique(self.groups[self.rows], return_inverse=True)
         counts = self.counts[self.rows]
         return np.bincount(group, counts * distances) / np.bincount(group, counts)
+
+
+def which_count(x: NDArray, counts: NDArray) -> NDArray:
+    """Return which rows (N,) count: not zero times, and with a marker that was measured.
+
+    Parameters
+    ----------
+    x, counts : ndarray of shapes (N, m) and (N,)
+        As in `HysteresisLog`.
+    """
+    return (counts > 0.0) & ~np.isnan(x).all(axis=1)
 
 
 class HysteresisFit(NamedTuple):
@@ -140,22 +151,28 @@ class HysteresisProblem:
         changes = np.stack([*-np.diff(plays, axis=0), plays[-1]], axis=1)
         self.changes = changes[log.rows]  # (C, K + 1, n), of which u is a weighted sum
         self.times = log.times if creep else np.empty(0)
-        flat = changes.reshape(len(changes), -1)
-        late = []
-        for time in self.times:
-            half = CreepOperator([0.5], [time])  # y - u = (S(u) - u) / 2
-            late.append(2.0 * (half.apply_by_group(flat, log.runs, log.time) - flat))
-        late = np.reshape(late, (len(late), *changes.shape))[:, log.rows]
-        self.late = late.transpose(1, 0, 2, 3)  # (C, J, K + 1, n)
-        self.measured = log.x[log.rows]
-        roots = np.sqrt(log.counts[log.rows])[:, None]
-        self.roots = np.where(np.isnan(self.measured), 0.0, roots)
+        self.late = self._late(changes)
         n = log.q.shape[1]
         one_backlash = _FACTORS[: len(self.widths) - 1] >= 1.0
         self.start = np.outer(one_backlash, np.ones(n))
+
+        self.measured = log.x[log.rows]
+        roots = np.sqrt(log.counts[log.rows])[:, None]
+        self.roots = np.where(np.isnan(self.measured), 0.0, roots)
         self.center = log.q.mean(axis=0)
-        scale = np.ptp(log.q, axis=0)
-        self.scale = np.where(scale > 0.0, scale, 1.0)
+        ranges = np.ptp(log.q, axis=0)
+        self.scale = np.where(ranges > 0.0, ranges, 1.0)
+
+    def _late(self, changes: NDArray) -> NDArray:
+        """Return S(c) - c (C, J, K + 1, n) of changes c, with the slow state S of each time."""
+        flat = changes.reshape(len(changes), -1)
+        late = np.empty((len(self.log.rows), len(self.times), *changes.shape[1:]))
+        for place, time in enumerate(self.times):
+            half = CreepOperator([0.5], [time])  # y - u = (S(u) - u) / 2
+            crept = half.apply_by_group(flat, self.log.runs, self.log.time)
+            difference = 2.0 * (crept - flat)
+            late[:, place] = difference.reshape(changes.shape)[self.log.rows]
+        return late
 
     def operator(self, fit: HysteresisFit) -> HysteresisOperator | None:
         """Return the operator of fitted slopes and gains; None without hysteresis."""
@@ -181,72 +198,105 @@ class HysteresisProblem:
         slope_spread, gain_spread : float
             Standard deviations of the priors of a slope and of a gain; 0 for fixed ones.
         """
-        K, n = self.start.shape
-        weights = np.concatenate([self.start, np.zeros((len(self.times), n))])
-        spreads = np.repeat([slope_spread, gain_spread], [K, len(self.times)])
-        free = spreads > 0.0
-        mean = weights[free].ravel()
-        of_actuators = np.linalg.inv((1.0 - _COMMON) * np.eye(n) + _COMMON)
-        precision = np.kron(np.diag(spreads[free] ** -2.0), of_actuators)
-        n_rows = np.square(self.roots.max(axis=1)).sum()
-        correction = None
+        n_slopes, n = self.start.shape
+        n_gains = len(self.times)
+        weights = np.concatenate([self.start, np.zeros((n_gains, n))])
+        spreads = np.repeat([slope_spread, gain_spread], [n_slopes, n_gains])
+        prior = _Prior.of(weights, spreads)
+        correction = self._no_correction()
         system = None
-        distances = np.full(len(self.log.rows), LARGEST)
         for _ in range(_ROUNDS):
-            columns, noise, correction = self._linearised(weights, correction, free)
-            if not np.isfinite(columns).all():  # the model is not regular so far away
-                return HysteresisFit(weights[:K], weights[K:], distances)
-            system = _LeastSquares.of(columns, noise * precision, mean, n_rows)
+            system = self._linearised(weights, correction, prior)
+            if not np.isfinite(system.columns).all():
+                # The model is not regular so far away.
+                unknown = np.full(len(self.log.rows), LARGEST)
+                return HysteresisFit(weights[:n_slopes], weights[n_slopes:], unknown)
             solution = system.solution(system.products)
-            of_weights = solution[correction.size :]
             correction = solution[: correction.size].reshape(correction.shape)
-            weights[free] = of_weights.reshape(-1, n)
-            late = np.maximum(weights[K:].sum(axis=0), 1.0 - _AT_ONCE)
-            weights[K:] *= (1.0 - _AT_ONCE) / late
+            weights[prior.free] = solution[correction.size :].reshape(-1, n)
+            gains = weights[n_slopes:]
+            gains *= _MOST_LATE / np.maximum(gains.sum(axis=0), _MOST_LATE)
         assert system is not None
+        distances = np.empty(len(self.log.rows))
         for _, test in self.log.folds:
             distances[test] = system.held_out(test) / self.roots[test].max(axis=1)
-        return HysteresisFit(weights[:K], weights[K:], distances)
+        return HysteresisFit(weights[:n_slopes], weights[n_slopes:], distances)
+
+    def _no_correction(self) -> NDArray:
+        """Return a correction W of zeros (Z, n + 1)."""
+        with torch.no_grad():
+            z, _ = self.log.model.coordinates(torch.from_numpy(self.log.q[:1]))
+        return np.zeros((z.shape[1], 1 + len(self.center)))
+
+    def _effective(self, weights: NDArray) -> tuple[NDArray, NDArray]:
+        """Return the effective changes y (C, n), and dy / d weights (C, K + J, n).
+
+        An actuator depends on its own weights (K + J, n) only.
+        """
+        n_slopes = len(self.start)
+        gains = weights[n_slopes:]
+        of_changes = np.ones((n_slopes + 1, weights.shape[1]))  # the last are 1
+        of_changes[:-1] = weights[:n_slopes]
+        by_gains = (self.late * of_changes).sum(axis=2)
+        y = (self.changes * of_changes).sum(axis=1) + (by_gains * gains).sum(axis=1)
+        delayed = (self.late[:, :, :n_slopes] * gains[:, None]).sum(axis=1)
+        by_slopes = self.changes[:, :n_slopes] + delayed
+        return y, np.concatenate([by_slopes, by_gains], axis=1)
 
     def _linearised(
-        self, weights: NDArray, correction: NDArray | None, free: NDArray
-    ) -> tuple[NDArray, float, NDArray]:
-        """Return columns (C, m, P + F n + 1) of W, of free weights and tips, the noise, and W.
-
-        ``columns @ [W, weights, -1]`` are the errors of the tips, W (Z, n + 1) is zero at first.
-        """
-        K = len(self.start)
-        gains = weights[K:]
-        of_changes = np.concatenate([weights[:K], np.ones((1, weights.shape[1]))])
-        late = (self.late * of_changes).sum(axis=2)
-        y = (self.changes * of_changes).sum(axis=1) + (late * gains).sum(axis=1)
-        delayed = (self.late[:, :, :K] * gains[:, None]).sum(axis=1)
-        by_weights = np.concatenate([self.changes[:, :K] + delayed, late], axis=1)
-
-        model = self.log.model
+        self, weights: NDArray, correction: NDArray, prior: _Prior
+    ) -> _LeastSquares:
+        """Return the least squares of the next step, from weights and a correction W."""
+        y, by_weights = self._effective(weights)
         inputs = np.column_stack([np.ones(len(y)), (y - self.center) / self.scale])
+        model = self.log.model
         with torch.no_grad():
             z, dz = model.coordinates(torch.from_numpy(y))
-            if correction is None:
-                correction = np.zeros((z.shape[1], inputs.shape[1]))
-            tips, by_z = model.from_coordinates_and_jacobian(
-                z + torch.from_numpy(inputs @ correction.T)
-            )
+            moved = z + torch.from_numpy(inputs @ correction.T)
+            tips, by_z = model.from_coordinates_and_jacobian(moved)
             by_y = by_z @ (dz + torch.from_numpy(correction[:, 1:] / self.scale))
         residual = np.where(self.roots > 0.0, self.measured - tips.numpy(), 0.0)
+
+        # Columns of all unknowns, then the target: what they have to explain.
         by_correction = by_z.numpy()[..., None] * inputs[:, None, None]
-        by_free = by_y.numpy()[:, :, None] * by_weights[:, None, free]
-        by_correction = by_correction.reshape(*residual.shape, -1)
-        by_free = by_free.reshape(*residual.shape, -1)
-        target = residual + by_correction @ correction.ravel()
-        target = target + by_free @ weights[free].ravel()
-        columns = np.concatenate([by_correction, by_free, target[..., None]], axis=2)
-        noise = np.average(residual**2, weights=self.roots**2)
+        by_free = by_y.numpy()[:, :, None] * by_weights[:, None, prior.free]
+        n_unknowns = correction.size + len(prior.mean)
+        columns = np.empty((*residual.shape, n_unknowns + 1))
+        columns[..., : correction.size] = by_correction.reshape(*residual.shape, -1)
+        columns[..., correction.size : -1] = by_free.reshape(*residual.shape, -1)
+        unknowns = np.append(correction, weights[prior.free])
+        columns[..., -1] = residual + columns[..., :-1] @ unknowns
+
+        counts = self.roots**2
+        noise = np.average(residual**2, weights=counts)
         noise += _LEAST_NOISE**2 * np.nanvar(self.measured)
-        return self.roots[..., None] * columns, noise, correction
+        return _LeastSquares(
+            self.roots[..., None] * columns,
+            noise * prior.precision,
+            prior.mean,
+            n_rows=counts.max(axis=1).sum(),
+        )
 
 
-class _LeastSquares(NamedTuple):
+class _Prior(NamedTuple):
+    """Normal prior of the free weights, correlated over actuators: those of a robot are alike."""
+
+    free: NDArray  # (K + J,), the weights that are not fixed
+    mean: NDArray  # (F,)
+    precision: NDArray  # (F, F)
+
+    @classmethod
+    def of(cls, weights: NDArray, spreads: NDArray) -> _Prior:
+        """Return the prior about weights (K + J, n) with standard deviations (K + J,)."""
+        free = spreads > 0.0
+        correlation = (1.0 - _COMMON) * np.eye(weights.shape[1]) + _COMMON
+        of_actuators = np.linalg.inv(correlation)
+        precision = np.kron(np.diag(spreads[free] ** -2.0), of_actuators)
+        return cls(free, weights[free].ravel(), precision)
+
+
+@dataclass(frozen=True)
+class _LeastSquares:
     """Linear least squares of all rows, whose products are kept to leave some of them out.
 
     The columns are those of a correction, of weights of zero and more, and of the target. Beside
@@ -254,27 +304,25 @@ class _LeastSquares(NamedTuple):
     """
 
     columns: NDArray  # (C, m, P + F + 1)
-    products: NDArray  # of the columns, summed over rows
-    ridge: NDArray  # (P,)
     penalty: NDArray  # (F, F)
     mean: NDArray  # (F,), at which the penalty is zero
+    n_rows: float
 
-    @classmethod
-    def of(
-        cls, columns: NDArray, penalty: NDArray, mean: NDArray, n_rows: float
-    ) -> _LeastSquares:
-        """Return the system of columns of so many rows."""
-        flat = columns.reshape(-1, columns.shape[2])
-        products = flat.T @ flat
-        ridge = np.diag(products)[: -1 - len(mean)] / n_rows
-        ridge = np.where(ridge > 0.0, ridge, 1.0)
-        return cls(columns, products, ridge, penalty, mean)
+    @cached_property
+    def products(self) -> NDArray:
+        """Products of the columns, summed over rows."""
+        return _products(self.columns)
+
+    @cached_property
+    def ridge(self) -> NDArray:
+        """Penalties of the correction (P,)."""
+        ridge = np.diag(self.products)[: -1 - len(self.mean)] / self.n_rows
+        return np.where(ridge > 0.0, ridge, 1.0)
 
     def held_out(self, test: NDArray) -> NDArray:
         """Return the lengths of the errors of rows, from the solution of all others."""
         columns = self.columns[test]
-        flat = columns.reshape(-1, columns.shape[2])
-        solution = self.solution(self.products - flat.T @ flat)
+        solution = self.solution(self.products - _products(columns))
         return np.linalg.norm(columns @ np.append(solution, -1.0), axis=1)
 
     def solution(self, products: NDArray) -> NDArray:
@@ -284,10 +332,16 @@ class _LeastSquares(NamedTuple):
         explained = np.linalg.solve(normal, products[:P, P:])
         if not len(self.mean):
             return explained[:, -1]
-        left = products[P:, P:] - products[P:, :P] @ explained
-        system = left[:-1, :-1] + self.penalty
-        moment = left[:-1, -1] + self.penalty @ self.mean
+        remaining = products[P:, P:] - products[P:, :P] @ explained
+        system = remaining[:-1, :-1] + self.penalty
+        moment = remaining[:-1, -1] + self.penalty @ self.mean
         factor = np.linalg.cholesky(system)
         weights, _ = nnls(factor.T, np.linalg.solve(factor, moment))
         correction = explained @ np.append(-weights, 1.0)
         return np.concatenate([correction, weights])
+
+
+def _products(columns: NDArray) -> NDArray:
+    """Return the products of columns (C, m, L) with each other, summed over rows."""
+    flat = columns.reshape(-1, columns.shape[2])
+    return flat.T @ flat

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -24,39 +23,30 @@ _SMOOTH = (0.2, 0.0), (1.0, 0.0)
 _SMOOTH_AND_CREEP = (0.2, 0.2), (1.0, 0.2)
 
 
-@dataclass(frozen=True)
-class WidthSearch:
-    """Backlash (also called play) with the least held-out error.
+class WidthSearch(NamedTuple):
+    """One backlash of every width tried.
 
     Attributes
     ----------
-    width : float
-        The width of least error [unit of q].
-    widths : ndarray of shape (W,)
-        Widths tried, ascending from zero, including doubled ones if the largest was the best.
-    cv_distance : ndarray of shape (W,)
-        Mean tip distance on held-out motions for each width [m], with a linear correction inside
-        the model.
-    gain : float
-        Mean reduction of the distances of motions by the best width [m].
-    gain_std_error : float
-        Standard error of `gain` over the motions [m].
-    kept : bool
-        Whether the play lowers the error: `gain` is above `gain_std_error` and 1 % of the error.
+    tried : list of Candidate
+        Those of the widths asked for, ascending from no backlash.
+    best : Candidate
+        The one with the least held-out error; its width may be a refined one.
     """
 
-    width: float
-    widths: NDArray
-    cv_distance: NDArray
-    gain: float
-    gain_std_error: float
-    kept: bool
+    tried: list[Candidate]
+    best: Candidate
+
+    @property
+    def gain(self) -> Gain:
+        """The gain of the best width over no backlash."""
+        return gain(self.tried[0], self.best)
 
 
 def search_width(
     log: HysteresisLog, widths: list[float], *, refine: bool = False
 ) -> WidthSearch:
-    """Return the width of one backlash with the least held-out error.
+    """Return one backlash of several widths, and the one with the least held-out error.
 
     Parameters
     ----------
@@ -69,36 +59,17 @@ def search_width(
         Whether to minimise the error between the neighbours of the best width.
     """
     widest = float(np.ptp(log.q, axis=0).max())
-
-    @cache
-    def errors_of(width: float) -> NDArray:
-        return _Candidate.of(log, width, _NONE).errors
-
-    def error(width: float) -> float:
-        return float(errors_of(width).mean())
-
-    widths = list(widths)
-    best = min(widths, key=error)
-    while 0.0 < best == widths[-1] < widest:
-        widths.append(min(2.0 * best, widest))
-        best = min(widths, key=error)
-    if refine and best > 0.0:
-        place = widths.index(best)
-        bounds = widths[place - 1], widths[min(place + 1, len(widths) - 1)]
-        options = {"xatol": _CLOSE * best}
-        minimum = minimize_scalar(
-            error, bounds=bounds, method="bounded", options=options
-        )
-        best = min(best, float(minimum.x), key=error)
-    gain = _gain(errors_of(0.0), errors_of(best))
-    return WidthSearch(
-        best,
-        np.array(widths),
-        np.array([error(width) for width in widths]),
-        gain.mean,
-        gain.std_error,
-        gain.clear,
-    )
+    tried = [Candidate.of(log, width, _NONE) for width in widths]
+    best = min(tried, key=Candidate.error)
+    while best is tried[-1] and 0.0 < best.width < widest:
+        tried.append(Candidate.of(log, min(2.0 * best.width, widest), _NONE))
+        best = min(tried, key=Candidate.error)
+    if refine and best.width > 0.0:
+        place = tried.index(best)
+        following = tried[min(place + 1, len(tried) - 1)]
+        bounds = tried[place - 1].width, following.width
+        best = _with_best_width(log, best, _NONE, bounds)
+    return WidthSearch(tried, best)
 
 
 def find_hysteresis(log: HysteresisLog) -> HysteresisOperator | None:
@@ -123,24 +94,32 @@ def find_hysteresis(log: HysteresisLog) -> HysteresisOperator | None:
         least = _LEAST * np.median(strokes[strokes > 0.0])
         doubled = least * 2.0 ** np.arange(20)
         widths[1:1] = doubled[doubled < widest].tolist()
-    width = search_width(log, widths, refine=True).width
-
-    none = _Candidate.of(log, 0.0, _NONE)
-    creep = _Candidate.of(log, 0.0, _CREEP)
+    search = search_width(log, widths, refine=True)
+    none = search.tried[0]
+    creep = Candidate.of(log, 0.0, _CREEP)
     candidates = [creep]
-    if width > 0.0:
-        backlash = _Candidate.of(log, width, _NONE)
-        if _gain(none.errors, backlash.errors).clear:
-            candidates = [backlash, creep, *_with_friction(log, backlash)]
-    least = min(candidates, key=_Candidate.error)
-    if not _gain(none.errors, least.errors).certain:
+    if search.gain.clear:
+        candidates = [search.best, creep, *_with_friction(log, search.best)]
+    least = min(candidates, key=Candidate.error)
+    if not gain(none, least).certain:
         return None
-    as_good = (c for c in candidates if not _gain(c.errors, least.errors).clear)
+    as_good = (c for c in candidates if not gain(c, least).clear)
     return next(as_good).operator
 
 
-class _Candidate(NamedTuple):
-    """A kind of hysteresis, and its errors on held-out groups."""
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A kind of hysteresis, and its errors on held-out groups.
+
+    Attributes
+    ----------
+    width : float
+        Width of the backlash [unit of q]; 0 without friction.
+    operator : HysteresisOperator or None
+        Fitted to all rows; None for no hysteresis.
+    errors : ndarray of shape (G,)
+        Mean tip distance of every group, of fits without it [m].
+    """
 
     width: float
     operator: HysteresisOperator | None
@@ -149,7 +128,7 @@ class _Candidate(NamedTuple):
     @classmethod
     def of(
         cls, log: HysteresisLog, width: float, spreads: tuple[float, float]
-    ) -> _Candidate:
+    ) -> Candidate:
         """Return the candidate of the width of a backlash and of the spreads of the weights."""
         problem = HysteresisProblem(log, width, creep=spreads[1] > 0.0)
         fit = problem.fitted(*spreads)
@@ -160,46 +139,59 @@ class _Candidate(NamedTuple):
         return float(self.errors.mean())
 
 
-def _with_friction(log: HysteresisLog, backlash: _Candidate) -> list[_Candidate]:
+def _with_friction(log: HysteresisLog, backlash: Candidate) -> list[Candidate]:
     """Return candidates with friction other than one backlash, from few to many free weights."""
     width = backlash.width
-    with_creep = _Candidate.of(log, width, _CREEP)
-    if _gain(backlash.errors, with_creep.errors).clear:
-        with_creep = _with_width_again(log, with_creep)
-    smooth = [_Candidate.of(log, width, spreads) for spreads in _SMOOTH]
-    smooth_creep = [_Candidate.of(log, width, both) for both in _SMOOTH_AND_CREEP]
+    with_creep = Candidate.of(log, width, _CREEP)
+    if gain(backlash, with_creep).clear:
+        bounds = 0.25 * width, 1.5 * width
+        with_creep = _with_best_width(log, with_creep, _CREEP, bounds)
+    smooth = [Candidate.of(log, width, spreads) for spreads in _SMOOTH]
+    smooth_creep = [Candidate.of(log, width, both) for both in _SMOOTH_AND_CREEP]
     return [with_creep, *smooth, *smooth_creep]
 
 
-def _with_width_again(log: HysteresisLog, candidate: _Candidate) -> _Candidate:
-    """Return backlash and creep with the width of least error, for a width without creep."""
-    tried = [candidate]
+def _with_best_width(
+    log: HysteresisLog,
+    start: Candidate,
+    spreads: tuple[float, float],
+    bounds: tuple[float, float],
+) -> Candidate:
+    """Return the candidate of least error with a width within bounds, or the start."""
+    tried = [start]
 
     def error(width: float) -> float:
-        tried.append(_Candidate.of(log, width, _CREEP))
+        tried.append(Candidate.of(log, width, spreads))
         return tried[-1].error()
 
-    width = candidate.width
-    options = {"xatol": _CLOSE * width}
-    minimize_scalar(
-        error, bounds=(0.25 * width, 1.5 * width), method="bounded", options=options
-    )
-    return min(tried, key=_Candidate.error)
+    options = {"xatol": _CLOSE * start.width}
+    minimize_scalar(error, bounds=bounds, method="bounded", options=options)
+    return min(tried, key=Candidate.error)
 
 
-class _Gain(NamedTuple):
-    """Mean reduction of the errors of groups [m], and its standard error."""
+class Gain(NamedTuple):
+    """Mean reduction of the errors of groups [m], and its standard error.
+
+    Attributes
+    ----------
+    mean, std_error : float
+        Over the groups [m].
+    clear : bool
+        Whether the mean is above the standard error, and above 1 % of the error.
+    certain : bool
+        Whether it is above twice the standard error as well.
+    """
 
     mean: float
     std_error: float
-    clear: bool  # above the standard error, and above 1 % of the error
-    certain: bool  # and above twice the standard error
+    clear: bool
+    certain: bool
 
 
-def _gain(before: NDArray, after: NDArray) -> _Gain:
-    """Return the gain of errors of groups (G,) over those before."""
-    gains = before - after
+def gain(before: Candidate, after: Candidate) -> Gain:
+    """Return the gain of a candidate over another one."""
+    gains = before.errors - after.errors
     mean = float(gains.mean())
     std_error = float(gains.std(ddof=1) / np.sqrt(len(gains)))
-    clear = mean > max(std_error, _LEAST_GAIN * float(before.mean()))
-    return _Gain(mean, std_error, clear, clear and mean > _CERTAIN * std_error)
+    clear = mean > max(std_error, _LEAST_GAIN * before.error())
+    return Gain(mean, std_error, clear, clear and mean > _CERTAIN * std_error)

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from hybridkin._core.arrays import Numbers, check_shape, labels, real_array
 from hybridkin._core.commands import Commands
 from hybridkin.calibration.calibrate import CalibrationResult, calibrate, fit_geometry
 from hybridkin.calibration.hysteresis_fit import HysteresisLog
-from hybridkin.calibration.hysteresis_search import WidthSearch, search_width
+from hybridkin.calibration.hysteresis_search import search_width
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.play import PlayOperator
@@ -24,7 +24,7 @@ _WIDTHS = np.array([0.05e-3, 0.1e-3, 0.2e-3, 0.4e-3])  # [m]
 
 
 @dataclass(frozen=True)
-class PlayFit(WidthSearch):
+class PlayFit:
     """Backlash (also called play) identified from a log, and the chain calibrated with it.
 
     Attributes
@@ -47,6 +47,12 @@ class PlayFit(WidthSearch):
         The calibration on all rows with the chosen width.
     """
 
+    width: float
+    widths: NDArray
+    cv_distance: NDArray
+    gain: float
+    gain_std_error: float
+    kept: bool
     result: CalibrationResult
 
     @property
@@ -145,8 +151,15 @@ def fit_play(
         time=np.arange(len(x), dtype=np.float64),
     )
     search = search_width(log, tried)
-    if not search.kept:
-        search = replace(search, width=0.0)
-    y = PlayOperator(search.width).apply_by_group(q, runs)
-    result = calibrate(chain, y, x, names, **calibrate_options)
-    return PlayFit(**vars(search), result=result)
+    gain = search.gain
+    width = search.best.width if gain.clear else 0.0
+    y = PlayOperator(width).apply_by_group(q, runs)
+    return PlayFit(
+        width,
+        widths=np.array([candidate.width for candidate in search.tried]),
+        cv_distance=np.array([candidate.error() for candidate in search.tried]),
+        gain=gain.mean,
+        gain_std_error=gain.std_error,
+        kept=gain.clear,
+        result=calibrate(chain, y, x, names, **calibrate_options),
+    )

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybridkin._core.model import as_forward_model
-from hybridkin.calibration.hysteresis_fit import HysteresisLog
+from hybridkin.calibration.hysteresis_fit import HysteresisLog, which_count
 from hybridkin.calibration.hysteresis_search import find_hysteresis
 from hybridkin.chains.hysteresis import HysteresisOperator
 from hybridkin.chains.play import PlayOperator
@@ -81,12 +81,12 @@ def choose_hysteresis(spec: Spec, rows: Rows) -> HysteresisOperator | None:
         The log, with the rows of each run in order of time.
     """
     groups = np.zeros(len(rows)) if rows.groups is None else rows.groups
-    usable = (rows.counts > 0) & ~np.isnan(rows.tips).all(axis=1)
+    positions = spec.positions(rows).numpy().astype(np.float64)
+    usable = which_count(positions, rows.counts)
     if len(np.unique(groups)) == 1:  # a single motion is cut into ten
         groups = np.arange(len(rows)) * 10 // len(rows)
     if len(np.unique(groups[usable])) < 2:
         return None
-    positions = spec.positions(rows).numpy().astype(np.float64)
     model = spec.mechanical
     if model is None:
         network = ELMRegressorCV(200, weight_scales=(0.4,), **_PLAIN)

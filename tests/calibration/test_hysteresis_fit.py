@@ -10,7 +10,7 @@ from hybridkin import (
     robots,
 )
 from hybridkin.calibration.hysteresis_fit import HysteresisLog, HysteresisProblem
-from hybridkin.calibration.hysteresis_search import _gain, find_hysteresis
+from hybridkin.calibration.hysteresis_search import Candidate, find_hysteresis, gain
 
 TRUNK = robots.bionic_handling_assistant()
 M = np.array([[1.0, 0.3, 0.0], [0.0, 0.8, -0.4], [0.2, 0.0, 1.1]])
@@ -103,19 +103,22 @@ def test_shares_of_creep_and_the_width_before_it_are_found():
     friction, slow = find_hysteresis(log).operators
     np.testing.assert_allclose(friction.width, 0.3, rtol=0.02)
     gains = dict(zip(slow.times, slow.gains, strict=True))
-    for gain, time in zip(creep.gains, creep.times, strict=True):
+    for share, time in zip(creep.gains, creep.times, strict=True):
         near = min(gains, key=lambda tau: abs(tau - time))
-        np.testing.assert_allclose(gains[near], gain, atol=0.05)
+        np.testing.assert_allclose(gains[near], share, atol=0.05)
 
 
 def test_a_gain_must_be_above_its_error_and_above_one_percent():
-    before = np.array([1.0, 1.1, 0.9, 1.0])
-    assert _gain(before, before - [0.1, 0.12, 0.08, 0.1]).certain
-    unsure = _gain(before, before - [0.1, -0.04, 0.06, 0.04])
+    def gain_of(errors):
+        before = np.array([1.0, 1.1, 0.9, 1.0])
+        return gain(Candidate(0.0, None, before), Candidate(0.1, None, before - errors))
+
+    assert gain_of([0.1, 0.12, 0.08, 0.1]).certain
+    unsure = gain_of([0.1, -0.04, 0.06, 0.04])
     assert unsure.clear
     assert not unsure.certain
-    assert not _gain(before, before - [0.3, -0.2, 0.1, -0.1]).clear
-    assert not _gain(before, before - 0.005).clear
+    assert not gain_of([0.3, -0.2, 0.1, -0.1]).clear
+    assert not gain_of(0.005).clear
 
 
 def test_missing_markers_and_counts_weigh_the_rows():
