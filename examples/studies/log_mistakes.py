@@ -490,7 +490,9 @@ def examined(case: Case, fit: bool | None = None) -> Outcome:
     # What data decide at once; lengths and stiffnesses stay nominal, as many users leave them.
     names = ("radii", "base") if case.base_is_free else ("radii",)
     model = HybridForwardModel(case.chain, LinearRegression(), calibrate=names)
-    messages = fit_quietly(model, case.log.q, case.log.x, groups=case.log.groups)
+    messages = fit_quietly(
+        model, case.log.q, case.log.x, groups=case.log.groups
+    ).messages
     kinds += ("calibration",) * bool(messages)
     with torch.no_grad():
         tips = model.module_(torch.from_numpy(case.test.q)).numpy()

@@ -49,8 +49,6 @@ from hybridkin.learning.regressor_modules import Regressor, error_module
 _LEAST = 0.2  # assumed lower limit of training errors, as a share of the errors before learning
 _LARGEST_LEVERAGE = 0.999
 _MOST = 2000  # rows whose training errors are computed
-# Of an ELMRegressorCV whose number of neurons is known.
-_SHORT_SEARCH = {"weight_scales": (0.2, 0.8), "relevance_rounds": 2, "max_hidden": 0}
 
 NAMED: dict[str, type[ErrorModel]] = {}
 """Error models by name."""
@@ -393,11 +391,18 @@ class NetworkModelCV(RegressorModel[ELMRegressorCV]):
         return NetworkModel(ELMRegressor(**regressor.best_params_))
 
     def starting_at(self, settled: ErrorModel) -> ErrorModel:
-        """Return the model with the settled number of neurons and a shorter search."""
+        """Return the model with a shorter search, which starts at the settled input scales.
+
+        It may choose fewer neurons than settled ones: a number that suits held-out rows would make
+        their errors too small.
+        """
         if not isinstance(settled, NetworkModel):  # one for each marker
             return self
         network = _copy(self.regressor).set_params(
-            n_hidden=settled.regressor.n_hidden, **_SHORT_SEARCH
+            weight_scales=(settled.regressor.weight_scale,),
+            input_scaling=settled.regressor.input_scaling,
+            relevance_rounds=1,
+            max_hidden=settled.regressor.n_hidden,
         )
         return NetworkModelCV(network)
 

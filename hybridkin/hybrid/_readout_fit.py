@@ -159,8 +159,11 @@ def fit_readout(
             fit = _chosen_with_noise(problem, members)
         else:
             weights = problem.weights_of(start)
-            fit_near = _chosen if near else _fitted
-            fit = fit_near(problem.in_noise(noise_ratio), members, alphas, weights)
+            problem_in_noise = problem.in_noise(noise_ratio)
+            if near:
+                fit = _chosen(problem_in_noise, members, alphas, weights, rounds=1)
+            else:
+                fit = _fitted(problem_in_noise, members, alphas, weights)
     rmse = problem.mean_distance(fit.residual, 2) ** 0.5
     return fit._replace(residual=rows.as_given(fit.residual), rmse=rmse)
 
@@ -184,10 +187,11 @@ def _chosen(
     members: list[Tensor] | None,
     alphas: Pair | None,
     weights: Tensor,
+    rounds: int = 2,
 ) -> ReadoutFit:
     """Return the fit with the penalties of least held-out error, from a start of the search."""
     scores = {}
-    for _ in range(2):
+    for _ in range(rounds):
         # Linearised first about the start, then about the correction found.
         score = partial(problem.score, problem.linearised(weights), members)
         alphas, scores = _linearised.choose(score, alphas)

@@ -26,6 +26,7 @@ from hybridkin.hybrid._module import Hybrid, TipCorrection
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._wrapped import pose_errors, posed
 from hybridkin.hybrid.cv_results import CvResults
+from hybridkin.hybrid.held_out import Predictions
 
 Seed = int | np.random.RandomState | None
 Weighted = list[tuple[float, TipCorrection]]  # weights and corrections, without guards
@@ -93,6 +94,8 @@ class FittedError:
         Of "auto": `HybridForwardModel.cv_results_`.
     candidates : dict of str to Hybrid, or None
         Of "auto": every candidate, fitted to all rows.
+    outside : Predictions or None
+        Of the candidates for a part of a log: their predictions for its outer rows.
     """
 
     result: object
@@ -103,6 +106,7 @@ class FittedError:
     held_out: bool = False
     comparison: CvResults | None = None
     candidates: dict[str, Hybrid] | None = None
+    outside: Predictions | None = None
 
     @property
     def learned(self) -> Learned:
@@ -129,17 +133,21 @@ class Spec:
     calibration: CalibrationResult | None = None  # how `mechanical` was calibrated
     messages: tuple[str, ...] = ()  # warnings of that choice and calibration
     held_out: bool = True  # whether errors of held-out rows are computed
-    expected: float | None = None  # the mean of these errors [m], if already known
+    compared: bool = False  # whether a comparison will give the error to expect
     # Of the commands, with backlash between them and the rows.
     commanded: Directions | None = None
     progress: Callable[[int, int], None] | None = None  # gets (done, total)
 
     def with_geometry_chosen(
-        self, rows: Rows, geometry: GeometryChoice | None = None
+        self,
+        rows: Rows,
+        geometry: GeometryChoice | None = None,
+        of_all: GeometryChoice | None = None,
     ) -> Spec:
         """Return the specification with the parameters to calibrate, chosen on the rows or given.
 
         For a list and an error model that chooses, a plain chain is compared with elastic tendons.
+        A choice on all rows of the log gives the starts.
         """
         automatic = self.calibrate == "auto"
         if not self.calibrate or not (automatic or self.error_model.chooses):
@@ -153,6 +161,7 @@ class Spec:
                 weights=rows.weights,
                 outside=self.error_model.learns,
                 parameters=None if automatic else self.calibrate,
+                starts=() if of_all is None else of_all.starts,
             )
         return replace(
             self,

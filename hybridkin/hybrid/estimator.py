@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -50,6 +50,7 @@ from hybridkin.hybrid._range import TrainingRange, state_range
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._settings import CONSTRAINTS, error_model_of
 from hybridkin.hybrid._spec import ErrorModel, Spec, residuals
+from hybridkin.hybrid.held_out import MEAN_LENGTH, Predictions
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.hidden_layer import check_rows
 
@@ -57,6 +58,21 @@ _NO_TIMES = (
     "`X` has no times, but the actuators creep: a row counts as one second, also in trackers. Give "
     "Commands(X, runs, time) with times in seconds."
 )
+
+
+class Start(NamedTuple):
+    """Where the choices of a fit to a part of a log start: those of the fit to the whole log."""
+
+    error_model: ErrorModel
+    geometry: GeometryChoice | None
+
+
+class QuietFit(NamedTuple):
+    """What a fit without warnings gives besides the fitted model."""
+
+    messages: list[str]  # of its warnings
+    start: Start  # for fits to parts of the rows
+    outside: Predictions | None  # with a start: of the candidates of "auto"
 
 
 class HybridForwardModel(HybridPredictor):
@@ -263,7 +279,7 @@ class HybridForwardModel(HybridPredictor):
             millimetres; if there are too few groups for `coverage`; if the actuators creep
             and the rows have no times; and the warnings of `calibrate`.
         """
-        for message in self._fit(X, y, sample_weight, groups):
+        for message in self._fit(X, y, sample_weight, groups).messages:
             warnings.warn(message, stacklevel=2)
         return self
 
@@ -275,19 +291,22 @@ class HybridForwardModel(HybridPredictor):
         groups: ArrayLike | None = None,
         geometry: GeometryChoice | None = None,
         progress: Callable[[int, int], None] | None = None,
-        held_out: bool = True,
-        expected: float | None = None,
-    ) -> list[str]:
-        """Fit, see `fit_quietly`, and return the messages of all warnings."""
+        compared: bool = False,
+        start: Start | None = None,
+    ) -> QuietFit:
+        """Fit, see `fit_quietly`."""
         error_model = self._checked_error_model()
+        of_all = None
+        if start is not None:
+            error_model = error_model.starting_at(start.error_model)
+            of_all = start.geometry
         log = self._checked_rows(X, y, sample_weight, groups)
         rows = log.distinct()
-        settings = replace(
-            self._spec(error_model, log), held_out=held_out, expected=expected
-        )
+        settings = self._spec(error_model, log)
+        settings = replace(settings, held_out=start is None, compared=compared)
         messages = few_rows(rows, settings, self.coverage)
         self._fitted_rows = rows.digests()
-        spec = settings.with_geometry_chosen(rows, geometry)
+        spec = settings.with_geometry_chosen(rows, geometry, of_all)
         self.play_, of_play = play_of(self.play, spec, log.in_runs())
         messages += of_play
         self._past: Past | None = None
@@ -319,15 +338,21 @@ class HybridForwardModel(HybridPredictor):
         self._noise = fitted.error.noise
         self.radius_: Radius | None = None
         if self.coverage is not None:
+            measured = rows
             moved = None
             if self.play_ is not None:
-                rows = log.take(np.flatnonzero(log.counts > 0.0))
+                measured = log.take(np.flatnonzero(log.counts > 0.0))
                 moved = partial(moved_without, self.play, spec, log)
             self.radius_, of_radius = conformal_radius(
-                settings, rows, self.coverage, moved
+                settings, measured, self.coverage, moved
             )
             messages += of_radius
-        return [*dict.fromkeys([*messages, *fit_messages(fitted.spec, rows)])]
+        messages += fit_messages(fitted.spec, rows)
+        return QuietFit(
+            [*dict.fromkeys(messages)],
+            Start(fitted.error.settled, spec.geometry),
+            fitted.error.outside,
+        )
 
     def partial_fit(
         self,
@@ -584,11 +609,11 @@ def fit_quietly(
     *,
     geometry: GeometryChoice | None = None,
     progress: Callable[[int, int], None] | None = None,
-    held_out: bool = True,
-    expected: float | None = None,
+    compared: bool = False,
+    start: Start | None = None,
     log: tuple[NDArray, NDArray] | None = None,
-) -> list[str]:
-    """Fit as `HybridForwardModel.fit` does and return the messages of its warnings.
+) -> QuietFit:
+    """Fit as `HybridForwardModel.fit` does, without warnings.
 
     Parameters
     ----------
@@ -600,16 +625,24 @@ def fit_quietly(
         What to calibrate. Default: chosen on the rows.
     progress : callable, optional
         Gets (done, total).
-    held_out : bool, default=True
-        Whether to compute errors on held-out rows that predictions do not need: those of the
-        calibration and of readouts. Without, ``expected_distance`` has the penalties of all rows.
-    expected : float, optional
-        The mean error of this model on held-out motions, known from a comparison: the
-        ``expected_distance`` of "auto" [m].
+    compared : bool, default=False
+        Whether a comparison follows that gives the error to expect, see `expect`; until then
+        ``expected_distance`` has the penalties of all rows.
+    start : Start, optional
+        That of the same model fitted to a whole log, of which X and y are a part. All choices
+        start there, and errors on held-out rows that predictions do not need are not computed.
+        "auto" fits only its ``candidates_``.
     log : tuple of ndarray, optional
         All rows (q, x) of the log, if X and y are some of them: all count as fitted.
     """
-    messages = model._fit(X, y, None, groups, geometry, progress, held_out, expected)
+    quiet_fit = model._fit(X, y, None, groups, geometry, progress, compared, start)
     if log is not None:
         model._fitted_rows = np.unique(row_digests(*log))
-    return messages
+    return quiet_fit
+
+
+def expect(model: HybridForwardModel, distance: float) -> None:
+    """Let "auto" expect the mean error of a comparison on new motions [m]."""
+    if model.cv_results_ is not None:
+        model.cv_results_["expected_distance"] = distance
+        model._noise = distance / MEAN_LENGTH

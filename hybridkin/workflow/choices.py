@@ -14,7 +14,7 @@ from hybridkin.workflow.report import millimetres
 def choice_in_words(model: HybridForwardModel) -> str:
     """Return the chosen settings of a fitted model in a few words."""
     if model.cv_results_ is not None:
-        return _auto_in_short(model, model.cv_results_)
+        return auto_in_short(model.cv_results_, memory_in_words(model))
     network = model.error_model_
     if isinstance(network, ELMRegressorCV):
         return (
@@ -36,7 +36,12 @@ def _weights(results: CvResults) -> dict[str, float]:
     return dict(sorted(chosen.items(), key=lambda item: -item[1]))
 
 
-def _auto_in_short(model: HybridForwardModel, results: CvResults) -> str:
+def memory_in_words(model: HybridForwardModel) -> str:
+    """Return the hysteresis of a fitted model in words; empty without one."""
+    return "" if model.play_ is None else hysteresis_in_words(model)
+
+
+def auto_in_short(results: CvResults, hysteresis: str) -> str:
     """Return the parts, the calibrated parameters and the hysteresis that "auto" chose."""
     weights = _weights(results)
     words = next(iter(weights))
@@ -45,8 +50,8 @@ def _auto_in_short(model: HybridForwardModel, results: CvResults) -> str:
         words = f"blend of {', '.join(parts)}"
     if len(results["mechanical_model"]) > 1:
         words += f" on {results['parameters']}"
-    if model.play_ is not None:
-        words += f", {hysteresis_in_words(model)}"
+    if hysteresis:
+        words += f", {hysteresis}"
     return words
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,13 +23,18 @@ from hybridkin.calibration.choice import GeometryChoice, choose_geometry
 from hybridkin.calibration.measured import distances, folds
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.robots import RobotDescription
-from hybridkin.hybrid.estimator import HybridForwardModel, fit_quietly
+from hybridkin.hybrid.estimator import HybridForwardModel, Start, fit_quietly
+from hybridkin.hybrid.held_out import HeldOut, Predictions, chosen_blend
 from hybridkin.hybrid.log_distance import held_out_distances
 from hybridkin.learning.elm_cv import ELMRegressorCV
 from hybridkin.learning.regressor_modules import error_module
 from hybridkin.native.library import evaluate
 from hybridkin.workflow.calibrated import CalibratedParameter, calibrated_parameters
-from hybridkin.workflow.choices import choice_in_words
+from hybridkin.workflow.choices import (
+    auto_in_short,
+    choice_in_words,
+    memory_in_words,
+)
 from hybridkin.workflow.log import MeasuredLog
 from hybridkin.workflow.report import Progress, quiet
 
@@ -95,9 +100,10 @@ class Comparison:
 
     Attributes
     ----------
-    markers : dict of str to ndarray of shape (N, K)
-        Error of every marker of each row when its motion was held out [m], NaN if it was not
-        measured.
+    tips : dict of str to ndarray of shape (N, 3 K)
+        Predicted markers of each row when its motion was held out, by model [m].
+    measured : ndarray of shape (N, 3 K)
+        Measured markers [m], NaN if missing.
     fold : ndarray of shape (N,)
         Fold in which a row was held out.
     distance : ndarray of shape (N,)
@@ -106,10 +112,18 @@ class Comparison:
         Settings that were chosen in each fold.
     """
 
-    markers: dict[str, NDArray]
+    tips: dict[str, NDArray]
+    measured: NDArray
     fold: NDArray
     distance: NDArray
     choices: list[dict[str, str]]
+
+    @cached_property
+    def markers(self) -> dict[str, NDArray]:
+        """Error of every marker of each row (N, K) by model [m], NaN if it was not measured."""
+        return {
+            name: distances(tips, self.measured) for name, tips in self.tips.items()
+        }
 
     @cached_property
     def errors(self) -> dict[str, NDArray]:
@@ -261,21 +275,73 @@ def with_play_detected(
     return replace(settings, play=play)
 
 
+class FittedModels(NamedTuple):
+    """The models that can be saved, fitted to all rows, and the starts of their fits to parts."""
+
+    mechanical: Mechanical
+    models: dict[str, HybridForwardModel]
+    starts: dict[str, Start]
+
+
+def fit_to_all(
+    rows: MeasuredLog,
+    robot: RobotDescription,
+    settings: FitSettings,
+    mechanical: Mechanical,
+    *,
+    log: tuple[NDArray, NDArray] | None = None,
+    progress: Progress = quiet,
+) -> FittedModels:
+    """Return every model that can be saved, fitted to all rows.
+
+    Parameters
+    ----------
+    rows, robot, settings
+        As for `compare_by_group`.
+    mechanical : Mechanical
+        That of all rows.
+    log : tuple of ndarray, optional
+        All rows (q, x) of the log, if it was thinned: all count as fitted.
+    progress : callable, optional
+        Called with (what, done, total).
+    """
+    models = models_to_save(robot, mechanical, settings)
+    starts = {}
+    for name, model in models.items():
+        progress_of_fit = partial(progress, f"fitting {name} to all motions")
+        progress_of_fit(0, 1)
+        if name == AUTO:  # it will be saved
+            model.set_params(coverage=settings.coverage)
+        quiet_fit = fit_quietly(
+            model,
+            rows.commands,
+            rows.x,
+            rows.motions,
+            geometry=mechanical.geometry,
+            progress=progress_of_fit,
+            compared=True,
+            log=log,
+        )
+        starts[name] = quiet_fit.start
+    return FittedModels(mechanical, models, starts)
+
+
 def compare_by_group(
     rows: MeasuredLog,
     robot: RobotDescription,
     settings: FitSettings,
-    mechanical: Mechanical | None = None,
+    fitted: FittedModels,
     *,
     n_jobs: int | None = -1,
     progress: Progress = quiet,
 ) -> Comparison:
     """Return the errors of every model on held-out motions.
 
-    Whole motions are held out. In each fold, the geometry is chosen and calibrated on the training
-    motions, and every model is fitted to them. ``error_model="auto"`` is fitted once; the table has
-    each of its candidates, ``candidates_``, and itself. The prediction for a motion therefore never
-    uses data of this motion.
+    Whole motions are held out. In each fold, the set of geometric parameters, their values, the
+    hysteresis and the settings of every model are chosen on the training motions, in searches that
+    start at those of all motions. All candidates of ``error_model="auto"`` are fitted in this way.
+    The weights of its blend in a fold are chosen by the errors on the motions of the other folds,
+    and by those on the outer rows of the training motions, as `chosen_blend` does.
 
     Parameters
     ----------
@@ -285,8 +351,8 @@ def compare_by_group(
         Nominal kinematics, and the parameters to calibrate.
     settings : FitSettings
         Loss, folds and models, see `with_play_detected`.
-    mechanical : Mechanical, optional
-        That of all rows, which gives starts for the fits of the folds.
+    fitted : FittedModels
+        The models fitted to all rows, see `fit_to_all`.
     n_jobs : int, optional
         Largest number of processes.
     progress : callable, optional
@@ -302,7 +368,12 @@ def compare_by_group(
     for train, test in parts:
         jobs.append(
             delayed(_one_fold)(
-                robot, settings, rows.rows(train), rows.rows(test), mechanical
+                robot,
+                settings,
+                rows.rows(train),
+                rows.rows(test),
+                fitted.mechanical,
+                fitted.starts,
             )
         )
     most = max(1, len(rows.q) // _ROWS_PER_PROCESS[settings.auto])
@@ -315,31 +386,48 @@ def compare_by_group(
     )
     stage = "cross-validation by motion"
     progress(stage, 0, len(parts))
-    fold_results: list[_FoldResult] = []
-    results: Any = workers(jobs)
-    for result in results:
-        fold_results.append(result)
-        progress(stage, len(fold_results), len(parts))
-    fold = np.empty(len(rows.q), dtype=int)
-    distance = np.empty(len(rows.q))
-    markers = {}
-    for name in _in_all(fold_results):
-        markers[name] = np.empty((len(rows.q), rows.x.shape[1] // 3))
-    for k, ((_, test), result) in enumerate(zip(parts, fold_results, strict=True)):
-        fold[test] = k
-        distance[test] = result.distance
-        for name, errors in markers.items():
-            errors[test] = result.errors[name]
-    choices = [result.choices for result in fold_results]
-    return Comparison(markers, fold, distance, choices)
+    results: list[_FoldResult] = []
+    from_workers: Any = workers(jobs)
+    for result in from_workers:
+        results.append(result)
+        progress(stage, len(results), len(parts))
+    places = np.argsort(np.concatenate([test for _, test in parts]))
+    fold = np.repeat(np.arange(len(parts)), [len(test) for _, test in parts])[places]
+    distance = np.concatenate([result.distance for result in results])[places]
+    tips = {}
+    for name in results[0].tips:
+        tips[name] = np.concatenate([result.tips[name] for result in results])[places]
+    choices = [result.choices for result in results]
+    autos = [result.auto for result in results if result.auto is not None]
+    if autos:
+        candidates = np.array([tips[_in_table(name)] for name in autos[0].names])
+        tips[AUTO], words = _blended(rows, fold, candidates, autos)
+        for of_fold, chosen in zip(choices, words, strict=True):
+            of_fold[AUTO] = chosen
+    if settings.play is None:  # it is the calibrated model
+        tips.pop(BACKLASH, None)
+    in_order = {}
+    for name in sorted(tips, key=lambda name: _KINDS.index(name.partition(",")[0])):
+        in_order[name] = tips[name]
+    return Comparison(in_order, rows.x, fold, distance, choices)
+
+
+class _AutoOfFold(NamedTuple):
+    """What a fold gives of error_model="auto" besides the predictions of its candidates."""
+
+    names: list[str]
+    outside: Predictions
+    geometry: GeometryChoice | None
+    hysteresis: str  # in words
 
 
 class _FoldResult(NamedTuple):
-    """Errors (N, K) of every model on the held-out rows, their distances (N,), and choices."""
+    """Predictions (N, m) of every model for held-out rows, the rows' distances (N,), choices."""
 
-    errors: dict[str, NDArray]
+    tips: dict[str, NDArray]
     distance: NDArray
     choices: dict[str, str]
+    auto: _AutoOfFold | None
 
 
 @one_thread()  # the processes share the cores already
@@ -348,36 +436,76 @@ def _one_fold(
     settings: FitSettings,
     train: MeasuredLog,
     test: MeasuredLog,
-    of_all: Mechanical | None,
+    of_all: Mechanical,
+    starts: dict[str, Start],
 ) -> _FoldResult:
-    """Return the errors of every model on test rows after a fit to training rows."""
+    """Return the predictions of every model for test rows after a fit to training rows."""
     mechanical = Mechanical.of(robot, train, settings.loss, of_all)
-    models = {}
+    tips = {}
     if robot.chain is not None:
         nominal = _nominal(robot, robot.chain, train, settings.loss)
-        models[NOMINAL] = HybridForwardModel(nominal, "drop")
-    models |= models_to_save(robot, mechanical, settings)
-    errors = {}
+        tips[NOMINAL] = evaluate(nominal, test.q)[0]
     choices = {}
-    for name, model in models.items():
-        fit_quietly(
+    auto = None
+    for name, model in models_to_save(robot, mechanical, settings).items():
+        quiet_fit = fit_quietly(
             model,
             train.commands,
             train.x,
             train.motions,
             geometry=mechanical.geometry,
-            held_out=False,
+            start=starts[name],
         )
-        for candidate, module in (model.candidates_ or {}).items():
-            if candidate != "mechanical":
-                errors[f"hybrid, {candidate}"] = _held_out(model, module, test)
-            elif settings.play is not None:  # else it is the calibrated model
-                errors[BACKLASH] = _held_out(model, module, test)
-        errors[name] = _held_out(model, model.module_, test)
-        if name in (DATA_ELM, HYBRID_ELM, AUTO):
-            choices[name] = choice_in_words(model)
+        if quiet_fit.outside is None or model.candidates_ is None:
+            tips[name] = evaluate(model.module_, test.q)[0]
+            if name in (DATA_ELM, HYBRID_ELM):
+                choices[name] = choice_in_words(model)
+            continue
+        q = model.effective(test.commands)
+        for candidate, module in model.candidates_.items():
+            tips[_in_table(candidate)] = evaluate(module, q)[0]
+        auto = _AutoOfFold(
+            [*model.candidates_],
+            quiet_fit.outside,
+            quiet_fit.start.geometry,
+            memory_in_words(model),
+        )
     distance = held_out_distances(train.q, train.motions, test.q)
-    return _FoldResult(errors, distance, choices)
+    return _FoldResult(tips, distance, choices, auto)
+
+
+def _in_table(candidate: str) -> str:
+    """Return the name of a candidate of "auto" in the table."""
+    return BACKLASH if candidate == "mechanical" else f"hybrid, {candidate}"
+
+
+def _blended(
+    rows: MeasuredLog, fold: NDArray, predicted: NDArray, autos: list[_AutoOfFold]
+) -> tuple[NDArray, list[str]]:
+    """Return the predictions (N, m) of error_model="auto", and its choices in each fold.
+
+    Predictions (K, N, m) of the other folds choose the weights of a fold.
+    """
+    names = rows.motions.astype(str)
+    labels = fold
+    if len(autos) == 2:
+        # A fold has only one other; the motions of that one take the place of folds.
+        labels = np.unique(names, return_inverse=True)[1]
+    label_of = dict(zip(names, labels, strict=True))
+    blend = np.empty_like(rows.x)
+    words = []
+    for k, auto in enumerate(autos):
+        others = fold != k
+        counts = np.ones(others.sum())
+        held_out = Predictions(
+            predicted[:, others], rows.x[others], counts, names[others]
+        )
+        outer = [label_of[str(name)] for name in np.asarray(auto.outside.groups)]
+        both = HeldOut.of(held_out, auto.outside, np.append(labels[others], outer))
+        weights, results = chosen_blend(auto.names, both, auto.geometry)
+        blend[~others] = np.tensordot(weights, predicted[:, ~others], 1)
+        words.append(auto_in_short(results, auto.hysteresis))
+    return blend, words
 
 
 def _nominal(
@@ -388,20 +516,3 @@ def _nominal(
         return chain
     result, _ = fit_geometry(chain, rows.q, rows.x, ("base",), loss)
     return result.chain
-
-
-def _held_out(
-    model: HybridForwardModel, module: ForwardModel, test: MeasuredLog
-) -> NDArray:
-    """Return the errors (N, K) of the markers on test rows by a module of the fitted model."""
-    q = model.effective(test.commands)
-    return distances(evaluate(module, q)[0], test.x)
-
-
-def _in_all(fold_results: list[_FoldResult]) -> list[str]:
-    """Return the models that every fold has, kind by kind; kernel ridge has up to 2000 rows."""
-    names = []
-    for name in fold_results[0].errors:
-        if all(name in result.errors for result in fold_results):
-            names.append(name)
-    return sorted(names, key=lambda name: _KINDS.index(name.partition(",")[0]))

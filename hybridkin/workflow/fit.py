@@ -12,7 +12,7 @@ import numpy as np
 
 from hybridkin.chains.robots import RobotDescription
 from hybridkin.datasets import Log
-from hybridkin.hybrid.estimator import HybridForwardModel, fit_quietly
+from hybridkin.hybrid.estimator import HybridForwardModel, expect, fit_quietly
 from hybridkin.saving.saved_model import save_model
 from hybridkin.workflow.calibrated import Calibration, deviations
 from hybridkin.workflow.choices import auto_in_words, choice_in_words
@@ -25,7 +25,7 @@ from hybridkin.workflow.compare import (
     FitSettings,
     Mechanical,
     compare_by_group,
-    models_to_save,
+    fit_to_all,
     with_play_detected,
 )
 from hybridkin.workflow.errors import HeldOutErrors, Promise
@@ -102,24 +102,17 @@ def fit_log(
     for message in messages:
         warnings.warn(message, stacklevel=2)
     settings = with_play_detected(settings, rows, mechanical)
+    whole = complete.q, complete.x
+    fitted = fit_to_all(rows, robot, settings, mechanical, log=whole, progress=progress)
     compared = compare_by_group(
-        rows, robot, settings, mechanical, n_jobs=n_jobs, progress=progress
+        rows, robot, settings, fitted, n_jobs=n_jobs, progress=progress
     )
     saved = AUTO if settings.auto else _best_to_save(compared)
-    report_fit = partial(progress, f"fitting {saved} to all motions")
-    report_fit(0, 1)
-    model = models_to_save(robot, mechanical, settings)[saved]
-    model.set_params(coverage=settings.coverage)
-    fit_quietly(
-        model,
-        rows.commands,
-        rows.x,
-        rows.motions,
-        geometry=mechanical.geometry,
-        progress=report_fit,
-        expected=float(compared.errors[saved].mean()),
-        log=(complete.q, complete.x),
-    )
+    model = fitted.models[saved]
+    if settings.coverage is not None and not settings.auto:
+        model.set_params(coverage=settings.coverage)
+        fit_quietly(model, rows.commands, rows.x, rows.motions, log=whole)
+    expect(model, float(compared.errors[saved].mean()))
     progress("writing the report", 0, 1)
     held_out = {}
     for name, errors in compared.errors.items():
@@ -162,10 +155,10 @@ def fit_log(
 def _check(log: MeasuredLog, robot: RobotDescription, settings: FitSettings) -> None:
     """Raise if the log or the settings do not allow a comparison by motions."""
     n_motions = len(np.unique(log.motions))
-    if n_motions < 2:
+    if n_motions < 3:
         raise ValueError(
-            "`groups` must name at least 2 motions to hold one out, but the log has "
-            f"{n_motions}; name another column: --groups COLUMN."
+            "`groups` must name at least 3 motions, one to hold out and two to choose by, but the "
+            f"log has {n_motions}; name another column: --groups COLUMN."
         )
     if settings.play in (None, "detect"):
         return

@@ -142,8 +142,10 @@ def write_comparison(report: Report[FitRecord]) -> None:
     report.text(
         "## Errors on held-out motions",
         f"{record.rows} rows{thinned}, {record.n_motions} {record.split}. Each of "
-        f"{len(record.choices_by_fold)} folds holds out whole motions. The other motions choose "
-        "and fit everything: geometry, features, penalties and blend.",
+        f"{len(record.choices_by_fold)} folds holds out whole motions. Geometry, hysteresis, "
+        "penalties and networks are chosen and fitted without them, in searches that start at the "
+        "choices for all motions. Those also decide whether hysteresis is looked for, and how many "
+        "neurons a network has at most. The other folds choose the weights of a blend.",
         _KINDS_OF_MODELS,
     )
     columns = ("mean", "std_error", "std", "p95", "max", "std_folds")

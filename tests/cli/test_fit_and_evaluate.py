@@ -99,7 +99,7 @@ def test_spoilt_logs_stop_the_fit_with_advice(robot, tmp_path, capsys, spoil, me
         ({"--groups": "motions"}, "did you mean 'motion'"),
         ({"--exclude": "*"}, "at least 2 motions"),
         ({"--q": "t1,t2"}, "must have 6 actuators"),
-        ({"text": HEADER + "\n0,1,2,3,4,5,6,7,8,9,1\n1,2,1,3,4,5,6,7,7,9,1\n"}, "at least 2 mot"),
+        ({"text": HEADER + "\n0,1,2,3,4,5,6,7,8,9,1\n1,2,1,3,4,5,6,7,7,9,1\n"}, "at least 3 mot"),
         ({"toml": "[[segment]]\nradius = 0.1\n"}, r"\[log\]"),
         ({"out": "robot.toml"}, "must be a folder"),
     ],

@@ -19,9 +19,9 @@ from hybridkin.hybrid._features import Features
 from hybridkin.hybrid._readout_fit import _Problem as ReadoutProblem
 from hybridkin.hybrid._readout_fit import fit_readout
 from hybridkin.hybrid._rows import Rows
-from hybridkin.hybrid._selection import HeldOut, chosen_blend
 from hybridkin.hybrid._spec import Spec
 from hybridkin.hybrid._wrapped import PoseRows, WithPose
+from hybridkin.hybrid.held_out import HeldOut, Predictions, chosen_blend
 
 CHAIN = ConstantCurvatureChain([0.05])
 N, M = 40, 10  # held-out and outer rows
@@ -46,10 +46,12 @@ def held_out(errors, counts=None, groups=None):
     """Return predictions that are off by errors (K, N + M, 3), of tips at random."""
     rng = np.random.default_rng(0)
     y = rng.standard_normal((N, 3))
-    rows = Rows(np.zeros((N, 2)), y, counts, groups)
     outer = np.arange(0, N, N // M)
-    predicted = np.concatenate([y, y[outer]]) + errors
-    return HeldOut.of(predicted, rows, np.arange(N) % 5, outer), rows
+    counts = np.ones(N) if counts is None else counts
+    of_folds = Predictions(y + errors[:, :N], y, counts, groups)
+    outside = Predictions(y[outer] + errors[:, N:], y[outer], counts[outer], None)
+    fold = np.arange(N) % 5
+    return HeldOut.of(of_folds, outside, np.append(fold, fold[outer]))
 
 
 def random_errors(*sizes):
@@ -60,26 +62,26 @@ def random_errors(*sizes):
 def test_shares_are_tenths_and_the_first_of_equals_is_taken():
     every = np.ones(N + M, dtype=bool)
     noise = random_errors(1.0)[0]
-    found, _ = held_out(np.stack([noise, 0.1 * noise, 0.1 * noise]))
+    found = held_out(np.stack([noise, 0.1 * noise, 0.1 * noise]))
     assert_array_equal(found.blend_weights(every), [0.0, 1.0, 0.0])
-    found, _ = held_out(np.stack([noise, 0.5 * noise, -0.5 * noise]))
+    found = held_out(np.stack([noise, 0.5 * noise, -0.5 * noise]))
     assert_array_equal(found.blend_weights(every), [0.0, 0.5, 0.5])  # their errors cancel
-    found, _ = held_out(np.stack([noise, 0.25 * noise, -0.5 * noise]))
+    found = held_out(np.stack([noise, 0.25 * noise, -0.5 * noise]))
     shares = found.blend_weights(every)
     assert_allclose(shares.sum(), 1.0)
     assert_allclose(shares, [0.0, 0.7, 0.3])  # 2/3 and 1/3
     only = np.arange(N + M) < 7  # of some rows
     errors = np.stack([noise, 0.1 * noise, 0.1 * noise])
     errors[1, 7:] *= 100.0
-    assert_array_equal(held_out(errors)[0].blend_weights(only), [0.0, 1.0, 0.0])
-    assert_array_equal(held_out(errors)[0].blend_weights(~only), [0.0, 0.0, 1.0])
+    assert_array_equal(held_out(errors).blend_weights(only), [0.0, 1.0, 0.0])
+    assert_array_equal(held_out(errors).blend_weights(~only), [0.0, 0.0, 1.0])
 
 
 @pytest.mark.parametrize("groups", [None, np.arange(N) // 4])
 def test_a_blend_is_taken_where_it_gains(groups):
     noise = random_errors(1.0)[0]
-    found, rows = held_out(np.stack([noise, 0.5 * noise, -0.5 * noise]), groups=groups)
-    shares, results = chosen_blend(NAMES, found, rows)
+    found = held_out(np.stack([noise, 0.5 * noise, -0.5 * noise]), groups=groups)
+    shares, results = chosen_blend(NAMES, found)
     assert_array_equal(shares, [0.0, 0.5, 0.5])
     assert results["chosen"] == "blend"
     assert results["candidate"] == [*NAMES, "blend"]
@@ -100,8 +102,8 @@ def test_a_gain_in_one_motion_alone_is_not_sure():
         errors[0] * np.where(np.concatenate([groups, groups[::4]]) == 0, 0.01, 1.05)[:, None]
     )
     names = ["mechanical", "learned"]
-    assert chosen_blend(names, *held_out(errors))[1]["chosen"] == "learned"
-    assert chosen_blend(names, *held_out(errors, groups=groups))[1]["chosen"] == "mechanical"
+    assert chosen_blend(names, held_out(errors))[1]["chosen"] == "learned"
+    assert chosen_blend(names, held_out(errors, groups=groups))[1]["chosen"] == "mechanical"
 
 
 class Recorded(NoCorrection):

@@ -38,7 +38,8 @@ def few(n, coverage, groups=True, error_model="drop"):
     """Return a fit to few motions, its warnings, and its rows."""
     q, x, motion = motions(0, n, 4)
     model = HybridForwardModel(robots.bionic_handling_assistant(), error_model, coverage=coverage)
-    return model, fit_quietly(model, q, x, groups=motion if groups else None), q
+    quiet_fit = fit_quietly(model, q, x, groups=motion if groups else None)
+    return model, quiet_fit.messages, q
 
 
 @pytest.mark.parametrize(("n", "finite"), [(8, False), (9, True)])
@@ -109,7 +110,7 @@ def test_a_radius_of_two_motions_holds_out_one_and_then_rows(n, error_model):
     model = HybridForwardModel(
         chain, error_model, calibrate=["radii"], coverage=0.5, random_state=0
     )
-    messages = fit_quietly(model, q, x, groups=motion)
+    messages = fit_quietly(model, q, x, groups=motion).messages
     assert (model.radius_.inside < 0.2) == (not any("`coverage`" in text for text in messages))
     with pytest.raises(ValueError, match="`groups` must hold at least two motions"):
         fit_quietly(model, q[:12], x[:12], groups=motion[:12])

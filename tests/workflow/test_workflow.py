@@ -18,7 +18,12 @@ from hybridkin import (
     workflow,
 )
 from hybridkin.cli.main import main
-from hybridkin.workflow.compare import Mechanical, compare_by_group, with_play_detected
+from hybridkin.workflow.compare import (
+    Mechanical,
+    compare_by_group,
+    fit_to_all,
+    with_play_detected,
+)
 from hybridkin.workflow.domain import Domain
 from hybridkin.workflow.log import checked
 
@@ -71,7 +76,9 @@ def test_play_lowers_the_errors_of_auto_on_held_out_motions(playful):
     robot, log = playful
     settings = workflow.FitSettings(n_folds=2, play=4e-4)
     log = checked(log, robot.chain, base_is_free=True)
-    compared = compare_by_group(log, robot, settings, n_jobs=1)
+    mechanical = Mechanical.of(robot, log, settings.loss)
+    fitted = fit_to_all(log, robot, settings, mechanical)
+    compared = compare_by_group(log, robot, settings, fitted, n_jobs=1)
     errors, choices = compared.errors, compared.choices
     assert errors["hybrid, auto"].mean() < 0.1 * errors["mechanical, calibrated"].mean()
     assert all(choice["hybrid, auto"].endswith("backlash 0.4 mm") for choice in choices)
