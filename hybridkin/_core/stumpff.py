@@ -12,10 +12,16 @@ from torch import Tensor
 _SERIES_END = 1.0
 # Coefficients of c3 and c4 by powers of s, highest first; float32 needs fewer.
 _DEGREE = {torch.float64: 7, torch.float32: 4}
-_SERIES = []
-for _j in range(7, -1, -1):
-    _sign = (-1.0) ** _j
-    _SERIES.append([_sign / math.factorial(2 * _j + k) for k in (3, 4)])
+_SERIES = {}  # of c_k and c_(k + 1)
+for _k in (3, 5):
+    _SERIES[_k] = []
+    for _j in range(7, -1, -1):
+        _sign = (-1.0) ** _j
+        _pair = (
+            _sign / math.factorial(2 * _j + _k),
+            _sign / math.factorial(2 * _j + _k + 1),
+        )
+        _SERIES[_k].append(_pair)
 
 
 class Stumpff(NamedTuple):
@@ -49,16 +55,7 @@ def stumpff(s: Tensor) -> Stumpff:
     Stumpff
         Five tensors of the shape of `s`.
     """
-    # c3 and c4 together need one multiply-add per power, which is fast for small batches too.
-    # Not s.new_tensor: before torch 2.5 it fails in functional transforms.
-    series = _SERIES[-1 - _DEGREE.get(s.dtype, 7) :]
-    powers = torch.tensor(series, dtype=s.dtype, device=s.device)
-    powers = powers.reshape(-1, 2, *(1,) * s.ndim).unbind()
-    near = s.clamp(max=_SERIES_END)
-    both = powers[0]
-    for power in powers[1:]:
-        both = torch.addcmul(power, both, near)
-    c3, c4 = both.expand(2, *s.shape).unbind()
+    c3, c4 = _power_series(s, 3)
     far = s.clamp(min=_SERIES_END)
     theta = far.sqrt()
     c = torch.cos(theta)
@@ -70,3 +67,27 @@ def stumpff(s: Tensor) -> Stumpff:
     f = 1.0 - s * c3
     g = 0.5 - s * c4
     return Stumpff(torch.where(bent, c, 1.0 - s * g), f, g, c3, c4)
+
+
+def next_stumpff(s: Tensor, c3: Tensor, c4: Tensor) -> tuple[Tensor, Tensor]:
+    """Return c5 and c6 of s from c3 and c4: c_(k + 2) = (1/k! - c_k) / s, near zero the series."""
+    c5, c6 = _power_series(s, 5)
+    far = s.clamp(min=_SERIES_END)
+    bent = s > _SERIES_END
+    c5 = torch.where(bent, (1.0 / 6.0 - c3) / far, c5)
+    c6 = torch.where(bent, (1.0 / 24.0 - c4) / far, c6)
+    return c5, c6
+
+
+def _power_series(s: Tensor, k: int) -> tuple[Tensor, ...]:
+    """Return c_k and c_(k + 1) of s up to one radian, and beyond it those at one radian."""
+    # Both together need one multiply-add per power, which is fast for small batches too.
+    # Not s.new_tensor: before torch 2.5 it fails in functional transforms.
+    series = _SERIES[k][-1 - _DEGREE.get(s.dtype, 7) :]
+    powers = torch.tensor(series, dtype=s.dtype, device=s.device)
+    powers = powers.reshape(-1, 2, *(1,) * s.ndim).unbind()
+    near = s.clamp(max=_SERIES_END)
+    both = powers[0]
+    for power in powers[1:]:
+        both = torch.addcmul(power, both, near)
+    return both.expand(2, *s.shape).unbind()

@@ -13,13 +13,14 @@ over the memory.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from hybridkin._core.stumpff import stumpff
+from hybridkin._core.arrays import identity
+from hybridkin._core.stumpff import next_stumpff, stumpff
 
 Vector = Sequence[Tensor] | Tensor  # x, y, z
 
@@ -88,115 +89,165 @@ def tip(segments: Segments, beside: Vector) -> Tensor:
 class WorkOfGravity:
     """Work of gravity on the weights of arcs, from the base frame to their centres, by the arcs.
 
-    The weights (A,) act half way along the arcs; `down` (3,) is a direction in the base frame. In
-    the end frame of an arc, the later weights have the moment M, the sum of weight times position.
-    In the start frame it is R M + W t, with the weight W after the arc and its end point t: the
-    formulas of a tail v, with W l instead of l.
+    The weights (A, ...) act half way along the arcs; `down` (3, ...) is a direction in the base
+    frame. The work is linear in both. All moments are about the ends of arcs, in the base frame.
     """
 
     def __init__(self, segments: Segments, weights: Tensor, down: Tensor) -> None:
         self.segments = segments
-        self._weights = weights[:, None]
-        after = weights.flip(0).cumsum(0).flip(0) - weights
-        self._after = after[:, None]
-        self._each = segments.each()
+        self._weights = weights
         self._down = down
+        self._after = weights.flip(0).cumsum(0).flip(0) - weights
 
-        # Moments of the weights of the arcs themselves, at their centres.
-        half = self._half(segments)
-        direction = torch.stack([half.g * half.x, half.g * half.y, half.f])
-        centres = (half.length * direction).unbind(1)
+        # The first halves of the arcs, and all arcs with the rigid lengths after them.
+        halves = 0.5 * torch.cat([segments.length, segments.x, segments.y])
+        self._half = segments_of(halves, segments.offset)
+        centres = self._half.length * _tangent_step(self._half)
+        tangents = torch.stack(
+            [segments.f * segments.x, segments.f * segments.y, segments.c]
+        )
+        ends = segments.length * _tangent_step(segments) + segments.offset * tangents
 
-        # Then from the last arc to the base.
-        moment = torch.zeros_like(centres[0])
-        moments = []
-        for k in range(len(self._each) - 1, -1, -1):
-            segment = self._each[k]
-            x, y, z = moment
-            at_end = torch.stack([x, y, z + after[k] * segment.offset])
-            moments.append(at_end)
-            length = after[k] * segment.length
-            moved = _in_start_frame(at_end.unbind(), segment, length)
-            moment = torch.stack([*moved]) + centres[k]
-        self._moments = torch.stack(moments[::-1], dim=1)  # (3, A, N)
-        self.value = torch.tensordot(down, moment, 1)
+        # Rotations (3, 3, A, ...) from start frames, and from end frames, to the base frame.
+        self._starts, self._ends = _rotations(segments)
+        ends_in_base = _rotated(self._starts, ends).cumsum(1)
+        starts_in_base = ends_in_base - _rotated(self._starts, ends)
+        self._centres = starts_in_base + _rotated(self._starts, centres)
+        heavy = weights * self._centres
+        later = heavy.flip(1).cumsum(1).flip(1) - heavy
+        self._moments = later - self._after * ends_in_base  # (3, A, ...)
 
-    def _half(self, segments: Segments) -> Segments:
-        """Return the first halves of the arcs, with lengths times the weights of the arcs."""
-        length = self._weights * segments.length
-        halves = 0.5 * torch.cat([length, segments.x, segments.y])
-        return segments_of(halves, segments.offset)
+    @property
+    def value(self) -> Tensor:
+        """The work (...)."""
+        return (self._down * (self._weights * self._centres).sum(1)).sum(0)
 
-    def _local_columns(self, segments: Segments) -> Tensor:
-        """Return derivatives (3, 3, A, N) of moments in start frames, by l, b_x, b_y, as vectors.
+    @cached_property
+    def _columns(self) -> tuple[Tensor, Tensor]:
+        """Return derivatives of the later moments by l, b_x and b_y, and spins, (3, 3, A, ...).
 
-        The moments in the end frames stay the same.
+        Vectors in the base frame: (vector, kind, A, ...).
         """
-        heavy = segments._replace(length=self._after * segments.length)
-        later = _vectors(_columns(self._moments.unbind(), heavy))
-        half = self._half(segments)
-        zero = torch.zeros_like(half.x)
-        centre = 0.5 * _vectors(_columns((zero, zero, zero), half))
-        by_length = self._after * later[:1] + self._weights * centre[:1]
-        by_bending = later[1:] + centre[1:]
-        return torch.cat([by_length, by_bending])
-
-    def _downs(self) -> Tensor:
-        """Return the direction of gravity in the start frames of the arcs, (3, A, N)."""
-        zero = torch.zeros_like(self._each[0].length)
-        down: Vector = [zero + component for component in self._down]
-        downs = []
-        for segment in self._each:
-            downs.append(torch.stack([*down]))
-            inverse = segment._replace(x=-segment.x, y=-segment.y)
-            down = _in_start_frame(down, inverse, 0.0)
-        return torch.stack(downs, dim=1)
+        zero = torch.zeros_like(self.segments.x)
+        tool = (zero, zero, zero + self.segments.offset)
+        ends = _vectors(_columns(tool, self.segments)).transpose(0, 1)
+        centres = _vectors(_columns((zero, zero, zero), self._half)).transpose(0, 1)
+        own = self._after * ends + 0.5 * self._weights * centres
+        starts = self._starts[:, :, None]
+        local_spins = _vectors(_spins(self.segments)).transpose(0, 1)
+        spins = _rotated(starts, local_spins)
+        turned = torch.linalg.cross(spins, self._moments[:, None], dim=0)
+        return _rotated(starts, own) + turned, spins
 
     def gradient(self) -> Tensor:
-        """Return the derivative (3 A, N) by the arcs: lengths, then x-, then y-bendings."""
-        columns = self._local_columns(self.segments)
-        return (columns * self._downs()).sum(1).flatten(0, 1)
+        """Return the derivative (3 A, ...) by the arcs: lengths, then x-, then y-bendings."""
+        columns, _ = self._columns
+        return (self._down[:, None, None] * columns).sum(0).flatten(0, 1)
 
     def hessian(self) -> Tensor:
         """Return the second derivative (3 A, 3 A, N) by the arcs."""
-        downs = self._downs()
-        columns = self._local_columns(self.segments)
-        columns = columns.transpose(0, 1)  # (3 vector, 3, A, N)
+        columns, spins = self._columns
 
-        # Of each arc with the later ones: the bending turns their moments.
-        later = columns[:, :, :0]  # in the end frame of the present arc
-        rows = []
-        for k in range(len(self._each) - 1, -1, -1):
-            segment = self._each[k]
-            weightless = segment._replace(length=torch.zeros_like(segment.length))
-            by_bending = _vectors(_columns(later.unbind(), weightless)[3:])
-            by_later = torch.einsum("jciln,cn->jiln", by_bending, downs[:, k])
-            rows.append(nn.functional.pad(by_later, (0, 0, k + 1, 0, 0, 0, 1, 0)))
-            later = _with_later(columns[:, :, k : k + 1], later, segment)
-        upper = torch.stack(rows[::-1], dim=1)  # (3, A, 3, A, N)
-        upper = upper.flatten(2, 3).flatten(0, 1)
+        # The bending of an arc turns the derivatives by all later arcs.
+        down = self._down[:, None, None].expand_as(columns)
+        torques = torch.linalg.cross(columns, down, dim=0)
+        pairs = torch.einsum("vikn,vjmn->ikjmn", spins, torques)
+        A = len(self._weights)
+        later = pairs.new_ones(A, A).triu(1)[:, None, :, None]
+        pairs = (pairs * later).flatten(2, 3).flatten(0, 1)
 
-        within = self._within(downs).transpose(2, 3).diag_embed()  # (3, 3, N, A, A)
+        within = self._within().transpose(2, 3).diag_embed()  # (3, 3, N, A, A)
         within = within.permute(0, 3, 1, 4, 2).flatten(2, 3).flatten(0, 1)
-        return upper + upper.transpose(0, 1) + within
+        return pairs + pairs.transpose(0, 1) + within
 
-    def _within(self, downs: Tensor) -> Tensor:
+    def _within(self) -> Tensor:
         """Return the second derivatives (3, 3, A, N) by the arcs, each with itself."""
-        offset = self.segments.offset
+        down = _rotated(self._starts.transpose(0, 1), self._down[:, None])
+        x, y, z = _rotated(self._ends.transpose(0, 1), self._moments)
+        heavy = self.segments._replace(length=self._after * self.segments.length)
+        tail = torch.stack([x, y, z + self._after * heavy.offset])
+        by_length, by_bending = _second_derivatives(tail, heavy, down)
+        none = torch.zeros_like(tail)
+        by_half_length, by_half_bending = _second_derivatives(none, self._half, down)
+        mixed = self._after * by_length + 0.25 * self._weights * by_half_length
+        bending = by_bending + 0.25 * self._weights * by_half_bending
+        lengths = torch.cat([torch.zeros_like(mixed[:1]), mixed])
+        return torch.cat([lengths[None], torch.cat([mixed[:, None], bending], dim=1)])
 
-        def slope(arcs: Tensor) -> Tensor:
-            segments = segments_of(arcs.flatten(0, 1), offset)
-            return (self._local_columns(segments) * downs).sum(1)
 
-        arcs = torch.stack([self.segments.length, self.segments.x, self.segments.y])
-        # Backward: in forward mode torch decomposes addcmul in Python, which is slow.
-        backward = torch.func.vjp(slope, arcs)[1]
-        seconds = []
-        for kind in range(3):
-            chosen = torch.zeros_like(arcs)
-            chosen[kind] = 1.0
-            seconds.append(backward(chosen)[0])
-        return torch.stack(seconds)
+def _tangent_step(segment: Segments) -> Tensor:
+    """Return the derivative (3, ...) of the end of an arc by its length."""
+    return torch.stack([segment.g * segment.x, segment.g * segment.y, segment.f])
+
+
+def _rotated(turns: Tensor, vectors: Tensor) -> Tensor:
+    """Return rotations (3, 3, ...) times vectors (3, ...)."""
+    return (turns * vectors).sum(1)
+
+
+def _rotations(segments: Segments) -> tuple[Tensor, Tensor]:
+    """Return the rotations (3, 3, A, ...) from start and end frames of arcs to the base frame."""
+    _, x, y, c, f, g, *_ = segments
+    xy = -g * x * y
+    entries = [
+        1.0 - g * x * x,
+        xy,
+        f * x,
+        xy,
+        1.0 - g * y * y,
+        f * y,
+        -f * x,
+        -f * y,
+        c,
+    ]
+    steps = _vectors(entries)
+    ends = [steps[:, :, 0]]
+    for step in steps.unbind(2)[1:]:
+        ends.append(_rotated(ends[-1][:, :, None], step))
+    base = identity(3, x).reshape(3, 3, *[1] * (x.ndim - 1)).expand_as(ends[0])
+    return torch.stack([base, *ends[:-1]], dim=2), torch.stack(ends, dim=2)
+
+
+def _second_derivatives(
+    tail: Tensor, segments: Segments, down: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return second derivatives of d . p, the point p of an end frame along a direction d.
+
+    Those by l and b_i are (2, ...), those by b_i and b_j (2, 2, ...); the tail v = (v_xy, v_z) and
+    d (3, ...) are constant. With beta = d_xy . b and functions of |b|^2, d . p is
+
+        P e + Q v_z + d_xy . v_xy,      P = beta g + d_z f,      Q = beta f + d_z c.
+    """
+    _, bx, by, _, f, g, c3, c4, _ = segments
+    b = torch.stack([bx, by])
+    square = (b * b).sum(0)
+    c5, c6 = next_stumpff(square, c3, c4)
+    d, dz = down[:2], down[2]
+    v, vz = tail[:2], tail[2]
+    e = segments.length - (b * v).sum(0)
+    beta = (d * b).sum(0)
+    # First and second derivatives of f and g by |b|^2, times 2 and 4.
+    f1 = c3 - g
+    g1 = 2.0 * c4 - c3
+    f2 = c3 - 3.0 * c4 + 3.0 * c5
+    g2 = c4 - 5.0 * c5 + 8.0 * c6
+    p1 = beta * g1 + dz * f1
+    q1 = beta * f1 - dz * f
+    P = g * d + p1 * b
+    one_sided = _outer(d, (g1 * e + f1 * vz) * b) - _outer(P, v)
+    along = (beta * g2 + dz * f2) * e + (beta * f2 - dz * f1) * vz
+    eye = identity(2, b).reshape(2, 2, *[1] * square.ndim)
+    by_bending = (
+        one_sided
+        + one_sided.transpose(0, 1)
+        + along * _outer(b, b)
+        + (p1 * e + q1 * vz) * eye
+    )
+    return P, by_bending
+
+
+def _outer(a: Tensor, b: Tensor) -> Tensor:
+    return a[:, None] * b
 
 
 def tip_and_columns(

@@ -292,13 +292,27 @@ class ArcChain(MarkedChain):
         # Products of row-major derivatives are much faster than those of transposed ones.
         J = change(self._turned(self.by_arcs(by_arcs)).contiguous())
         if "offsets" in tangents:
-            by_offsets = self._turned(self.by_offsets(by_offsets)).contiguous()
+            k = self.arcs_per_segment  # an offset follows the last arc of a segment
+            by_offsets = self.by_offsets(by_offsets)[:, k - 1 :: k]
+            by_offsets = self._turned(by_offsets).contiguous()
             J = J + by_offsets @ tangents["offsets"].T
         if "base" in tangents:
             turn, move = tangents["base"][:, :3].split([3, 1], dim=2)
             turned = torch.einsum("pij,jkn->nkip", turn, x)
             J = J + (turned + move[..., 0].T).flatten(1, 2)
+        if "marker_offsets" in tangents:
+            turns = self._turned(self._axes_at_markers(arcs)).unflatten(1, (-1, 3))
+            moved = torch.einsum("nkij,pkj->nkip", turns, tangents["marker_offsets"])
+            J = J + moved.flatten(1, 2)
         return (J,)
+
+    def _axes_at_markers(self, arcs: Tensor) -> Tensor:
+        """Return x, y, z of the axes of the frames at markers in the base frame, (3, 3, K, N)."""
+        segments = self._segments(arcs)
+        no_length = torch.zeros_like(segments.length)
+        turns = segments._replace(length=no_length, offset=no_length)
+        axes = identity(3, arcs)[..., None, None]
+        return torch.stack([tip(turns, axis) for axis in axes], dim=1)
 
     def arcs(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return the arc of every segment.

@@ -13,7 +13,7 @@ from hybridkin._core.stored import Layout, Restore, Stored
 from hybridkin.chains._arcs import WorkOfGravity, segments_of
 from hybridkin.chains._checks import filled, float_dtype, numeric, stiffness
 from hybridkin.chains._slack import WithoutDerivative, applied
-from hybridkin.chains.arc_chain import STRUCTURE, ArcChain
+from hybridkin.chains.arc_chain import STRUCTURE, ArcChain, Change
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.markers import MarkedChain, Marker
 
@@ -38,29 +38,6 @@ class _Statics(NamedTuple):
     offsets: Tensor  # (A,), rigid length after each arc [m]
     down: Tensor  # (3,), direction of gravity in the frame of the base
 
-    def gravity(self, arcs: Tensor) -> WorkOfGravity:
-        """Return the work of gravity and its derivatives."""
-        segments = segments_of(arcs, self.offsets[:, None])
-        return WorkOfGravity(segments, self.weights, self.down)
-
-    def energy(self, arcs: Tensor, forces: Tensor) -> Tensor:
-        """Return the energy (N,) [J] with tendon forces (N, n)."""
-        change = arcs - self.rest[:, None]
-        elastic = 0.5 * (self.stiffness[:, None] * change.square()).sum(0)
-        tendons = (forces.mT * (self.readings @ change)).sum(0)
-        return elastic + tendons - self.gravity(arcs).value
-
-    def imbalance(self, arcs: Tensor, forces: Tensor) -> Tensor:
-        """Return the derivative (3 A, N) of the energy by the arcs: zero at rest."""
-        elastic = self.stiffness[:, None] * (arcs - self.rest[:, None])
-        tendons = self.readings.mT @ forces.mT
-        return elastic + tendons - self.gravity(arcs).gradient()
-
-    def hessian(self, arcs: Tensor) -> Tensor:
-        """Return the second derivative (N, 3 A, 3 A) of the energy by the arcs."""
-        by_gravity = self.gravity(arcs).hessian().permute(2, 0, 1)
-        return torch.diag(self.stiffness) - by_gravity
-
     def shape_of_least_energy(self, forces: Tensor) -> tuple[Tensor, Tensor]:
         """Return arcs (3 A, N) at a minimum of the energy, and the inverse Hessian (N, 3 A, 3 A).
 
@@ -71,12 +48,13 @@ class _Statics(NamedTuple):
         column_unit = unit[:, None]
         eye = identity(len(unit), forces)
         arcs = self.rest[:, None].expand(-1, len(forces)).clone()
-        energy = self.energy(arcs, forces)
+        shape = _Shape(self, arcs, forces)
+        energy = shape.energy
         damping = torch.zeros_like(energy)
         for _ in range(_MOST_STEPS):
             # The damped Newton step; none where the damped Hessian is not positive.
-            imbalance = (column_unit * self.imbalance(arcs, forces)).mT
-            hessian = column_unit * self.hessian(arcs) * unit
+            imbalance = (column_unit * shape.imbalance).mT
+            hessian = column_unit * shape.hessian * unit
             damped = hessian + damping[:, None, None] * eye
             factor, failed = torch.linalg.cholesky_ex(damped)
             factor = torch.where(failed[:, None, None] > 0, eye, factor)
@@ -84,11 +62,14 @@ class _Statics(NamedTuple):
 
             # Accepted if it lowers the energy, or is near the end.
             moved = arcs - column_unit * descent.mT
-            moved_energy = self.energy(moved, forces)
+            shape = _Shape(self, moved, forces)
+            moved_energy = shape.energy
             size = descent.abs().amax(1)
             lower = moved_energy <= energy + _ROUNDING * energy.abs()
             accepted = (failed == 0) & (lower | (size < 1e3 * _CONVERGED))
             arcs = torch.where(accepted, moved, arcs)
+            if not accepted.all():
+                shape = _Shape(self, arcs, forces)
             energy = torch.where(accepted, moved_energy, energy)
 
             more = (10.0 * damping).clamp(min=0.1)
@@ -96,9 +77,71 @@ class _Statics(NamedTuple):
             damping = torch.where(accepted, less, more)
             if (accepted & (size < _CONVERGED)).all():
                 break
-        hessian = column_unit * self.hessian(arcs) * unit
+        hessian = column_unit * shape.hessian * unit
         inverse, _ = torch.linalg.solve_ex(hessian, eye.expand_as(hessian))
         return arcs, column_unit * inverse * unit
+
+
+class _Shape:
+    """Arcs (3 A, N) with tendon forces (N, n): their energy and its derivatives."""
+
+    def __init__(self, statics: _Statics, arcs: Tensor, forces: Tensor) -> None:
+        self.statics = statics
+        self.arcs = arcs
+        self.forces = forces
+        self.strain = arcs - statics.rest[:, None]
+        segments = segments_of(arcs, statics.offsets[:, None])
+        weights = statics.weights[:, None]
+        self.gravity = WorkOfGravity(segments, weights, statics.down[:, None])
+
+    @property
+    def energy(self) -> Tensor:
+        """The energy (N,) [J]."""
+        squares = self.strain.square()
+        elastic = 0.5 * (self.statics.stiffness[:, None] * squares).sum(0)
+        tendons = (self.forces.mT * (self.statics.readings @ self.strain)).sum(0)
+        return elastic + tendons - self.gravity.value
+
+    @property
+    def imbalance(self) -> Tensor:
+        """The derivative (3 A, N) of the energy by the arcs: zero at rest."""
+        elastic = self.statics.stiffness[:, None] * self.strain
+        tendons = self.statics.readings.mT @ self.forces.mT
+        return elastic + tendons - self.gravity.gradient()
+
+    @property
+    def hessian(self) -> Tensor:
+        """The second derivative (N, 3 A, 3 A) of the energy by the arcs."""
+        by_gravity = self.gravity.hessian().permute(2, 0, 1)
+        return torch.diag(self.statics.stiffness) - by_gravity
+
+    def imbalance_change(self, change: _Statics, d_forces: Tensor) -> Tensor:
+        """Return the change (N, 3 A, P) of the imbalance at fixed arcs along P changes.
+
+        The changes of all entries, and of the forces (N, n, P), have P as the last axis. The work
+        of gravity is linear in weights, offsets and direction.
+        """
+        statics = self.statics
+        elastic = change.stiffness[..., None] * self.strain[:, None]
+        preload = statics.stiffness[:, None] * change.rest
+        tendons = torch.einsum("iap,ni->apn", change.readings, self.forces)
+        tendons = tendons + torch.einsum("ia,nip->apn", statics.readings, d_forces)
+
+        columns = self.arcs[:, None].expand(-1, change.weights.shape[1], -1)
+        segments = segments_of(columns, statics.offsets[:, None, None])
+        weights = statics.weights[:, None, None]
+        down = statics.down[:, None, None]
+        heavier = WorkOfGravity(segments, change.weights[..., None], down).gradient()
+        turned = WorkOfGravity(segments, weights, change.down[..., None]).gradient()
+        gravity = heavier + turned
+        if change.offsets.any():
+            longer = segments._replace(
+                offset=segments.offset + change.offsets[..., None]
+            )
+            gravity = gravity + WorkOfGravity(longer, weights, down).gradient()
+            gravity = gravity - WorkOfGravity(segments, weights, down).gradient()
+        total = elastic - preload[..., None] + tendons - gravity
+        return total.permute(2, 0, 1)
 
 
 class ForceTendonChain(ArcChain):
@@ -319,10 +362,6 @@ class ForceTendonChain(ArcChain):
             tips.append(self._marked([(at, x, y, z)]))
         return tips
 
-    def geometry_jacobian(self, q: Tensor, tangents: Mapping[str, Tensor]) -> Tensor:
-        """Return the derivative of the tip along P changes of the geometry, shape (..., 3, P)."""
-        return Chain.geometry_jacobian(self, q, tangents)
-
     def forces(self, q: Tensor) -> Tensor:
         """Return the tendon forces (..., n) [N] at q (..., n); they are not negative."""
         self._check_shape(q)
@@ -412,11 +451,33 @@ class ForceTendonChain(ArcChain):
         arcs = self._at_rest(q)
         statics = self._statics()
         gains = self.gains.to(q)
-        hessian = statics.hessian(arcs)
-        by_force, _ = torch.linalg.solve_ex(hessian, -statics.readings.mT)
+        shape = _Shape(statics, arcs, self.forces(q))
+        by_force, _ = torch.linalg.solve_ex(shape.hessian, -statics.readings.mT)
         pulls = (gains * q >= 0.0) * gains
         slope = by_force * pulls[:, None]
         return arcs.to(rows), slope.permute(1, 2, 0).to(rows)
+
+    def _arcs_and_change(
+        self, rows: Tensor, tangents: Mapping[str, Tensor]
+    ) -> tuple[Tensor, Change]:
+        """Return arcs and their changes, by the implicit function theorem.
+
+        The imbalance vanishes at rest, so the arcs change by minus the inverse Hessian times its
+        change at fixed arcs.
+        """
+        q = rows.double()
+        arcs = self._at_rest(q)
+        shape = _Shape(self._statics(), arcs, self.forces(q))
+        *changes, d_forces = self._slope_of(
+            lambda chain: (*chain._statics(), chain.forces(q)), tangents
+        )
+        forcing = shape.imbalance_change(_Statics(*changes), d_forces)
+        by_geometry, _ = torch.linalg.solve_ex(shape.hessian, -forcing)
+
+        def change(by_arcs: Tensor) -> Tensor:
+            return by_arcs @ by_geometry.to(by_arcs)
+
+        return arcs.to(rows), change
 
     def _at_rest(self, q: Tensor) -> Tensor:
         """Return the arcs (3 A, N) at rest, float64.
@@ -434,7 +495,7 @@ class ForceTendonChain(ArcChain):
         statics = self._statics()
         forces = self.forces(q)
         for _ in range(2):
-            imbalance = statics.imbalance(arcs, forces).mT
+            imbalance = _Shape(statics, arcs, forces).imbalance.mT
             arcs = arcs - applied(compliance, imbalance).mT
         return arcs
 
