@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -161,9 +161,11 @@ def solve(
     floor = 1e-12 * float(problem.chain.reach)
     robust = loss != "linear"
 
+    searched = replace(problem, chain=problem.chain.near_last_shapes())
+
     @lru_cache(1)
     def chain_and_residual(key: bytes) -> tuple[Chain, NDArray]:
-        chain = problem.chain_at(np.frombuffer(key).copy())
+        chain = searched.chain_at(np.frombuffer(key).copy())
         return chain, rows.residual(chain)
 
     def jacobian(theta: NDArray) -> NDArray:

@@ -117,6 +117,14 @@ class Chain(PoseModel):
             chain._set_geometry(buffers)
         return chain
 
+    def near_last_shapes(self) -> Self:
+        """Return a chain whose searches start where the last one for the same q ended.
+
+        So do those of all chains that `with_geometry` makes of it. A chain without searches is
+        returned as it is.
+        """
+        return self
+
     def _set_geometry(self, geometry: Mapping[str, Tensor | None]) -> None:
         """Register the buffers of `_entries` and those computed from them."""
         raise NotImplementedError

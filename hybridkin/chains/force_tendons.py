@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from hybridkin._core.arrays import Numbers, Transform, identity, whole
 from hybridkin._core.stored import Layout, Restore, Stored
@@ -21,7 +22,7 @@ __all__ = ["ForceTendonChain"]
 
 _MOST_STEPS = 100
 _MOST_ARCS = 50  # of a segment
-_CONVERGED = 1e-9  # last Newton step, in units of 1 J^(1/2); two more follow
+_CONVERGED = 1e-6  # last Newton step, in units of 1 J^(1/2); two more follow
 _ROUNDING = 1e-12
 
 
@@ -38,16 +39,17 @@ class _Statics(NamedTuple):
     offsets: Tensor  # (A,), rigid length after each arc [m]
     down: Tensor  # (3,), direction of gravity in the frame of the base
 
-    def shape_of_least_energy(self, forces: Tensor) -> tuple[Tensor, Tensor]:
+    def shape_of_least_energy(
+        self, forces: Tensor, arcs: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Return arcs (3 A, N) at a minimum of the energy, and the inverse Hessian (N, 3 A, 3 A).
 
-        Newton steps from the shape without forces and weight. A step that does not lower the energy
-        is repeated with more damping. Each coordinate is scaled by the root of its stiffness.
+        Newton steps from the given arcs. A step that does not lower the energy is repeated with
+        more damping. Each coordinate is scaled by the root of its stiffness.
         """
         unit = self.stiffness.rsqrt()
         column_unit = unit[:, None]
         eye = identity(len(unit), forces)
-        arcs = self.rest[:, None].expand(-1, len(forces)).clone()
         shape = _Shape(self, arcs, forces)
         energy = shape.energy
         damping = torch.zeros_like(energy)
@@ -66,7 +68,7 @@ class _Statics(NamedTuple):
             moved_energy = shape.energy
             size = descent.abs().amax(1)
             lower = moved_energy <= energy + _ROUNDING * energy.abs()
-            accepted = (failed == 0) & (lower | (size < 1e3 * _CONVERGED))
+            accepted = (failed == 0) & (lower | (size < _CONVERGED))
             arcs = torch.where(accepted, moved, arcs)
             if not accepted.all():
                 shape = _Shape(self, arcs, forces)
@@ -80,6 +82,14 @@ class _Statics(NamedTuple):
         hessian = column_unit * shape.hessian * unit
         inverse, _ = torch.linalg.solve_ex(hessian, eye.expand_as(hessian))
         return arcs, column_unit * inverse * unit
+
+
+@dataclass
+class _LastShapes:
+    """The arcs (3 A, N) that the last search found for rows q (N, n)."""
+
+    q: Tensor
+    arcs: Tensor
 
 
 class _Shape:
@@ -241,7 +251,7 @@ class ForceTendonChain(ArcChain):
         dict.fromkeys(_entries, ""),
         {**STRUCTURE, "arcs_per_segment": int, "gravity": list},
     )
-    _structure = (*ArcChain._structure, "arcs_per_segment", "gravity")
+    _structure = (*ArcChain._structure, "arcs_per_segment", "gravity", "_last")
 
     _units: ClassVar[dict[str, str]] = {
         **Chain._units,
@@ -309,6 +319,7 @@ class ForceTendonChain(ArcChain):
         if not down.norm() > 0.0:
             raise ValueError(f"`gravity` must be a direction, got {down.tolist()}.")
         self.gravity = tuple((down / down.norm()).tolist())
+        self._last: _LastShapes | None = None
         self.arcs_per_segment = whole(arcs, "arcs", most=_MOST_ARCS)
         geometry |= {
             "bending_stiffness": stiffness(
@@ -361,6 +372,12 @@ class ForceTendonChain(ArcChain):
         for (at, *_), (x, y, z) in zip(self.markers, offsets, strict=True):
             tips.append(self._marked([(at, x, y, z)]))
         return tips
+
+    def near_last_shapes(self) -> ForceTendonChain:
+        """Return a chain whose searches start where the last one for the same q ended."""
+        chain = self.with_geometry()
+        chain._last = _LastShapes(self.gains[:0], self.gains[:0])
+        return chain
 
     def forces(self, q: Tensor) -> Tensor:
         """Return the tendon forces (..., n) [N] at q (..., n); they are not negative."""
@@ -417,15 +434,22 @@ class ForceTendonChain(ArcChain):
                 f"{n_negative} of {len(rows)} rows with a negative one."
             )
 
+    def _middles(self) -> Tensor:
+        """Return the places (k,) of the middles of arcs in their segment, from 0 to 1."""
+        k = self.arcs_per_segment
+        places = torch.arange(k, dtype=torch.float64, device=self.taper.device)
+        return (places + 0.5) / k
+
+    def _outer_radii(self) -> Tensor:
+        """Return outer radii (S, k) in the middle of arcs, over those at the start of segments."""
+        return 1.0 - self.taper.double()[:, None] * self._middles()
+
     def _statics(self) -> _Statics:
         """Return the energy of shapes, in float64."""
         k = self.arcs_per_segment
         base = self.base.double()
 
-        # Outer radius in the middle of each arc over that at the start of the segment, (S, k).
-        middles = torch.arange(k, dtype=base.dtype, device=base.device) + 0.5
-        outer = 1.0 - self.taper.double()[:, None] * middles / k
-
+        outer = self._outer_radii()
         length = self.lengths.double()[:, None].expand(-1, k) / k
         weights = self.weight.double()[:, None] * outer**2 * length
         axial = self.axial_stiffness.double()[:, None] * outer**2 / length
@@ -441,6 +465,40 @@ class ForceTendonChain(ArcChain):
             weights=weights.flatten(),
             offsets=self.arc_offsets.to(base),
             down=base[:3, :3].mT @ down,
+        )
+
+    def _statics_change(self, changes: Mapping[str, Tensor]) -> _Statics:
+        """Return the changes of `_statics` along P changes of the geometry, P as the last axis."""
+        k = self.arcs_per_segment
+        statics = self._statics()
+        outer = self._outer_radii().flatten()[:, None]
+        middles = self._middles().repeat(self.n_segments)[:, None]
+
+        def of_arcs(values: Tensor) -> Tensor:
+            return values.double().repeat_interleave(k, dim=-1).mT
+
+        wider = of_arcs(-changes["taper"]) * middles / outer
+        longer = of_arcs(changes["lengths"] / self.lengths)
+        softer = of_arcs(changes["axial_stiffness"] / self.axial_stiffness)
+        axial = softer + 2.0 * wider - longer
+        softer = of_arcs(changes["bending_stiffness"] / self.bending_stiffness)
+        bending = softer + 4.0 * wider - longer
+        relative = torch.cat([axial, bending, bending])
+
+        weight = of_arcs(changes["weight"] * self.lengths) * outer**2 / k
+        rests = [changes["lengths"], *changes["rest_bends"].unbind(-1)]
+        bends = self._changes_of_bends(changes)
+        readings = nn.functional.pad(bends, (self.n_segments, 0))
+        offsets = torch.zeros_like(longer)
+        offsets[k - 1 :: k] = changes["offsets"].T
+        down = offsets.new_tensor(self.gravity)
+        return _Statics(
+            stiffness=statics.stiffness[:, None] * relative,
+            rest=torch.cat([of_arcs(part / k) for part in rests]),
+            readings=of_arcs(readings).permute(2, 1, 0),
+            weights=weight + statics.weights[:, None] * (2.0 * wider + longer),
+            offsets=offsets,
+            down=(down @ changes["base"][:, :3, :3].double()).T,
         )
 
     def _arcs_of_rows(self, rows: Tensor) -> Tensor:
@@ -466,13 +524,13 @@ class ForceTendonChain(ArcChain):
         change at fixed arcs.
         """
         q = rows.double()
-        arcs = self._at_rest(q)
+        arcs, compliance = self._shapes(q)
         shape = _Shape(self._statics(), arcs, self.forces(q))
-        *changes, d_forces = self._slope_of(
-            lambda chain: (*chain._statics(), chain.forces(q)), tangents
-        )
-        forcing = shape.imbalance_change(_Statics(*changes), d_forces)
-        by_geometry, _ = torch.linalg.solve_ex(shape.hessian, -forcing)
+        changes = self._all_changes(tangents)
+        pulled = (q * self.gains > 0.0) * q
+        d_forces = pulled[..., None] * changes["gains"].T
+        forcing = shape.imbalance_change(self._statics_change(changes), d_forces)
+        by_geometry = -compliance @ forcing
 
         def change(by_arcs: Tensor) -> Tensor:
             return by_arcs @ by_geometry.to(by_arcs)
@@ -486,12 +544,7 @@ class ForceTendonChain(ArcChain):
         the implicit function theorem the first one gives the first derivative, the second one the
         second.
         """
-        entries = [self.geometry()[name].detach() for name in self._entries]
-        packed = WithoutDerivative.apply(self._search, q.detach(), *entries)
-        n = 3 * self.n_segments * self.arcs_per_segment
-        arcs, compliance = packed.split([n, n * n], dim=1)
-        arcs = arcs.mT
-        compliance = compliance.unflatten(1, (n, n))
+        arcs, compliance = self._shapes(q)
         statics = self._statics()
         forces = self.forces(q)
         for _ in range(2):
@@ -499,11 +552,27 @@ class ForceTendonChain(ArcChain):
             arcs = arcs - applied(compliance, imbalance).mT
         return arcs
 
+    def _shapes(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the arcs (3 A, N) at rest and the compliance (N, 3 A, 3 A), no derivatives."""
+        entries = [self.geometry()[name].detach() for name in self._entries]
+        packed = WithoutDerivative.apply(self._search, q.detach(), *entries)
+        n = 3 * self.n_segments * self.arcs_per_segment
+        arcs, compliance = packed.split([n, n * n], dim=1)
+        return arcs.mT, compliance.unflatten(1, (n, n))
+
     def _search(self, q: Tensor, *entries: Tensor) -> Tensor:
         """Return arcs (N, 3 A) at rest and the flat compliance, for entries of the geometry."""
         geometry = dict(zip(self._entries, entries, strict=True))
         chain = self.with_geometry(**geometry)
-        arcs, compliance = chain._statics().shape_of_least_energy(chain.forces(q))
+        statics = chain._statics()
+        start = statics.rest[:, None].expand(-1, len(q))
+        last = self._last
+        if last is not None and torch.equal(last.q, q):
+            start = last.arcs
+        arcs, compliance = statics.shape_of_least_energy(chain.forces(q), start)
+        if last is not None:
+            last.q = q
+            last.arcs = arcs
         return torch.cat([arcs.mT, compliance.flatten(1)], dim=1)
 
     @classmethod
