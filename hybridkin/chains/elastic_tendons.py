@@ -36,6 +36,7 @@ _SHAPING = (
     "tendon_zeros",
     "gains",
 )
+_SOFT = 0.1  # stiffness of tendons in the guess, relative to their own
 _TABLE = 12  # largest number of tendons for which all responses are stored
 
 
@@ -71,8 +72,18 @@ def _write_plan(plan: Plan, stored: Stored) -> int:
     bends = rest_bends[segment]  # zeros of the tendons are for bends measured from rest
     zeros = stored.array("tendon_zeros") + x * bends[:, 0] + y * bends[:, 1]
     tendons = np.column_stack([zeros, x, y, x * x, x * y, y * y, stored.array("gains")])
+    # The stretch of tendons that could also push, much softer: its signs are near those of the
+    # real one. A tendon acts on its own segment and, from the base, on those before.
+    acts = np.equal.outer(segment, np.arange(n_segments))
+    if from_base:
+        acts = np.greater_equal.outer(segment, np.arange(n_segments))
+    paths = np.hstack([acts, x[:, None] * acts, y[:, None] * acts])
+    stiff = np.diag(stiffness.T.ravel()) / _SOFT + paths.T @ paths
+    stretch = np.eye(len(x)) - paths @ np.linalg.solve(stiff, paths.T)
+    guess = np.vstack([-stretch * stored.array("gains"), stretch @ zeros])
+
     equal_count = counts[0] if len({*counts}) == 1 else 0
-    numbers = [frame, np.hstack(segments), tendons]
+    numbers = [frame, np.hstack(segments), tendons, guess]
     return plan.node(
         "elastic", len(x), 3, numbers, n_arcs, n_segments, equal_count, *counts
     )

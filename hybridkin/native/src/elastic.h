@@ -17,11 +17,11 @@ typedef struct {
 /* Sizes and numbers of a node. Of a segment these are its stiffnesses (3), its E (3), the arc at
    rest up to the tip (3), and the shares of t_k and of t_{k-1} in what is up to the tip; of a
    tendon its zero [m], the x and y of its w = (1, x, y), xx, xy, yy, and its gain [m per unit of
-   q]. */
+   q]. Then a linear map to n numbers: they guess which tendons are taut, by their signs. */
 typedef struct {
     int n, S, tip, same;   /* tendons; segments, and up to the tip; tendons of each if all alike */
     const int32_t *counts; /* tendons that end at each segment */
-    const real *segments, *tendons;
+    const real *segments, *tendons, *guess;
 } HK(elastic_t);
 
 #define HK_PASSED 3
@@ -34,17 +34,21 @@ typedef struct {
 
 static inline HK(elastic_t) HK(elastic_of)(const hk_plan *p, int at) {
     const int32_t *more = p->code + at + HK_MORE;
-    HK(elastic_t) e = {p->code[at + HK_N], more[1], more[0], more[2], more + 3, NULL, NULL};
+    HK(elastic_t) e = {p->code[at + HK_N], more[1], more[0], more[2], more + 3, NULL, NULL, NULL};
     e.segments = hk_numbers(p, at) + HK_FRAME + e.tip;
     e.tendons = e.segments + HK_SEGMENT * e.S;
+    e.guess = e.tendons + HK_TENDON * e.n;
     return e;
 }
 
-/* The inverse of a symmetric, positive definite D (xx, xy, xz, yy, yz, zz), by D = L diag L'. */
+/* The inverse of a symmetric, positive definite D (xx, xy, xz, yy, yz, zz), by D = L diag L'. One
+   division: the pivots are D0, m / D0 and n / (D0 m), with the minors m and n of D0 D. */
 HK_INLINE void HK(invert)(const V *D, V *inverse) {
-    const V r0 = R(1.0) / D[0], a = D[1] * r0, b = D[2] * r0;
-    const V r1 = R(1.0) / (D[3] - a * D[1]), yz = D[4] - a * D[2], c = yz * r1;
-    const V r2 = R(1.0) / (D[5] - b * D[2] - c * yz), d = a * c - b, cr = c * r2, dr = d * r2;
+    const V m = D[0] * D[3] - D[1] * D[1], yz = D[0] * D[4] - D[1] * D[2];
+    const V n = m * (D[0] * D[5] - D[2] * D[2]) - yz * yz, first = D[0] * m;
+    const V all = R(1.0) / (first * n), r0 = m * n * all, r1 = D[0] * D[0] * n * all;
+    const V r2 = first * first * all, a = D[1] * r0, b = D[2] * r0, c = yz * r0 * r1;
+    const V d = a * c - b, cr = c * r2, dr = d * r2;
     inverse[0] = r0 + a * a * r1 + d * dr;
     inverse[1] = -(a * r1 + c * dr);
     inverse[2] = dr;
@@ -132,11 +136,13 @@ static inline M HK(first_wrong)(M found, M was, V stretch, V size, M *none) {
     return wrong;
 }
 
-/* Find the taut tendons by block principal pivoting from all taut (Murty 1974, Judice & Pires
+/* Find the taut tendons by block principal pivoting from a guess (Murty 1974, Judice & Pires
    1994), and the shape t (3 S) at balance. */
 HK_INLINE void HK(settle)(HK(elastic_t) e, const V *q, const HK(inside) * in, V *t) {
     const int most = HK_WHOLE_STEPS + (1 << (e.n < HK_MOST_TURNS ? e.n : HK_MOST_TURNS));
-    for (int i = 0; i < e.n; i++) in->taut[i] = SPLAT(1.0);
+    HK(affine)(e.n, e.n, e.guess, e.guess + e.n * e.n, q, in->taut);
+    for (int i = 0; i < e.n; i++)
+        in->taut[i] = SELECT(in->taut[i] >= SPLAT(0.0), SPLAT(1.0), SPLAT(0.0));
     for (int step = 0; step < most; step++) {
         HK(shape)(e, q, in, t);
         M changed = SPLAT(0.0) != SPLAT(0.0), none = NOT(changed);
