@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 from scipy.spatial import KDTree
+from sklearn.preprocessing import PolynomialFeatures
 
 _NEIGHBOURS = 60  # nearest rows, among which one of another motion is searched
-_FEWEST = 30  # pairs of rows
+_FEWEST = 40  # rows with such a neighbour
 _CLOSE = 0.05  # largest distance of a pair, relative to the range of an actuator
 _BINS = 10  # of distances, for the change of the tip with q
 _STATIC = 0.2  # largest part of the squared difference of a pair that is such a change
@@ -41,7 +42,8 @@ def repeatability(q: NDArray, x: NDArray, motions: NDArray) -> float | None:
     """
     span = np.ptp(q, axis=0)
     z = (q - q.mean(axis=0)) / np.where(span > 0.0, span, 1.0)
-    features = _quadratic(z)
+    degree = 2 if len(z) > 2 * z.shape[1] ** 2 else 1
+    features = PolynomialFeatures(degree).fit_transform(z)
     weights, *_ = np.linalg.lstsq(features, x, rcond=None)
     residual = x - features @ weights
 
@@ -50,23 +52,19 @@ def repeatability(q: NDArray, x: NDArray, motions: NDArray) -> float | None:
     is_other = motions[near] != motions[:, None]
     rows = np.flatnonzero(is_other.any(axis=1))
     nearest = rows, is_other[rows].argmax(axis=1)
-    pairs = np.sort(np.column_stack([rows, near[nearest]]), axis=1)
-    pairs, first = np.unique(pairs, axis=0, return_index=True)
-    apart = distances[nearest][first]
-    order = np.argsort(apart)
-    apart = apart[order]
-    squared = np.square(residual[pairs[:, 0]] - residual[pairs[:, 1]]).sum(axis=1)
-    squared = squared[order]
+    order = np.argsort(distances[nearest])
+    apart = distances[nearest][order]
+    differences = (residual[rows] - residual[near[nearest]])[order]
+    squared = np.square(differences).sum(axis=1)
     n_close = int(np.searchsorted(apart, _CLOSE))
     if n_close < _FEWEST:
         return None
 
     # Squared differences grow as a + b h^2 with the distance h in q.
-    half = len(squared) // 2
-    growth = []
-    for rows in np.array_split(np.arange(half), min(_BINS, half)):
-        growth.append([1.0, np.median(apart[rows]) ** 2, np.median(squared[rows])])
-    growth = np.array(growth)
+    medians = []
+    for part in np.array_split(np.arange(len(apart) // 2), _BINS):
+        medians.append([1.0, np.median(apart[part]) ** 2, np.median(squared[part])])
+    growth = np.array(medians)
     slope = nnls(growth[:, :2], growth[:, 2])[0][1]
     used = None
     for n_pairs in np.geomspace(_FEWEST, n_close, 20).astype(int):
@@ -74,12 +72,3 @@ def repeatability(q: NDArray, x: NDArray, motions: NDArray) -> float | None:
         if slope * apart[n_pairs - 1] ** 2 <= _STATIC * median:
             used = median
     return None if used is None else float(_MEAN_OF_MEDIAN * np.sqrt(used))
-
-
-def _quadratic(z: NDArray) -> NDArray:
-    """Return features of a quadratic function, without products where there are few rows."""
-    n = z.shape[1]
-    columns = [np.ones((len(z), 1)), z, z**2]
-    if len(z) > 2 * n**2:
-        columns += [z[:, [i]] * z[:, i + 1 :] for i in range(n)]
-    return np.hstack(columns)

@@ -33,27 +33,21 @@ def explained_in_words(
         if model.play is None or name.startswith("data-driven") or name == CALIBRATED:
             static[name] = errors.mean
     best = min(static, key=static.__getitem__)
-    words = "Mean errors on held-out motions: "
-    if CALIBRATED in static and best != CALIBRATED:
-        words += f"{CALIBRATED} {millimetres(static[CALIBRATED])}; "
-    words += f"best function of q ({best}) {millimetres(static[best])}"
-    if model.play_ is not None:
-        words += f"; with hysteresis ({AUTO}) {millimetres(held_out[AUTO].mean)}"
-    x = rows.x[:, -3:]
-    measured = np.isfinite(x).all(axis=1)
-    tips = x[measured], rows.motions[measured]
-    floor = repeatability(rows.q[measured], *tips)
-    if floor is None:
-        return (
-            f"{words}. The least possible error is not known: too few rows are close to rows of "
-            "other motions."
-        )
-    words += (
-        f". Where motions meet at nearly the same q, their tips differ: no function of q can have "
-        f"an error below about {millimetres(floor)}"
+    words = (
+        f"Of the errors on held-out motions, the best function of q ({best}) leaves "
+        f"{millimetres(static[best])}"
     )
     if model.play_ is not None:
-        left = repeatability(model.effective(rows.commands)[measured], *tips)
-        if left is not None:
-            words += f", none of what the actuators do below {millimetres(left)}"
-    return f"{words}. This rest is noise, drift, or what the model does not know of the past."
+        words += f", and {AUTO}, with hysteresis, {millimetres(held_out[AUTO].mean)}"
+    x = rows.x[:, -3:]
+    measured = np.isfinite(x).all(axis=1)
+    inputs = {"functions of q": rows.q}
+    if model.play_ is not None:
+        inputs["those of what the actuators do"] = model.effective(rows.commands)
+    for name, q in inputs.items():
+        floor = repeatability(q[measured], x[measured], rows.motions[measured])
+        least = "cannot be told from this log"
+        if floor is not None:
+            least = f"is about {millimetres(floor)}"
+        words += f"; the least error of {name} {least}"
+    return f"{words}. The rest is noise, drift, and what q does not say of the past."
