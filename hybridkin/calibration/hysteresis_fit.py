@@ -266,12 +266,13 @@ class HysteresisProblem:
         columns[..., correction.size : -1] = by_free.reshape(*residual.shape, -1)
         unknowns = np.append(correction, weights[prior.free])
         columns[..., -1] = residual + columns[..., :-1] @ unknowns
+        columns *= self.roots[..., None]
 
         counts = self.roots**2
         noise = np.average(residual**2, weights=counts)
         noise += _LEAST_NOISE**2 * np.nanvar(self.measured)
         return _LeastSquares(
-            self.roots[..., None] * columns,
+            columns,
             noise * prior.precision,
             prior.mean,
             n_rows=counts.max(axis=1).sum(),
