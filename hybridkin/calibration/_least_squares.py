@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -97,7 +97,11 @@ class Rows(NamedTuple):
 
     def rmse(self, chain: Chain) -> float:
         """Return the root mean square tip distance of a chain [m]."""
-        squares = _squares(self.residual(chain))
+        return self.rms(self.residual(chain))
+
+    def rms(self, residual: NDArray) -> float:
+        """Return the root mean square length of a residual [m]."""
+        squares = _squares(residual)
         return float(np.sqrt(np.average(squares, weights=self.weights)))
 
     def noise(self, residual: NDArray, robust: bool) -> float:
@@ -134,11 +138,11 @@ def row_loss(z: NDArray, weight: NDArray, loss: str) -> NDArray:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Result of a fit, and the derivative of the residual there."""
+    """Result of a fit."""
 
     problem: Problem
+    rows: Rows
     theta: NDArray
-    jacobian: NDArray  # of the residual, (3 N, P)
     noise: float  # standard deviation of one coordinate [m]
     rmse: float
     converged: bool
@@ -146,6 +150,11 @@ class Fit:
     def chain(self) -> Chain:
         """Return the fitted chain."""
         return self.problem.chain_at(self.theta)
+
+    @cached_property
+    def jacobian(self) -> NDArray:
+        """Derivative of the residual at the result (3 N, P)."""
+        return self.rows.jacobian(self.problem, self.theta, self.chain())
 
 
 def solve(
@@ -208,9 +217,10 @@ def solve(
         sigma = noise(theta)
         if abs(sigma - previous) <= 0.02 * previous:
             break
-    rmse = rows.rmse(problem.chain_at(theta))
+    _, residual = chain_and_residual(theta.tobytes())
+    rmse = rows.rms(residual)
     if not robust:
         count = float(weight.sum())
         n_free = max(3.0 * count - theta.size, 1.0)
         sigma = max(rmse * (count / n_free) ** 0.5, floor)
-    return Fit(problem, theta, jacobian(theta), sigma, rmse, bool(converged))
+    return Fit(problem, rows, theta, sigma, rmse, bool(converged))
