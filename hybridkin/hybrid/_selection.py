@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -41,9 +41,6 @@ _MOST = 2000  # rows for kernel ridge, whose cost grows with the cube of their n
 _FEW_MOTIONS = 40
 _FEW_ROWS = 100
 _ANEW = 3  # folds, without each of which penalties are then chosen once more
-
-
-Folds = list[tuple[NDArray, NDArray]]  # training and held-out rows
 
 
 class Part(NamedTuple):
@@ -100,38 +97,30 @@ class Auto(ErrorModel):
         """Return the blend, fitted to all rows, and the comparison of the candidates."""
         folds = folds_of(rows.X, rows.groups)
         fold = _fold_of_rows(folds)
-        by_fold = _held_out_by_fold(rows, folds)
         parts = [Part.of(spec, rows, train, test) for train, test in folds]
-        outside = Part.of(spec, rows, *inner_and_outer(rows.X))
+        outer = inner_and_outer(rows.X)[1]
         candidates = self._candidates(spec, len(rows))
-        fits: dict[str, FittedHybrid] = {}
-        near: dict[str, ErrorModel] = {}
-        predicted = []
-        predicted_outside = []
-        for name, candidate in candidates.items():
-            if spec.progress is not None:
-                spec.progress(len(fits), len(candidates))
-            fits[name] = fit_hybrid(replace(spec, error_model=candidate), by_fold)
-            settled = fits[name].error.settled
-            near[name] = candidate.starting_at(settled)
-            tips = np.empty_like(rows.tips)
+        fits, on_outer = _fitted(candidates, rows, spec, fold)
+        settled = [fitted.error.settled for fitted in fits.values()]
+        predicted = np.empty((len(settled), *rows.tips.shape), rows.tips.dtype)
+        for k, model in enumerate(settled):
             for part in parts:
-                tips[part.test] = part.predicted(settled, rows)
-            predicted.append(tips)
-            predicted_outside.append(outside.predicted(settled, rows))
-        on_folds = _predictions(predicted, rows)
-        on_outer = _predictions(predicted_outside, rows.take(outside.test))
-        labels = np.concatenate([fold, fold[outside.test]])
-        held_out = HeldOut.of(on_folds, on_outer, labels)
+                predicted[k, part.test] = part.predicted(model, rows)
+        on_folds = Predictions(predicted, rows.tips, rows.counts, rows.groups)
+        held_out = HeldOut.of(on_folds, on_outer, np.append(fold, fold[outer]))
         weights, comparison = chosen_blend([*candidates], held_out, spec.geometry)
+        near = {}
+        for (name, candidate), model in zip(candidates.items(), settled, strict=True):
+            near[name] = candidate.starting_at(model)
         alone = spec.held_out and not spec.compared
         if alone and weights[0] < 1.0 and _is_small(rows):
-            unsettled = blend_of(near.values(), weights)
-            blended = np.tensordot(weights, on_folds.predicted, 1)
+            blended = np.tensordot(weights, predicted, 1)
             comparison["expected_distance"] *= _optimism(
-                unsettled, parts, by_fold, blended
+                blend_of(near.values(), weights),
+                parts,
+                _by_fold(rows, fold),
+                blended,
             )
-        settled = [fitted.error.settled for fitted in fits.values()]
         return replace(
             blend_of(settled, weights).fit(rows, spec),
             settled=Candidates(near),
@@ -189,39 +178,49 @@ class Candidates(ErrorModel):
 
     def fit(self, rows: Rows, spec: Spec) -> FittedError:
         """Return the fits of all candidates."""
-        by_fold = _held_out_by_fold(rows, folds_of(rows.X, rows.groups))
-        outside = Part.of(spec, rows, *inner_and_outer(rows.X))
-        fits: dict[str, FittedHybrid] = {}
-        predicted = []
-        for name, model in self.models.items():
-            fits[name] = fit_hybrid(replace(spec, error_model=model), by_fold)
-            predicted.append(outside.predicted(fits[name].error.settled, rows))
-        first = next(iter(fits.values()))
+        fold = _fold_of_rows(folds_of(rows.X, rows.groups))
+        fits, outside = _fitted(self.models, rows, spec, fold)
         return replace(
-            first.error,
+            next(iter(fits.values())).error,
             settled=self,
             candidates={name: fitted.module for name, fitted in fits.items()},
-            outside=_predictions(predicted, rows.take(outside.test)),
+            outside=outside,
         )
 
 
-def _held_out_by_fold(rows: Rows, folds: Folds) -> Rows:
-    """Return rows whose groups, if there are any, are the folds, which takes less time."""
-    if rows.groups is None:
-        return rows
-    return replace(rows, groups=_fold_of_rows(folds))
+def _fitted(
+    models: Mapping[str, ErrorModel], rows: Rows, spec: Spec, fold: NDArray
+) -> tuple[dict[str, FittedHybrid], Predictions]:
+    """Return error models fitted to rows, and their predictions of the outer rows.
+
+    Folds (N,), if there are groups, are held out for their penalties. The outer rows are predicted
+    with these penalties by fits to the inner rows.
+    """
+    inner, outer = inner_and_outer(rows.X)
+    outside = Part.of(spec, rows, inner, outer)
+    by_fold = _by_fold(rows, fold)
+    fits = {}
+    predicted = []
+    for name, model in models.items():
+        if spec.progress is not None:
+            spec.progress(len(fits), len(models))
+        fits[name] = fit_hybrid(replace(spec, error_model=model), by_fold)
+        predicted.append(outside.predicted(fits[name].error.settled, rows))
+    test = rows.take(outer)
+    return fits, Predictions(np.array(predicted), test.tips, test.counts, test.groups)
 
 
-def _fold_of_rows(folds: Folds) -> NDArray:
+def _by_fold(rows: Rows, fold: NDArray) -> Rows:
+    """Return rows whose groups, if there are any, are folds (N,): fewer take less time."""
+    return rows if rows.groups is None else replace(rows, groups=fold)
+
+
+def _fold_of_rows(folds: list[tuple[NDArray, NDArray]]) -> NDArray:
     """Return the fold in which every row is held out (N,)."""
     fold = np.empty(sum(len(test) for _, test in folds), dtype=int)
     for k, (_, test) in enumerate(folds):
         fold[test] = k
     return fold
-
-
-def _predictions(predicted: list[NDArray], rows: Rows) -> Predictions:
-    return Predictions(np.array(predicted), rows.tips, rows.counts, rows.groups)
 
 
 def _is_small(rows: Rows) -> bool:
