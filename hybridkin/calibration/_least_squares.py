@@ -97,11 +97,7 @@ class Rows(NamedTuple):
 
     def rmse(self, chain: Chain) -> float:
         """Return the root mean square tip distance of a chain [m]."""
-        return self.rms(self.residual(chain))
-
-    def rms(self, residual: NDArray) -> float:
-        """Return the root mean square length of a residual [m]."""
-        squares = _squares(residual)
+        squares = _squares(self.residual(chain))
         return float(np.sqrt(np.average(squares, weights=self.weights)))
 
     def noise(self, residual: NDArray, robust: bool) -> float:
@@ -217,8 +213,7 @@ def solve(
         sigma = noise(theta)
         if abs(sigma - previous) <= 0.02 * previous:
             break
-    _, residual = chain_and_residual(theta.tobytes())
-    rmse = rows.rms(residual)
+    rmse = rows.rmse(problem.chain_at(theta))
     if not robust:
         count = float(weight.sum())
         n_free = max(3.0 * count - theta.size, 1.0)
