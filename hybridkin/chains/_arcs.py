@@ -99,20 +99,17 @@ class WorkOfGravity:
         self._down = down
         self._after = weights.flip(0).cumsum(0).flip(0) - weights
 
-        # The first halves of the arcs, and all arcs with the rigid lengths after them.
+        # The weights act at the ends of the first halves of the arcs.
         halves = 0.5 * torch.cat([segments.length, segments.x, segments.y])
         self._half = segments_of(halves, segments.offset)
         centres = self._half.length * _tangent_step(self._half)
-        tangents = torch.stack(
-            [segments.f * segments.x, segments.f * segments.y, segments.c]
-        )
-        ends = segments.length * _tangent_step(segments) + segments.offset * tangents
 
         # Rotations (3, 3, A, ...) from start frames, and from end frames, to the base frame.
         self._starts, self._ends = _rotations(segments)
-        ends_in_base = _rotated(self._starts, ends).cumsum(1)
-        starts_in_base = ends_in_base - _rotated(self._starts, ends)
-        self._centres = starts_in_base + _rotated(self._starts, centres)
+        arcs = segments.length * _rotated(self._starts, _tangent_step(segments))
+        steps = arcs + segments.offset * self._ends[:, 2]
+        ends_in_base = steps.cumsum(1)
+        self._centres = ends_in_base - steps + _rotated(self._starts, centres)
         heavy = weights * self._centres
         later = heavy.flip(1).cumsum(1).flip(1) - heavy
         self._moments = later - self._after * ends_in_base  # (3, A, ...)

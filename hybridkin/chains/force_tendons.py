@@ -434,22 +434,18 @@ class ForceTendonChain(ArcChain):
                 f"{n_negative} of {len(rows)} rows with a negative one."
             )
 
-    def _middles(self) -> Tensor:
-        """Return the places (k,) of the middles of arcs in their segment, from 0 to 1."""
+    def _lost_radii(self, taper: Tensor) -> Tensor:
+        """Return the relative loss of outer radii (..., S, k) up to the middle of each arc."""
         k = self.arcs_per_segment
-        places = torch.arange(k, dtype=torch.float64, device=self.taper.device)
-        return (places + 0.5) / k
-
-    def _outer_radii(self) -> Tensor:
-        """Return outer radii (S, k) in the middle of arcs, over those at the start of segments."""
-        return 1.0 - self.taper.double()[:, None] * self._middles()
+        middles = torch.arange(k, dtype=torch.float64, device=taper.device) + 0.5
+        return taper.double()[..., None] * middles / k
 
     def _statics(self) -> _Statics:
         """Return the energy of shapes, in float64."""
         k = self.arcs_per_segment
         base = self.base.double()
 
-        outer = self._outer_radii()
+        outer = 1.0 - self._lost_radii(self.taper)
         length = self.lengths.double()[:, None].expand(-1, k) / k
         weights = self.weight.double()[:, None] * outer**2 * length
         axial = self.axial_stiffness.double()[:, None] * outer**2 / length
@@ -471,13 +467,12 @@ class ForceTendonChain(ArcChain):
         """Return the changes of `_statics` along P changes of the geometry, P as the last axis."""
         k = self.arcs_per_segment
         statics = self._statics()
-        outer = self._outer_radii().flatten()[:, None]
-        middles = self._middles().repeat(self.n_segments)[:, None]
+        outer = 1.0 - self._lost_radii(self.taper).flatten()[:, None]
 
         def of_arcs(values: Tensor) -> Tensor:
             return values.double().repeat_interleave(k, dim=-1).mT
 
-        wider = of_arcs(-changes["taper"]) * middles / outer
+        wider = -self._lost_radii(changes["taper"]).flatten(1).mT / outer
         longer = of_arcs(changes["lengths"] / self.lengths)
         softer = of_arcs(changes["axial_stiffness"] / self.axial_stiffness)
         axial = softer + 2.0 * wider - longer
