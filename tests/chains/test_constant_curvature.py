@@ -13,7 +13,7 @@ from torch.testing import assert_close
 
 from hybridkin import ConstantCurvatureChain, ElasticTendonChain
 from hybridkin._core.model import reverse_jacobian
-from hybridkin._core.stumpff import stumpff
+from hybridkin._core.stumpff import next_stumpff, stumpff
 
 RADII = [0.100, 0.093, 0.079]
 THREE = 2 * math.pi / 3 * torch.arange(3, dtype=torch.float64)
@@ -115,9 +115,12 @@ def test_stumpff_functions_against_mpmath(theta):
         g = (1 - c) / angle**2 if exact else mpmath.mpf("0.5")
         c3 = (1 - f) / angle**2 if exact else mpmath.mpf(1) / 6
         c4 = (0.5 - g) / angle**2 if exact else mpmath.mpf(1) / 24
-        expected = [float(value) for value in (c, f, g, c3, c4)]
+        c5 = (mpmath.mpf(1) / 6 - c3) / exact if exact else mpmath.mpf(1) / 120
+        c6 = (mpmath.mpf(1) / 24 - c4) / exact if exact else mpmath.mpf(1) / 720
+        expected = [float(value) for value in (c, f, g, c3, c4, c5, c6)]
+    functions = stumpff(s)
     assert_close(
-        torch.stack(list(stumpff(s))),
+        torch.stack([*functions, *next_stumpff(s, functions.c3, functions.c4)]),
         torch.tensor(expected, dtype=torch.float64),
         rtol=4e-15,
         atol=3e-15,

@@ -120,6 +120,17 @@ def test_geometry_jacobian_against_differences():
         assert_close(J, (above - below) / (2 * step), rtol=1e-5, atol=1e-8)
 
 
+def test_searches_near_the_last_shapes_find_the_same():
+    near = chain().near_last_shapes()
+    assert near.with_geometry()._last is near._last
+    near(forces())
+    heavier = {"weight": torch.tensor([2.5, 1.0], dtype=torch.float64)}
+    for q in (forces(), forces(3, seed=1)):  # the rows of the last search, and others
+        expected = chain().with_geometry(**heavier)(q)
+        assert_close(near.with_geometry(**heavier)(q), expected, rtol=0, atol=1e-13)
+    assert chain()._last is None  # without asking, a result depends on nothing before
+
+
 def test_batches_dtypes_and_negative_forces():
     body = chain()
     q = forces(4)
