@@ -4,7 +4,7 @@ The table of the docs page "Tendons that go slack", section "Forces as inputs"::
 
     python examples/studies/tentacle.py --jobs 2
 
-About seven minutes of processor time. It needs the recording soromox_tentacle in the folder that
+About 70 s of processor time. It needs the recording soromox_tentacle in the folder that
 ``--data`` or HYBRIDKIN_DATA names (`help(hybridkin.datasets.load_soromox_tentacle)` names its
 source). Each of the 22 loads is held out once; everything is fitted to the other 21.
 """
