@@ -107,7 +107,7 @@ def test_what_needs_no_torch_does_not_load_it():
     "code",
     [
         "robot = hybridkin.robots.read_description({robot!r}); robot.chain",
-        "import torch; hybridkin.ForceTendonChain([0.01], [0.1]).backbone(torch.ones(3))",
+        "hybridkin.ForceTendonChain([0.01], [0.1], 0.02, 100.0)",
         "from hybridkin.cli.main import main; main(['describe', {robot!r}])",
     ],
 )
