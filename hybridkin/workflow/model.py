@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 import hybridkin
 from hybridkin._core.arrays import as_array, as_path
@@ -132,11 +132,11 @@ class LoadedModel:
         commands, _ = self.play.command(q, dt=steps)
         return commands
 
-    def predict(self, commands: Commands) -> NDArray:
+    def predict(self, commands: ArrayLike | Commands) -> NDArray:
         """Return tips (N, 3) [m], or all markers, for commands (N, n)."""
         if self.hybrid is not None:
             return self.hybrid.predict(commands)
-        q = np.array(commands.q, dtype=float)
+        q = np.array(Commands.of(commands).q, dtype=float)
         return evaluate(as_forward_model(self.model), q)[0]
 
     def tips(self, q: NDArray) -> NDArray:
