@@ -108,17 +108,11 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         inside = (distance <= 1.0) & self._are_states_seen(X)
         return x, self.radius_.at(inside).astype(x.dtype)
 
-    def predict_mechanical(
-        self,
-        X: object,
-    ) -> NDArray:
+    def predict_mechanical(self, X: object) -> NDArray:
         """Return the mechanical part f_mech(q), shaped like `predict` [m]."""
         return self._evaluated(self._mechanical_tips, X)[0]
 
-    def predict_error(
-        self,
-        X: object,
-    ) -> NDArray:
+    def predict_error(self, X: object) -> NDArray:
         """Return the learned part w(q) eps(q), shaped like `predict` [m], rotations [rad]."""
         return self._evaluated(self._tip_errors, X, warn=False)[0]
 
@@ -139,28 +133,19 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             scores.append(score)
         return float(np.mean(scores))
 
-    def jacobian(
-        self,
-        X: object,
-    ) -> NDArray:
+    def jacobian(self, X: object) -> NDArray:
         """Return the full Jacobian dx/dq of the sum, shape (N, m, n) or, for 1-D y, (N, n).
 
         For poses, the last three rows give the angular velocity in the measuring frame.
         """
         return self._evaluated(partial(self._tips, jacobian=True), X)[1]
 
-    def predict_and_jacobian(
-        self,
-        X: object,
-    ) -> tuple[NDArray, NDArray]:
+    def predict_and_jacobian(self, X: object) -> tuple[NDArray, NDArray]:
         """Return `predict(X)` and `jacobian(X)` in one pass."""
         x, J = self._evaluated(partial(self._tips, jacobian=True), X)
         return x, J
 
-    def in_domain(
-        self,
-        X: object,
-    ) -> NDArray[np.bool_]:
+    def in_domain(self, X: object) -> NDArray[np.bool_]:
         """Return whether each row lies in the domain, close to the training rows (see `guard`).
 
         After a fit with groups, a row must also be as close to the nearest training row as 98 % of
@@ -214,10 +199,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             self._check_times(commands.time is not None)
         return self.play_.apply_by_group(rows, commands.run_of_rows, commands.time)
 
-    def error_weight(
-        self,
-        X: object,
-    ) -> NDArray:
+    def error_weight(self, X: object) -> NDArray:
         """Return the weight w(q) in [0, 1] of the error model at each row, shape (N,)."""
         weight = as_forward_model(self.fitted_module_.error_weight)
         return self._evaluated(
