@@ -382,7 +382,7 @@ COSTLY = {
         choose_geometry,
         {"chain": trunk(), "q": Q, "x": X, "groups": GROUPS},
     ),
-    "LoadedModel.effective": (LOADED.effective, {"q": Q, "groups": GROUPS}),
+    "LoadedModel.effective": (LOADED.effective, {"commands": Q}),
     "LoadedModel.expected_errors": (LOADED.expected_errors, {"q": Q}),
     "RobotDescription.to_log": (DESCRIPTION.to_log, {"q": Q}),
     "RobotDescription.from_log": (DESCRIPTION.from_log, {"q": Q}),

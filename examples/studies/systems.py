@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from hybridkin import (
+    Commands,
     CreepOperator,
     ElasticTendonChain,
     ELMRegressor,
@@ -43,7 +44,7 @@ def fitted(error_model, **options):
     data = datasets.load_trunk()
     rows = datasets.paper_split(data, random_state=0)[0][:300]
     model = HybridForwardModel(TRUNK, error_model, random_state=0, **options)
-    return model.fit(data.q[rows], data.x[rows])
+    return model.fit(Commands(data.q[rows], time=np.arange(300.0)), data.x[rows])
 
 
 MODELS = {

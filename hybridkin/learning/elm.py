@@ -279,7 +279,7 @@ class ELMRegressor(FittedNetwork):
         self : ELMRegressor
             The fitted estimator.
         """
-        return self._learn(X, y, sample_weight, first=True)
+        return self._learn(X, y, sample_weight, first=True)._warned()
 
     @_fit_context(prefer_skip_nested_validation=True)
     def partial_fit(self, X, y, sample_weight=None, decay=1.0):
@@ -304,9 +304,8 @@ class ELMRegressor(FittedNetwork):
                 f"`decay` must lie in (0, 1], got {decay!r}; 1 keeps the weight of earlier rows, "
                 f"0.99 reduces it by 1 %."
             )
-        return self._learn(
-            X, y, sample_weight, first="module_" not in vars(self), decay=decay
-        )
+        first = "module_" not in vars(self)
+        return self._learn(X, y, sample_weight, first, decay)._warned()
 
     def merge(self, other):
         """Add the training rows of `other` and return self; equals one `fit` to all rows.
@@ -336,7 +335,7 @@ class ELMRegressor(FittedNetwork):
         shape = self.module_.output_weights.shape
         if shape != other.module_.output_weights.shape:
             self._refuse("shape of output_weights_ (`direct_link`, columns of `y`)")
-        return self._solve(merge(self._stats, other._stats), self.module_)
+        return self._solve(merge(self._stats, other._stats), self.module_)._warned()
 
     def _refuse(self, what):
         raise ValueError(
@@ -389,16 +388,21 @@ class ELMRegressor(FittedNetwork):
         readout, self.noise_variance_, self.solver_ = fit_readout(
             stats, n_features, alpha, self.fit_intercept
         )
+        layer = {name: elm.get_buffer(name).cpu() for name in LAYER}
+        module = ELM(elm.activation, **layer, **readout)
+        return self._hold(module.to(device_named(self.device)), stats)
+
+    def _warned(self):
+        """Warn if the system was singular, and return self."""
         if self.solver_ == "eigh":
+            n_features = len(self.module_.output_weights)
             warnings.warn(
                 f"The system of {n_features} features is singular at alpha={self.alpha}; it was "
                 f"solved with eigenvectors. Increase `alpha` or reduce `n_hidden`.",
                 linalg.LinAlgWarning,
-                stacklevel=2,
+                stacklevel=3,
             )
-        layer = {name: elm.get_buffer(name).cpu() for name in LAYER}
-        module = ELM(elm.activation, **layer, **readout)
-        return self._hold(module.to(device_named(self.device)), stats)
+        return self
 
     def _hold(self, module, stats):
         """Store a fitted network, and its arrays as learned attributes."""

@@ -206,7 +206,9 @@ class ELMRegressorCV(FittedNetwork):
         self.alpha_ = best.params["alpha"]
         self.best_params_ = best.params
         self.best_score_ = -best.score
-        self.best_estimator_ = ELMRegressor(**best.params).fit(X, y, sample_weight)
+        # Without a warning: the caller does not choose the penalty.
+        best_estimator = ELMRegressor(**best.params)
+        self.best_estimator_ = best_estimator._learn(X, y, sample_weight, first=True)
         self.module_ = self.best_estimator_.module_
         self.noise_variance_ = self.best_estimator_.noise_variance_
         self._y_ndim = y.ndim

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 import hybridkin
-from hybridkin._core.arrays import as_array, as_path
+from hybridkin._core.arrays import as_array, as_path, shaped
 from hybridkin._core.commands import Commands
 from hybridkin._core.digests import row_digests
 from hybridkin._core.directions import in_terms
@@ -115,11 +115,12 @@ class LoadedModel:
             return 0.0
         return 0.5 * self.play.width
 
-    def effective(self, commands: Commands) -> NDArray:
+    def effective(self, commands: ArrayLike | Commands) -> NDArray:
         """Return what the actuators do for commands (N, n)."""
+        checked = self._checked(commands)
         if self.hybrid is None:
-            return commands.q
-        return self.hybrid.effective(commands)
+            return checked.q
+        return self.hybrid.effective(checked)
 
     def commands(self, q: NDArray, time: NDArray | None = None) -> NDArray:
         """Return the commands (N, n) that move the actuators along q (N, n), row after row.
@@ -134,9 +135,10 @@ class LoadedModel:
 
     def predict(self, commands: ArrayLike | Commands) -> NDArray:
         """Return tips (N, 3) [m], or all markers, for commands (N, n)."""
+        checked = self._checked(commands)
         if self.hybrid is not None:
-            return self.hybrid.predict(commands)
-        q = np.array(Commands.of(commands).q, dtype=float)
+            return self.hybrid.predict(checked)
+        q = np.array(checked.q, dtype=float)
         return evaluate(as_forward_model(self.model), q)[0]
 
     def tips(self, q: NDArray) -> NDArray:
@@ -147,6 +149,16 @@ class LoadedModel:
         """Return the distance of rows q (N, n) from the training rows, at most 1 in the domain."""
         q = np.array(q, dtype=float)
         return evaluate(self.module, q, value=False, distance=True)[0]
+
+    def _checked(self, commands: ArrayLike | Commands) -> Commands:
+        checked = Commands.of(commands)
+        q = shaped(checked.q, "commands", ("N", self.n_actuators))
+        if not len(q) or not np.isfinite(q).all():
+            raise ValueError(
+                "`commands` must be finite and hold at least one row, got "
+                f"{np.isfinite(q).all(axis=1).sum()} finite ones of {len(q)}."
+            )
+        return checked
 
     def check_columns(self, q: NDArray) -> None:
         """Raise if the rows q (N, n) of a log do not have one column for each actuator."""
