@@ -26,6 +26,7 @@ from hybridkin import (
     ElasticTendonChain,
     ELMRegressor,
     ELMRegressorCV,
+    ForceTendonChain,
     HybridForwardModel,
     InverseKinematics,
     RigidChain,
@@ -81,6 +82,7 @@ ROBOTS = {
     "unit range": Robot(tendons(gains=1e-3, actuator_zeros=5.0), 5.0, 1.0),
     "elastic": Robot(ElasticTendonChain([0.005], [0.06], bending_stiffness=3e-7), 0.0, 0.002),
     "elastic, gain": Robot(ElasticTendonChain([0.005], [0.06], gains=2e-5), 0.0, 100.0),
+    "forces": Robot(ForceTendonChain([0.01], [0.3], 0.02, 50.0, weight=0.1), 1.5, 1.0),
     "rotated stage": Robot(
         ConstantCurvatureChain(
             [0.05] * 2, n_actuators=[1, 3], lengths=[None, 0.1], routing="base", stage="rotation"
@@ -104,7 +106,7 @@ ERROR_MODELS = {
     "auto": "auto",
 }
 FACTORS = {
-    "robot": tuple(ROBOTS),
+    "robot": tuple(name for name in ROBOTS if name != "forces"),  # which is slow
     "markers": ("tip", "two", "two, some missing"),
     "play": ("none", "width", "operator", "auto"),
     "error_model": tuple(ERROR_MODELS),
@@ -156,12 +158,12 @@ def allowed(case):
     return not (case.get("play") == "auto" and case.get("groups") is False)
 
 
-def pairwise(seed=0):
+def pairwise(factors, seed=0):
     """Return cases in which every allowed pair of values meets, greedily from random ones."""
     rng = np.random.default_rng(seed)
     missing = set()
-    for a, b in itertools.combinations(FACTORS, 2):
-        for pair in itertools.product(FACTORS[a], FACTORS[b]):
+    for a, b in itertools.combinations(factors, 2):
+        for pair in itertools.product(factors[a], factors[b]):
             entry = ((a, pair[0]), (b, pair[1]))
             if allowed(dict(entry)):
                 missing.add(entry)
@@ -169,7 +171,7 @@ def pairwise(seed=0):
     for entry in sorted(missing, key=str):
         if entry not in missing:
             continue
-        tried = [completed(dict(entry), rng) for _ in range(100)]
+        tried = [completed(dict(entry), factors, rng) for _ in range(100)]
         tried = [case for case in tried if case is not None]
         if not tried:
             missing.discard(entry)  # a third value rules the pair out
@@ -180,10 +182,10 @@ def pairwise(seed=0):
     return cases
 
 
-def completed(case, rng):
+def completed(case, factors, rng):
     """Return the case with random allowed values of the other factors, None if there are none."""
-    for name in rng.permutation([name for name in FACTORS if name not in case]):
-        values = [value for value in FACTORS[name] if allowed({**case, name: value})]
+    for name in rng.permutation([name for name in factors if name not in case]):
+        values = [value for value in factors[name] if allowed({**case, name: value})]
         if not values:
             return None
         case = {**case, name: values[rng.integers(len(values))]}
@@ -195,7 +197,7 @@ def met(case):
     return set(itertools.combinations(ordered, 2))
 
 
-CASES = pairwise()
+CASES = pairwise(FACTORS) + pairwise({**FACTORS, "robot": ("forces",)})
 SLOW = {"auto"}  # values whose fits take more than 0.3 s
 
 
@@ -409,6 +411,10 @@ def test_the_drawn_body_ends_at_the_tip(crossing):
     if case["robot"] in ("own", "none"):
         return
     q = log.q[:DRAWN]
+    if case["robot"] == "forces" and not isinstance(model.mechanical_model_, ForceTendonChain):
+        with pytest.raises(TypeError, match="backbone can be drawn"):  # forces have no zeros
+            BackboneDisplay.from_estimator(model, q)
+        return
     body = BackboneDisplay.from_estimator(model, q)
     tips = model.predict(q)
     tips = tips[:, :3] if case["output"] == "pose" else tips[:, -3:]
