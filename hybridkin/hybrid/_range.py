@@ -1,4 +1,4 @@
-"""The range of the actuators in the rows of a fit."""
+"""The ranges in the rows of a fit: of the actuators, and of the states of hysteresis."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ _TESTED = 0.98  # share of the rows of the log that are in the range, held out
 
 
 class TrainingRange(NamedTuple):
-    """The least and the largest actuator vector of a fit [unit of q].
+    """The least and the largest actuator vector, or states (R, n), of a fit [unit of q].
 
     Attributes
     ----------
-    low, high : ndarray of shape (n,)
+    low, high : ndarray of shape (n,) or (R, n)
         Equal for an actuator that never moved.
     """
 

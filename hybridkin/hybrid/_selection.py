@@ -34,7 +34,7 @@ from hybridkin.hybrid.held_out import (
     Predictions,
     chosen_blend,
 )
-from hybridkin.learning.elm_cv import ELMRegressorCV
+from hybridkin.learning.elm_cv import growing_network
 
 _MOST = 2000  # rows for kernel ridge, whose cost grows with the cube of their number
 # With fewer, penalties that were chosen on all rows suit them.
@@ -132,12 +132,7 @@ class Auto(ErrorModel):
 
     def _candidates(self, spec: Spec, n_rows: int) -> dict[str, ErrorModel]:
         """Return the error models by name; of equal candidates the first, simplest one wins."""
-        network = ELMRegressorCV(
-            250,
-            relevance_rounds=3,
-            max_hidden=1000,
-            random_state=copy.deepcopy(self.random_state),
-        )
+        network = growing_network(copy.deepcopy(self.random_state))
         candidates: dict[str, ErrorModel] = {}
         at_tip = ""
         if spec.mechanical is None:

@@ -240,6 +240,13 @@ class ELMRegressorCV(FittedNetwork):
         return chosen
 
 
+def growing_network(random_state=None):
+    """Return the network of comparisons: 250 to 1000 neurons, input scales in three rounds."""
+    return ELMRegressorCV(
+        250, relevance_rounds=3, max_hidden=1000, random_state=random_state
+    )
+
+
 class _Candidate(NamedTuple):
     """A hidden layer, its errors for every penalty, and the parameters with the best penalty."""
 

@@ -26,7 +26,7 @@ from hybridkin.chains.robots import RobotDescription
 from hybridkin.hybrid.estimator import HybridForwardModel, Start, fit_quietly
 from hybridkin.hybrid.held_out import HeldOut, Predictions, chosen_blend
 from hybridkin.hybrid.log_distance import held_out_distances
-from hybridkin.learning.elm_cv import ELMRegressorCV
+from hybridkin.learning.elm_cv import growing_network
 from hybridkin.learning.regressor_modules import error_module
 from hybridkin.native.library import evaluate
 from hybridkin.workflow.calibrated import CalibratedParameter, calibrated_parameters
@@ -232,9 +232,7 @@ def models_to_save(
         without_error_model: HybridForwardModel(model, "drop"),
         DATA_QUADRATIC: HybridForwardModel(None, quadratic()),
     }
-    network = ELMRegressorCV(
-        250, relevance_rounds=3, max_hidden=1000, random_state=0
-    )  # as in auto
+    network = growing_network(0)
     if settings.auto:
         models[DATA_ELM] = HybridForwardModel(None, network)
         models[AUTO] = _auto(robot, model, settings)
