@@ -14,12 +14,11 @@ if TYPE_CHECKING:
     from hybridkin.calibration.play_fit import PlayFit, fit_play
     from hybridkin.chains import robots
     from hybridkin.chains.constant_curvature import ConstantCurvatureChain
-    from hybridkin.chains.creep import CreepOperator, CreepState
+    from hybridkin.chains.creep import CreepOperator
     from hybridkin.chains.elastic_tendons import ElasticTendonChain
     from hybridkin.chains.force_tendons import ForceTendonChain
-    from hybridkin.chains.play import PlayOperator, PlayState
+    from hybridkin.chains.play import PlayOperator
     from hybridkin.chains.prandtl_ishlinskii import (
-        HysteresisState,
         PrandtlIshlinskiiOperator,
     )
     from hybridkin.chains.rigid import RigidChain
@@ -40,7 +39,6 @@ __all__ = [
     "Commands",
     "ConstantCurvatureChain",
     "CreepOperator",
-    "CreepState",
     "ELMRegressor",
     "ELMRegressorCV",
     "ElasticTendonChain",
@@ -48,13 +46,11 @@ __all__ = [
     "ForwardModel",
     "HybridForwardModel",
     "HysteresisSeries",
-    "HysteresisState",
     "IKSolution",
     "IKStatus",
     "InverseKinematics",
     "PlayFit",
     "PlayOperator",
-    "PlayState",
     "PrandtlIshlinskiiOperator",
     "RigidChain",
     "Step",
@@ -84,11 +80,11 @@ _NAMES_OF = {
     "calibration.calibrate": ("CalibrationResult", "calibrate"),
     "calibration.play_fit": ("PlayFit", "fit_play"),
     "chains.constant_curvature": ("ConstantCurvatureChain",),
-    "chains.creep": ("CreepOperator", "CreepState"),
+    "chains.creep": ("CreepOperator",),
     "chains.elastic_tendons": ("ElasticTendonChain",),
     "chains.force_tendons": ("ForceTendonChain",),
-    "chains.play": ("PlayOperator", "PlayState"),
-    "chains.prandtl_ishlinskii": ("HysteresisState", "PrandtlIshlinskiiOperator"),
+    "chains.play": ("PlayOperator",),
+    "chains.prandtl_ishlinskii": ("PrandtlIshlinskiiOperator",),
     "chains.rigid": ("RigidChain",),
     "chains.series": ("HysteresisSeries",),
     "hybrid.choose_rows": ("choose_rows",),

@@ -14,7 +14,6 @@ from hybridkin import (
     ELMRegressor,
     HybridForwardModel,
     InverseKinematics,
-    PlayState,
     datasets,
     plots,
     robots,
@@ -89,7 +88,7 @@ def hostile(draw, good):
     if isinstance(good, dict):
         key = draw(st.sampled_from([*good]))
         return {**good, key: draw(hostile(good[key]))}
-    if isinstance(good, (list, tuple)) and not isinstance(good, PlayState):
+    if isinstance(good, (list, tuple)):
         parts = [*good, *good] if draw(st.booleans()) else [*good]
         if parts:
             k = draw(st.integers(0, len(parts) - 1))
@@ -97,8 +96,6 @@ def hostile(draw, good):
         return parts if draw(st.booleans()) else tuple(parts[:-1])
     if isinstance(good, (bool, int, float)):
         return draw(st.sampled_from(NUMBERS))
-    if isinstance(good, PlayState):
-        return PlayState(*(draw(hostile(part)) for part in good))
     if isinstance(good, OBJECTS):
         return good
     return draw(st.sampled_from([*WRONG, *NUMBERS, Q, X, X[:, 0], torch.tensor(Q), FOLDER, CSV]))

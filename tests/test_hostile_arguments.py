@@ -39,10 +39,8 @@ from hybridkin import (
     ELMRegressorCV,
     ForceTendonChain,
     HybridForwardModel,
-    HysteresisState,
     InverseKinematics,
     PlayOperator,
-    PlayState,
     PrandtlIshlinskiiOperator,
     RigidChain,
     as_forward_model,
@@ -227,11 +225,11 @@ ENTRIES = {
     "PlayOperator": (PlayOperator, {"width": np.array([0.1, 0.0, 0.2])}),
     "PlayOperator.apply": (
         PlayOperator([0.01, 0.0, 0.1]).apply,
-        {"q": Q, "state": PlayState(Q[0], Q[0])},
+        {"q": Q, "state": np.tile(Q[0], (3, 1))},
     ),
     "PlayOperator.command": (
         PlayOperator([0.01, 0.0, 0.1]).command,
-        {"y": Q, "state": PlayState(Q[0], Q[0])},
+        {"y": Q, "state": np.tile(Q[0], (3, 1))},
     ),
     "PlayOperator.apply_by_group": (
         PlayOperator(0.01).apply_by_group,
@@ -243,11 +241,11 @@ ENTRIES = {
     ),
     "PrandtlIshlinskiiOperator.apply": (
         PrandtlIshlinskiiOperator([0.0, 0.1], [0.3]).apply,
-        {"q": Q, "state": HysteresisState(Q[0], Q[0], Q[:2])},
+        {"q": Q, "state": np.tile(Q[0], (4, 1))},
     ),
     "PrandtlIshlinskiiOperator.command": (
         PrandtlIshlinskiiOperator([0.0, 0.1], [0.3]).command,
-        {"y": Q, "state": HysteresisState(Q[0], Q[0], Q[:2])},
+        {"y": Q, "state": np.tile(Q[0], (4, 1))},
     ),
     "robots.from_toml": (robots.from_toml, {"path": ROBOT}),
     "robots.read_description": (robots.read_description, {"path": ROBOT}),
@@ -668,7 +666,7 @@ META = ROWS.to("meta")
         ("tangents", lambda: trunk().geometry_jacobian(ROWS, {})),
         (r"tangents\['base'\]", lambda: trunk().geometry_jacobian(ROWS, {"base": torch.ones(4)})),
         ("markers", lambda: tendon_chain().with_markers([(0,)])),
-        ("state", lambda: PlayOperator(0.1).apply(Q, PlayState(np.nan * Q[0], Q[0]))),
+        ("state", lambda: PlayOperator(0.1).apply(Q, np.nan * Q[:3])),
         ("routing", lambda: trunk(routing=["segment"])),
         ("timing", lambda: trajectories.line(X[0], X[1], timing=X)),
         ("duration", lambda: trajectories.line(X[0], X[1], duration=1e300)),
@@ -721,7 +719,7 @@ def test_a_number_whose_square_overflows_counts_as_infinite():
 
 
 def test_a_state_in_numpy_continues_a_motion_in_torch():
-    state = PlayState(Q[0][::-1].copy()[::-1], Q[0])
+    state = Q[:3, ::-1].copy()[:, ::-1]
     found, _ = PlayOperator(0.1).apply(ROWS, state)
     torch.testing.assert_close(found, torch.tensor(PlayOperator(0.1).apply(Q, state)[0]))
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -12,25 +10,10 @@ from hybridkin._core.kernel_numbers import HK_MAX_CREEPS
 from hybridkin.chains.hysteresis import HysteresisOperator
 from hybridkin.native.hysteresis import Stage
 
-__all__ = ["CreepOperator", "CreepState"]
+__all__ = ["CreepOperator"]
 
 
-class CreepState(NamedTuple):
-    """State of a creep operator, passed from one call to the next.
-
-    Attributes
-    ----------
-    command : array or Tensor of shape (n,)
-        Last command q [m].
-    slow : array or Tensor of shape (J, n)
-        Last slow states s_j [m].
-    """
-
-    command: Any
-    slow: Any
-
-
-class CreepOperator(HysteresisOperator[CreepState]):
+class CreepOperator(HysteresisOperator):
     """Creep between commanded and effective changes, as of polymers.
 
     A share g_j of every change comes with the time constant tau_j, the rest at once::
@@ -99,9 +82,6 @@ class CreepOperator(HysteresisOperator[CreepState]):
     def _size(self) -> int | str:
         return self.gains.shape[1] if self.gains.ndim == 2 else "n"
 
-    def _start(self, row: NDArray) -> CreepState:
-        return CreepState(row, np.tile(row, (len(self.times), 1)))
-
     def stages(self, n: int) -> list[Stage]:
         """Return the operator of n actuators as one stage of creep."""
         size = len(self.times)
@@ -115,14 +95,6 @@ class CreepOperator(HysteresisOperator[CreepState]):
             half, _ = CreepOperator([0.5], [time]).apply(q, dt=steps)
             slow.append(2.0 * half - q)
         return np.stack(slow, axis=1)
-
-    def packed(self, state: CreepState) -> NDArray:
-        """Return a state as the kernels keep it (J + 2, n); its result is not known."""
-        return np.vstack([state.command, state.slow, state.command])
-
-    def unpacked(self, rows: NDArray) -> CreepState:
-        """Return the state of rows (J + 2, n) of `packed`."""
-        return CreepState(rows[0], rows[1:-1])
 
 
 def _are_shares(gains: NDArray) -> bool:

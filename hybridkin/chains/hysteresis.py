@@ -4,26 +4,26 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from hybridkin._core.arrays import check_shape, labels, real_array
+from hybridkin._core.arrays import Numbers, check_shape, labels, real_array
 from hybridkin.chains._stages import follow_in_numpy
-from hybridkin.native.hysteresis import Stage, follow
+from hybridkin.native.hysteresis import Stage, follow, stage_numbers
 from hybridkin.native.library import available
 
-_State = TypeVar("_State", bound=tuple)
 
-
-class HysteresisOperator(ABC, Generic[_State]):
+class HysteresisOperator(ABC):
     """Hysteresis between commanded and effective changes; the operator itself has no state.
 
     The result depends on the order of the commands, with creep on their times as well. The state is
-    passed and returned, so several robots or branches of a plan can share one operator.
+    passed and returned, so several robots or branches of a plan can share one operator. Its rows
+    are the last command, what is inside of the operator (plays, slow states), and the last result,
+    which is the command of the next operator of a series.
 
     Attributes
     ----------
@@ -46,15 +46,15 @@ class HysteresisOperator(ABC, Generic[_State]):
         return (self,)
 
     def apply(
-        self, q: Any, state: _State | None = None, dt: ArrayLike = 1.0
-    ) -> tuple[Any, _State]:
+        self, q: Any, state: Numbers | None = None, dt: ArrayLike = 1.0
+    ) -> tuple[Any, Any]:
         """Return the effective changes of a motion, and the state at its end.
 
         Parameters
         ----------
         q : array or Tensor of shape (T, n)
             Commanded tendon length changes in order of time [m].
-        state : tuple, optional
+        state : array or Tensor of shape (R, n), optional
             State at the end of the previous motion. None: start without hysteresis, y_0 = q_0.
         dt : float or array-like of shape (T,), default=1.0
             Time since the row before, of every row [s]. Only creep needs it. Without `state` the
@@ -64,7 +64,7 @@ class HysteresisOperator(ABC, Generic[_State]):
         -------
         y : array or Tensor of shape (T, n)
             Effective changes [m], the input of the robot's model.
-        state : tuple
+        state : array or Tensor of shape (R, n)
             State for the rows that follow.
 
         Raises
@@ -72,13 +72,11 @@ class HysteresisOperator(ABC, Generic[_State]):
         ValueError
             For a wrong shape, for entries that are not finite, or for no rows without a state.
         """
-        rows, start = self._checked(q, state, "q")
-        result, end = self._moved(rows, start, _checked_steps(dt, len(rows)), False)
-        return _like(result, q), self._state_for(end, q)
+        return self._moved(q, "q", state, dt)
 
     def command(
-        self, y: Any, state: _State | None = None, dt: ArrayLike = 1.0
-    ) -> tuple[Any, _State]:
+        self, y: Any, state: Numbers | None = None, dt: ArrayLike = 1.0
+    ) -> tuple[Any, Any]:
         """Return the commands that give the effective changes y: the inverse of `apply`.
 
         An actuator without creep whose effective change stays the same keeps its command.
@@ -87,7 +85,7 @@ class HysteresisOperator(ABC, Generic[_State]):
         ----------
         y : array or Tensor of shape (T, n)
             Desired effective changes in order of time [m].
-        state : tuple, optional
+        state : array or Tensor of shape (R, n), optional
             State at the end of the previous motion. None: start without hysteresis, q_0 = y_0.
         dt : float or array-like of shape (T,), default=1.0
             Time since the row before, of every row, as in `apply` [s].
@@ -96,7 +94,7 @@ class HysteresisOperator(ABC, Generic[_State]):
         -------
         q : array or Tensor of shape (T, n)
             Commands to send [m]. They jump by up to `width` when an actuator reverses.
-        state : tuple
+        state : array or Tensor of shape (R, n)
             State for the rows that follow.
 
         Raises
@@ -104,9 +102,7 @@ class HysteresisOperator(ABC, Generic[_State]):
         ValueError
             For a wrong shape, for entries that are not finite, or for no rows without a state.
         """
-        rows, start = self._checked(y, state, "y")
-        result, end = self._moved(rows, start, _checked_steps(dt, len(rows)), True)
-        return _like(result, y), self._state_for(end, y)
+        return self._moved(y, "y", state, dt, lead=True)
 
     def apply_by_group(
         self, q: Any, groups: ArrayLike, time: ArrayLike | None = None
@@ -160,70 +156,51 @@ class HysteresisOperator(ABC, Generic[_State]):
         """Return the inner states (T, R, n) of a motion, see `inner_states`."""
         return np.empty((len(q), 0, q.shape[1]))
 
-    @abstractmethod
-    def packed(self, state: _State) -> NDArray:
-        """Return a state as the kernels keep it (R, n): the command, what is inside, the result."""
-
-    @abstractmethod
-    def unpacked(self, rows: NDArray) -> _State:
-        """Return the state of rows (R, n) of `packed`."""
-
-    def _moved(
-        self, rows: NDArray, start: _State, steps: NDArray, lead: bool
-    ) -> tuple[NDArray, _State]:
-        """Return effective changes (or with `lead` commands), and the last state."""
-        if not len(rows):
-            return rows, start
-        follow_rows = follow_in_numpy
-        if rows.dtype == np.float64 and available():
-            follow_rows = follow
-        state = self.packed(start).astype(rows.dtype)
-        result = follow_rows(self.stages(rows.shape[1]), rows, steps, state, lead)
-        return result, self.unpacked(state)
-
     @property
     @abstractmethod
     def _size(self) -> int | str:
         """Number of actuators; "n" if any."""
 
-    @abstractmethod
-    def _start(self, row: NDArray) -> _State:
-        """Return the state without hysteresis at a row (n,)."""
-
-    def _checked(
-        self, motion: Any, state: _State | None, name: str
-    ) -> tuple[NDArray, _State]:
-        """Return a caller's rows (T, n) as the core reads them, and the state before them."""
+    def _moved(
+        self,
+        motion: Any,
+        name: str,
+        state: Numbers | None,
+        dt: ArrayLike,
+        lead: bool = False,
+    ) -> tuple[Any, Any]:
+        """Return effective changes (or with `lead` commands), and the last state."""
         rows = np.array(real_array(motion, name), order="C")
         check_shape(rows, name, ("T", self._size))
-        if not rows.shape[1]:
+        n = rows.shape[1]
+        if not n:
             raise ValueError(f"`{name}` must hold at least one actuator, got none.")
         if not np.isfinite(rows).all():
             raise ValueError(f"`{name}` must be finite, got NaN or infinity.")
-        if state is not None:
-            return rows, self._checked_state(state, rows.shape[1])
-        if not len(rows):
-            need = "must hold at least one row if `state` is not given"
-            raise ValueError(f"`{name}` {need}.")
-        return rows, self._start(rows[0])
+        steps = _checked_steps(dt, len(rows))
+        stages = self.stages(n)
+        last = self._start(rows, name, state, stage_numbers(stages).n_rows)
+        follow_rows = follow_in_numpy
+        if rows.dtype == np.float64 and available():
+            follow_rows = follow
+        if len(rows):
+            rows = follow_rows(stages, rows, steps, last, lead)
+        return _like(rows, motion), _like(last, motion)
 
-    def _checked_state(self, state: Any, n: int) -> _State:
-        """Return a caller's state of n actuators, of the kind and the shapes of this operator."""
-        expected = self._start(np.zeros(n))
-        kind = type(expected)
-        if not isinstance(state, tuple) or len(state) != len(expected):
-            raise TypeError(f"`state` must be a {kind.__name__}, got {state!r:.80}.")
-        arrays = [real_array(part, "state") for part in state]
-        shapes = [part.shape for part in expected]
-        finite = all(np.isfinite(array).all() for array in arrays)
-        if not finite or [array.shape for array in arrays] != shapes:
-            need = f"must hold finite arrays of shapes {', '.join(map(str, shapes))}"
-            raise ValueError(f"`state` {need}, got {state!r:.200}.")
-        return kind(*arrays)
-
-    def _state_for(self, state: _State, caller: NDArray | Tensor) -> _State:
-        """Return a state in tensors if the caller gave one."""
-        return type(state)(*(_like(part, caller) for part in state))
+    def _start(
+        self, rows: NDArray, name: str, state: Numbers | None, n_rows: int
+    ) -> NDArray:
+        """Return the state (R, n) before rows (T, n): a copy of the caller's, or at rest."""
+        if state is None:
+            if not len(rows):
+                need = "must hold at least one row if `state` is not given"
+                raise ValueError(f"`{name}` {need}.")
+            return np.tile(rows[0], (n_rows, 1))
+        start = np.array(real_array(state, "state"), rows.dtype, order="C")
+        check_shape(start, "state", (n_rows, rows.shape[1]), f"as {self!r} returns it")
+        if not np.isfinite(start).all():
+            raise ValueError(f"`state` must be finite, got {state!r:.200}.")
+        return start
 
 
 def _motions(

@@ -2,34 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
-
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from hybridkin._core.arrays import real_array
 from hybridkin.chains.hysteresis import HysteresisOperator
 from hybridkin.native.hysteresis import Stage
 
-__all__ = ["PlayOperator", "PlayState"]
+__all__ = ["PlayOperator"]
 
 
-class PlayState(NamedTuple):
-    """State of a play operator, passed from one call to the next.
-
-    Attributes
-    ----------
-    command : array or Tensor of shape (n,)
-        Last command q [m].
-    effective : array or Tensor of shape (n,)
-        Last effective change y [m], at most half the width from the command.
-    """
-
-    command: Any
-    effective: Any
-
-
-class PlayOperator(HysteresisOperator[PlayState]):
+class PlayOperator(HysteresisOperator):
     """Backlash (also called play) between commanded and effective tendon length changes.
 
     The effective change stays constant until the command is half the width away, then follows at
@@ -76,18 +59,7 @@ class PlayOperator(HysteresisOperator[PlayState]):
     def _size(self) -> int | str:
         return self.width.size if self.width.ndim else "n"
 
-    def _start(self, row: NDArray) -> PlayState:
-        return PlayState(row, row)
-
     def stages(self, n: int) -> list[Stage]:
         """Return the operator of n actuators as one stage of one play."""
         half = np.broadcast_to(self.width / 2, (1, n))
         return [Stage(1, (half, np.ones((1, n))))]
-
-    def packed(self, state: PlayState) -> NDArray:
-        """Return a state as the kernels keep it (3, n)."""
-        return np.stack([state.command, state.effective, state.effective])
-
-    def unpacked(self, rows: NDArray) -> PlayState:
-        """Return the state of rows (3, n) of `packed`."""
-        return PlayState(rows[0], rows[-1])

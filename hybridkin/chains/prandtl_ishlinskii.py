@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -12,28 +10,10 @@ from hybridkin.chains.hysteresis import HysteresisOperator
 from hybridkin.chains.play import PlayOperator
 from hybridkin.native.hysteresis import Stage
 
-__all__ = ["HysteresisState", "PrandtlIshlinskiiOperator"]
+__all__ = ["PrandtlIshlinskiiOperator"]
 
 
-class HysteresisState(NamedTuple):
-    """State of a Prandtl-Ishlinskii operator, passed from one call to the next.
-
-    Attributes
-    ----------
-    command : array or Tensor of shape (n,)
-        Last command q [m].
-    effective : array or Tensor of shape (n,)
-        Last effective change y [m].
-    plays : array or Tensor of shape (K, n)
-        Last results of the play operators [m].
-    """
-
-    command: Any
-    effective: Any
-    plays: Any
-
-
-class PrandtlIshlinskiiOperator(HysteresisOperator[HysteresisState]):
+class PrandtlIshlinskiiOperator(HysteresisOperator):
     """A weighted sum of play operators, for friction whose loops have no sharp corners.
 
     With the results P_k of play operators of K widths, ``y = P_K + sum_k s_k (P_k - P_{k+1})``.
@@ -102,9 +82,6 @@ class PrandtlIshlinskiiOperator(HysteresisOperator[HysteresisState]):
     def _size(self) -> int | str:
         return self.slopes.shape[1] if self.slopes.ndim == 2 else "n"
 
-    def _start(self, row: NDArray) -> HysteresisState:
-        return HysteresisState(row, row, np.tile(row, (len(self.widths), 1)))
-
     def stages(self, n: int) -> list[Stage]:
         """Return the operator of n actuators as one stage of all plays."""
         slopes = np.ones((len(self.widths), n))  # the last are 1
@@ -116,14 +93,6 @@ class PrandtlIshlinskiiOperator(HysteresisOperator[HysteresisState]):
         """Return the plays (T, K, n)."""
         plays = [PlayOperator(width).apply(q)[0] for width in self.widths]
         return np.stack(plays, axis=1)
-
-    def packed(self, state: HysteresisState) -> NDArray:
-        """Return a state as the kernels keep it (K + 2, n)."""
-        return np.vstack([state.command, state.plays, state.effective])
-
-    def unpacked(self, rows: NDArray) -> HysteresisState:
-        """Return the state of rows (K + 2, n) of `packed`."""
-        return HysteresisState(rows[0], rows[-1], rows[1:-1])
 
 
 def _are_valid(numbers: NDArray, dimensions: tuple[int, ...]) -> bool:

@@ -23,7 +23,7 @@ class Past(NamedTuple):
 
     run: object
     time: float
-    state: tuple
+    state: NDArray
 
 
 _PLAIN: dict[str, Any] = {"relevance_rounds": 0, "max_hidden": 0, "random_state": 0}

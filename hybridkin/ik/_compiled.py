@@ -340,7 +340,7 @@ class Follower:
         """State of the hysteresis, None without."""
         if self.task.hysteresis is None:
             return None
-        return self.task.hysteresis.unpacked(self._lead.copy())
+        return self._lead.copy()
 
     def start(self, q: Tensor, dq: Tensor, hysteresis: Any) -> None:
         """Set the initial command (1, n), the step to it, and the state of hysteresis before it."""
@@ -354,8 +354,7 @@ class Follower:
         parts["q"][:] = as_array(q[0])
         if self.task.hysteresis is not None:
             q, end = self.task.hysteresis.apply(q, hysteresis, 0.0)
-            self._lead[:] = self.task.hysteresis.packed(end)
-            self._lead[-1] = as_array(q[0])
+            self._lead[:] = as_array(end)
         x, _ = self.core.settings.evaluate(q)
         parts["x"][:] = as_array(x).ravel()
         self.state[IK_LAST] = self._dt

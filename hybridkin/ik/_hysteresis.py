@@ -25,14 +25,14 @@ class Lead:
         The hysteresis.
     command : Tensor of shape (1, n)
         The present command.
-    state : tuple or None
+    state : array or Tensor of shape (R, n), or None
         State of the hysteresis before it. None: without hysteresis.
 
     Attributes
     ----------
     command, effective : Tensor of shape (1, n)
         The present command, and what the actuators do.
-    state : tuple
+    state : Tensor of shape (R, n)
         The present state.
     """
 

@@ -524,7 +524,7 @@ class InverseKinematics:
             of its measurement nor the change of the model's error during the step.
         progress : callable, optional
             Called as ``progress(i, T)`` before point i.
-        state : tuple, optional
+        state : array of shape (R, n), optional
             State of the hysteresis at one start, see `Tracker.reset`. Default: without hysteresis.
 
         Returns

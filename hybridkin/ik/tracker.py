@@ -48,7 +48,7 @@ class Tracker(Portable):
         The present command: the result of the last `step`, or the argument of `reset`.
     effective : array of shape (n,)
         What the actuators do, where the model is evaluated [unit of q]: `q` without hysteresis.
-    state : tuple or None
+    state : array of shape (R, n) or None
         State of the hysteresis after that command, for `reset`; None without hysteresis.
     x : array of shape (3,)
         The model's tip at the start of the last step [m], in the shape of the task.
@@ -184,7 +184,7 @@ class Tracker(Portable):
         ----------
         q : array-like of shape (n,)
             Command, in the unit of q. From outside the limits it returns at `dq_max`.
-        state : tuple, optional
+        state : array of shape (R, n), optional
             State of the hysteresis: `state` of a tracker, or as from `apply` of the model's `play_`
             with the commands until now. Default: without hysteresis at q.
         """

@@ -43,14 +43,6 @@ class Hysteresis(Protocol):
         """Return the operator of n actuators as stages in series."""
         ...
 
-    def packed(self, state: Any) -> NDArray:
-        """Return a state as the kernels keep it, shape (R, n)."""
-        ...
-
-    def unpacked(self, rows: NDArray) -> Any:
-        """Return the state of rows of `packed`."""
-        ...
-
 
 class StageNumbers(NamedTuple):
     """The description of stages as the kernels read it, see hysteresis.h.
@@ -65,6 +57,11 @@ class StageNumbers(NamedTuple):
 
     code: list[int]
     numbers: NDArray
+
+    @property
+    def n_rows(self) -> int:
+        """Number of rows of the state."""
+        return self.code[1]
 
 
 def stage_numbers(stages: list[Stage]) -> StageNumbers:
