@@ -2,7 +2,6 @@
 
 import numpy as np
 import torch
-from scipy import linalg
 from scipy.linalg.lapack import dposv  # pyright: ignore
 from sklearn.utils import gen_batches
 
@@ -51,6 +50,7 @@ class LeftOut:
     def __init__(self, elm, stats, X, y, weights, fit_intercept):
         n_features = len(elm.output_weights)
         mean, G, C, _ = moments(stats, n_features, fit_intercept)
+        self._scatter = np.block([[G, C], [C.T, np.zeros([y.shape[1]] * 2)]])
         self._elm = elm
         self._X = X
         self._intercept = fit_intercept
@@ -199,7 +199,7 @@ class _OfFewRows(LeftOut):
         if self._intercept:  # the direction of the mean, without residual, comes last
             mean_direction = np.outer(self._root, self._root) / self._n
             gram += (1 + np.trace(gram)) * mean_direction
-        eigenvalues, basis = linalg.eigh(gram)
+        eigenvalues, basis = _eigh(gram)
         if self._intercept:
             eigenvalues = eigenvalues[:-1]
             basis = basis[:, :-1]
@@ -228,7 +228,7 @@ class _OfManyRows(LeftOut):
     """
 
     def _decomposed(self, G, C):
-        eigenvalues, basis = linalg.eigh(G)
+        eigenvalues, basis = _eigh(G)
         return eigenvalues, basis, basis.T @ C
 
     def _d(self, alphas):
@@ -252,38 +252,44 @@ class _OfManyRows(LeftOut):
         return self._y[rows] + self._projected(Z, D)
 
     def _is_refitted(self, out) -> bool:
-        """Return whether sums over the remaining rows are faster than P_SS."""
-        return len(out) > len(self._center)
+        """Return whether sums over the remaining rows are faster than P_SS of every penalty."""
+        return 2 * len(out) > len(self._center)
 
     def _refitted(self, out, asked, alphas):
         n_features = len(self._center)
-        # Sums of squares and products of [Z, y], in the eigenbasis, less those of the rows out.
-        scatter = np.diag(np.append(self.eigenvalues, np.zeros(self._y.shape[1])))
-        scatter[:n_features, n_features:] = self._Zy
+        # Sums of squares and products of [phi, y], less those of the rows out.
+        scatter = self._scatter.copy()
         total = np.zeros(len(scatter))
         weight = self._n
         for batch in gen_batches(len(out), self._rows_at_a_time(0)):
             rows = out[batch]
-            root = self._root[rows]
-            z = np.hstack([self._z(rows), self._y[rows]])
+            z = np.hstack([self._features(rows), self._y[rows]])
             scatter -= z.T @ z
-            total -= root @ z
-            weight -= np.sum(root**2)
+            total -= self._root[rows] @ z
+            weight -= np.sum(self._root[rows] ** 2)
         mean = total / weight * self._intercept
         scatter -= weight * np.outer(mean, mean)
         # Ridge regression on the remaining rows.
-        eigenvalues, V = linalg.eigh(scatter[:n_features, :n_features])
+        eigenvalues, V = _eigh(scatter[:n_features, :n_features])
         shrunk = 1.0 / np.add.outer(alphas, np.maximum(eigenvalues, 0.0))
         moment = V.T @ scatter[:n_features, n_features:]
-        W = V @ (shrunk[:, :, None] * moment)
+        by_alpha = shrunk.T[:, :, None] * moment[:, None]
+        W = V @ by_alpha.reshape(n_features, -1)
         errors = np.empty((len(alphas), len(asked), self._y.shape[1]))
         for batch in gen_batches(len(asked), self._rows_at_a_time(len(alphas))):
             rows = asked[batch]
             root = self._root[rows, None]
-            z = self._z(rows) / root - mean[:n_features]
+            z = self._features(rows) / root - mean[:n_features]
             y = self._y[rows] / root - mean[n_features:]
-            errors[:, batch] = y - z @ W
+            predicted = (z @ W).reshape(len(rows), len(alphas), -1)
+            errors[:, batch] = y - predicted.swapaxes(0, 1)
         return errors
+
+
+def _eigh(matrix):
+    """Return the eigenvalues and eigenvectors of a symmetric matrix, as `scipy.linalg.eigh`."""
+    eigenvalues, axes = torch.linalg.eigh(torch.from_numpy(matrix))
+    return eigenvalues.numpy(), axes.numpy()
 
 
 def _products(Z, D):
