@@ -8,6 +8,7 @@ from itertools import product
 from math import inf
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from sklearn.kernel_ridge import KernelRidge
@@ -25,7 +26,8 @@ _ALPHAS = (1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0)
 _GAMMAS = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
 _WIDTHS = range(len(_GAMMAS))
 _PENALTIES = range(len(_ALPHAS))
-_ENOUGH = 600  # rows to search on
+_FIRST = 300  # rows of the first search
+_ENOUGH = 1200  # rows of the second one
 _BESIDE = ((-1, 0), (1, 0), (0, -1), (0, 1))
 _AROUND = ((-1, -1), (-1, 1), (1, -1), (1, 1), *_BESIDE)
 Place = tuple[int, int]
@@ -41,8 +43,8 @@ def tuned_kernel(
 ) -> KernelRidge:
     """Return Gaussian kernel ridge with the width and the penalty of least held-out error.
 
-    The search starts on a coarse grid and moves to the best neighbour until none is better. Of many
-    rows it takes evenly spaced ones first; then all rows move it to neighbours in one parameter.
+    The search starts on a coarse grid and moves to the best neighbour until none is better. It
+    takes a few evenly spaced rows first; then more of them move it to neighbours in one parameter.
     """
     if len(X) > _MOST:
         raise ValueError(
@@ -51,16 +53,22 @@ def tuned_kernel(
             "error_model=ELMRegressorCV()."
         )
     spread = X.var(axis=0).mean() or 1.0
-    spaced = evenly_spaced(len(X), _ENOUGH)
-    # Without a whole motion the folds would not be those of the log.
-    if groups is not None and len(np.unique(groups[spaced])) < len(np.unique(groups)):
-        spaced = np.arange(len(X))
-    some_groups = None if groups is None else groups[spaced]
-    held_out = _HeldOut(X[spaced], error[spaced], weights[spaced], some_groups, spread)
-    best = min(product(_WIDTHS[::2], _PENALTIES[1::2]), key=held_out.distance)
-    best = held_out.best_near(best, _AROUND)
-    if len(spaced) < len(X):
-        best = _HeldOut(X, error, weights, groups, spread).best_near(best, _BESIDE)
+
+    def held_out(most: int) -> _HeldOut:
+        rows = evenly_spaced(len(X), most)
+        of_rows = None
+        if groups is not None:
+            # Without a whole motion the folds would not be those of the log.
+            if len(np.unique(groups[rows])) < len(np.unique(groups)):
+                rows = np.arange(len(X))
+            of_rows = groups[rows]
+        return _HeldOut(X[rows], error[rows], weights[rows], of_rows, spread)
+
+    few = held_out(_FIRST)
+    best = min(product(_WIDTHS[::2], _PENALTIES[1::2]), key=few.distance)
+    best = few.best_near(best, _AROUND)
+    if len(X) > _FIRST:
+        best = held_out(_ENOUGH).best_near(best, _BESIDE)
     width = _GAMMAS[best[0]] / spread
     alpha = _ALPHAS[best[1]]
     return KernelRidge(kernel="rbf", gamma=width).set_params(alpha=alpha)
@@ -98,8 +106,12 @@ class _HeldOut:
         return at
 
     def _weighted_kernel(self, width: int) -> NDArray:
-        kernel = np.exp(-_GAMMAS[width] / self._spread * self._squares)
-        return kernel * np.outer(self._root, self._root)
+        scaled = torch.from_numpy(-_GAMMAS[width] / self._spread * self._squares)
+        kernel = scaled.exp_().numpy()  # NumPy's exponential is slower
+        root = self._root.reshape(-1, 1)
+        kernel *= root
+        kernel *= root.T
+        return kernel
 
     def _distance(self, at: Place) -> float:
         """Return the sum of held-out distances."""
