@@ -26,13 +26,15 @@ from hybridkin.hybrid._rows import Rows
 from hybridkin.native.library import Program, program_of
 
 _LARGEST = 1000  # most weights; of more features only the strongest directions are kept
-# Steps; the first ones and every tenth factorise.
+# Steps; the first ones, far from the optimum, and every tenth factorise.
 _ROUNDS, _FACTORS, _REFRESH = (
     200,
     4,
     10,
 )
-_SETTLED = 1e-9  # relative to the gradient without a correction
+# Gradients, relative to that without a correction.
+_FAR = 0.01
+_SETTLED = 1e-9
 # Noise ratios, over the mean of dx/dq squared.
 _RATIOS = torch.from_numpy(np.logspace(-2, 4, 25))
 
@@ -357,10 +359,12 @@ class _Problem:
         factor: tuple[Tensor, Tensor] | None = None
         step_size = 1.0
         for k in range(rounds):
-            if float(slope.norm()) <= _SETTLED * scale:
+            gradient = float(slope.norm()) / scale
+            if gradient <= _SETTLED:
                 break
+            far = k < _FACTORS and gradient > _FAR
             # A shortened step was too far from the system for corrections.
-            if factor is None or step_size < 1.0 or k < _FACTORS or k % _REFRESH == 0:
+            if factor is None or step_size < 1.0 or far or k % _REFRESH == 0:
                 factor = self.linearised(readout).factor(penalty)
                 pairs = []
             step = -_linearised.quasi_newton(slope, pairs, factor)
