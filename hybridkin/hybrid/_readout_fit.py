@@ -176,9 +176,9 @@ def _chosen_with_noise(problem: _Problem, members: list[Tensor] | None) -> Reado
     noise_ratio = problem.likeliest_ratio(torch.from_numpy(fit.residual))
     if noise_ratio == inf:
         return fit
-    in_noise = _chosen(
-        problem.in_noise(noise_ratio), members, fit.alphas, problem.nothing
-    )
+    weights = problem.weights_of(fit.readout)
+    problem_in_noise = problem.in_noise(noise_ratio)
+    in_noise = _chosen(problem_in_noise, members, fit.alphas, weights, rounds=1)
     if problem.mean_distance(in_noise.residual) < problem.mean_distance(fit.residual):
         return in_noise
     return fit
