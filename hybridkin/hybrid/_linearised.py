@@ -112,17 +112,18 @@ class Linearised:
         self.gram = _gram(J, self._products)
         self.moment = moment(J, y, phi)
         self.n_linear = n_linear
-        self._apart: dict[int, Tensor] = {}  # the Gram matrices of large groups
+        # Gram matrices and right-hand sides of the rows without a large group.
+        self._without: dict[int, tuple[Tensor, Tensor]] = {}
         self._reduced: dict[tuple[int, bytes], Reduced] = {}
 
     def factor(self, penalty: Tensor) -> tuple[Tensor, Tensor]:
         """Return which features are used (K,), and the Cholesky factor (D, D) of their system."""
         finite = torch.isfinite(penalty)
-        gram = self.gram.clone()
+        gram = self.gram
         if not finite.all():
             gram = gram[:, finite][..., finite]
-        system = gram.flatten(2).flatten(0, 1)
-        system.diagonal().add_(penalty[finite].repeat(len(self.gram)))
+        flat = gram.flatten(2).flatten(0, 1)
+        system = _penalised(flat, penalty[finite], len(gram))
         return finite, torch.linalg.cholesky(system)
 
     def residual(self, readout: Tensor) -> Tensor:
@@ -186,20 +187,24 @@ class Linearised:
         linear, others = penalty.tensor_split([n])
         key = group, others.numpy().tobytes()
         if key not in self._reduced:
-            if group not in self._apart:
-                self._apart[group] = _gram(J, Products(phi))
-            gram = self.gram - self._apart[group]
-            self._reduced[key] = _reduced(gram, self.moment - moment(J, y, phi), others)
+            if group not in self._without:
+                gram = self.gram - _gram(J, Products(phi))
+                self._without[group] = gram, self.moment - moment(J, y, phi)
+            self._reduced[key] = _reduced(*self._without[group], others)
         reduced = self._reduced[key]
         used = torch.isfinite(linear)
-        of_used = used.repeat(len(self.gram))
-        system = reduced.system[of_used][:, of_used]
-        system.diagonal().add_(linear[used].repeat(len(self.gram)))
-        L = torch.linalg.cholesky(system)
-        w = torch.cholesky_solve(reduced.right[of_used, None], L)[:, 0]
+        system = _penalised(reduced.system, linear, len(self.gram))
+        right = reduced.right
+        slope = reduced.slope
+        if not used.all():
+            of_used = used.repeat(len(self.gram))
+            system = system[of_used][:, of_used]
+            right = right[of_used]
+            slope = slope[:, of_used]
+        w = torch.cholesky_solve(right[:, None], torch.linalg.cholesky(system))[:, 0]
         readout = torch.zeros_like(self.moment)
         readout[:, :n][:, used] = w.view(len(readout), -1)
-        of_others = reduced.offset - reduced.slope[:, of_used] @ w
+        of_others = reduced.offset - slope @ w
         readout[:, n:][:, torch.isfinite(others)] = of_others.view(len(readout), -1)
         return y - moved_by(J, phi, readout)
 
@@ -234,19 +239,31 @@ def _reduced(gram: Tensor, right: Tensor, penalty: Tensor) -> Reduced:
     n = gram.shape[1] - len(penalty)
     used = torch.isfinite(penalty)
     linear = gram[:, :n, :, :n].flatten(2).flatten(0, 1)
-    both = gram[:, n:, :, :n][:, used].flatten(2).flatten(0, 1)
-    others = gram[:, n:, :, n:][:, used][..., used].flatten(2).flatten(0, 1)
-    others.diagonal().add_(penalty[used].repeat(len(gram)))
-    right_sides = torch.cat([both, right[:, n:][:, used].reshape(-1, 1)], dim=1)
+    right_linear, right_others = right.tensor_split([n], dim=1)
+    both = gram[:, n:, :, :n]
+    others = gram[:, n:, :, n:]
+    if not used.all():
+        both = both[:, used]
+        others = others[:, used][..., used]
+        right_others = right_others[:, used]
+    both = both.flatten(2).flatten(0, 1)
+    others = _penalised(others.flatten(2).flatten(0, 1), penalty[used], len(gram))
+    right_sides = torch.cat([both, right_others.reshape(-1, 1)], dim=1)
     solved = torch.cholesky_solve(right_sides, torch.linalg.cholesky(others))
     slope = solved[:, :-1]
     offset = solved[:, -1]
     return Reduced(
         linear - both.mT @ slope,
-        right[:, :n].flatten() - both.mT @ offset,
+        right_linear.flatten() - both.mT @ offset,
         slope,
         offset,
     )
+
+
+def _penalised(system: Tensor, penalty: Tensor, n_outputs: int) -> Tensor:
+    """Return a system (C P, C P) with the penalties (P,) of C outputs on its diagonal."""
+    diagonal = system.diagonal() + penalty.repeat(n_outputs)
+    return torch.diagonal_scatter(system, diagonal)
 
 
 def _gram(J: Tensor, products: Products) -> Tensor:

@@ -116,11 +116,11 @@ def test_gradient_is_zero_at_the_optimum(robot, kind, rng):
         assert objective(readout + move) > objective(readout)
 
 
-def ridge(rng, n=30, m=3, C=4, K=7, n_linear=0):
+def ridge(rng, unused, n=30, m=3, C=4, K=7, n_linear=0):
     rows = uniform(rng, n, m, C), uniform(rng, n, K), uniform(rng, n, m)
     linear = Linearised(*rows, n_linear=n_linear)
     penalty = torch.rand(K, generator=rng, dtype=torch.float64) + 0.1
-    penalty[2] = inf
+    penalty[unused] = inf
     return linear, penalty
 
 
@@ -137,15 +137,18 @@ def solved(linear, penalty, rows):
 
 @pytest.mark.parametrize("n_linear", [0, 2, 3, 7])
 @pytest.mark.parametrize("sizes", [None, [1] * 30, [3] * 10, [2, 28], [15, 14, 1]])
-def test_rows_left_out_equal_fits_without_them(sizes, n_linear, rng):
-    linear, penalty = ridge(rng, n_linear=n_linear)
+@pytest.mark.parametrize("unused", [[], [2]])
+def test_rows_left_out_equal_fits_without_them(unused, sizes, n_linear, rng):
+    linear, penalty = ridge(rng, unused, n_linear=n_linear)
     groups = (
         torch.arange(30)
         if sizes is None
         else torch.arange(len(sizes)).repeat_interleave(torch.tensor(sizes))
     )
     groups = groups[torch.randperm(30, generator=rng)]
-    found = linear.left_out(penalty, None if sizes is None else members_of(groups))
+    members = None if sizes is None else members_of(groups)
+    linear.left_out(2.0 * penalty, members)  # another penalty before changes nothing
+    found = linear.left_out(penalty, members)
     for label in groups.unique():
         out = groups == label
         expected = linear.residual(solved(linear, penalty, ~out))[out]
