@@ -206,6 +206,10 @@ class Log(NamedTuple):
     x: np.ndarray
     groups: np.ndarray | None
 
+    @property
+    def commands(self):
+        return Commands(self.q, self.groups, np.arange(float(len(self.q))))
+
 
 def log_of(case, robot, chain):
     """Return measured rows of a robot that bends a little more than its model says."""
@@ -260,15 +264,15 @@ def fitted(case):
         output=case["output"],
         random_state=0,
     )
-    model.fit(log.q, log.x, groups=log.groups)
+    model.fit(log.commands, log.x, groups=log.groups)
     unchanged = pickle.loads(pickle.dumps(model))
     if "adapted" in case["change"]:
         moved = log.x[:10] + np.resize([0.004, -0.002, 0.003, 0.0, 0.0, 0.0], log.x.shape[1])
         if case["output"] == "position":
             moved = log.x[:10] + np.resize([0.004, -0.002, 0.003], log.x.shape[1])
-        model.adapt(log.q[:10], moved)
+        model.adapt(log.commands[:10], moved)
     if "drifted" in case["change"]:
-        model.partial_fit(log.q[:20], log.x[:20] + 0.002)
+        model.partial_fit(log.commands[:20], log.x[:20] + 0.002)
     return Fitted(model, unchanged, log, robot)
 
 
@@ -305,9 +309,9 @@ def _without_warnings_of_few_rows():
 
 def test_parts_add_up(crossing):
     case, (model, _, log, _) = crossing
-    whole = model.predict(Commands(log.q, log.groups))
-    mechanical = model.predict_mechanical(Commands(log.q, log.groups))
-    error = model.predict_error(Commands(log.q, log.groups))
+    whole = model.predict(log.commands)
+    mechanical = model.predict_mechanical(log.commands)
+    error = model.predict_error(log.commands)
     columns = slice(None, 3 if case["output"] == "pose" else None)
     np.testing.assert_allclose((mechanical + error)[:, columns], whole[:, columns], atol=1e-9)
     if case["error_model"] == "drop" and case["change"] in ("none", "adapted"):
@@ -317,13 +321,13 @@ def test_parts_add_up(crossing):
 def test_the_core_agrees_with_torch(crossing):
     case, (model, _, log, _) = crossing
     module = in_columns(model.module_, case["output"])
-    q = torch.from_numpy(model.effective(Commands(log.q, log.groups)))
+    q = torch.from_numpy(model.effective(log.commands))
     with torch.no_grad():
         x, J = module.forward_and_jacobian(q)
         inside = model.module_.in_domain(q)
-    np.testing.assert_allclose(model.predict(Commands(log.q, log.groups)), x, atol=1e-9)
-    np.testing.assert_allclose(model.jacobian(Commands(log.q, log.groups)), J, rtol=1e-7, atol=1e-7)
-    assert (model.in_domain(Commands(log.q, log.groups)) == inside.numpy()).all()
+    np.testing.assert_allclose(model.predict(log.commands), x, atol=1e-9)
+    np.testing.assert_allclose(model.jacobian(log.commands), J, rtol=1e-7, atol=1e-7)
+    assert (model.in_domain(log.commands) == inside.numpy()).all()
 
 
 def test_the_jacobian_is_the_derivative(crossing):
@@ -351,16 +355,14 @@ def test_a_file_holds_the_model(crossing, tmp_path):
     save_model(model, tmp_path / "model.safetensors")
     again = load_model(tmp_path / "model.safetensors")
     for method in ("predict", "predict_mechanical", "predict_error", "jacobian", "in_domain"):
-        before = getattr(model, method)(Commands(log.q, log.groups))
-        after = getattr(again, method)(Commands(log.q, log.groups))
+        before = getattr(model, method)(log.commands)
+        after = getattr(again, method)(log.commands)
         np.testing.assert_allclose(after, before, rtol=1e-12, atol=1e-12, err_msg=method)
     np.testing.assert_array_equal(again.training_range_, model.training_range_)
     if model.play_ is not None:
         np.testing.assert_array_equal(again.play_.width, model.play_.width)
     pickled = pickle.loads(pickle.dumps(model))
-    np.testing.assert_array_equal(
-        pickled.predict(Commands(log.q, log.groups)), model.predict(Commands(log.q, log.groups))
-    )
+    np.testing.assert_array_equal(pickled.predict(log.commands), model.predict(log.commands))
 
 
 def test_limits_of_a_track_leave_room(crossing, tmp_path):
@@ -376,10 +378,10 @@ def test_a_clone_fits_the_same(crossing):
     case, (_, model, log, _) = crossing
     if case["error_model"] == "auto" and case["play"] != "none":
         return  # takes as long as the fit itself; those without backlash are enough
-    again = clone(model).fit(log.q, log.x, groups=log.groups)
+    again = clone(model).fit(log.commands, log.x, groups=log.groups)
     np.testing.assert_allclose(
-        again.predict(Commands(log.q, log.groups)),
-        model.predict(Commands(log.q, log.groups)),
+        again.predict(log.commands),
+        model.predict(log.commands),
         rtol=0,
         atol=1e-9,
     )
@@ -416,7 +418,7 @@ def test_the_drawn_body_ends_at_the_tip(crossing):
             BackboneDisplay.from_estimator(model, q)
         return
     body = BackboneDisplay.from_estimator(model, q)
-    tips = model.predict(q)
+    tips = model.predict(Commands(q, np.arange(len(q))))  # every row on its own
     tips = tips[:, :3] if case["output"] == "pose" else tips[:, -3:]
     ends = body.tips if body.predicted is None else body.predicted
     np.testing.assert_allclose(ends, tips, rtol=0, atol=1e-5)

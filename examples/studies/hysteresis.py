@@ -105,6 +105,14 @@ def far(a: NDArray, b: NDArray) -> NDArray:
     return 1e3 * np.linalg.norm(a - b, axis=1)
 
 
+def timed(q: NDArray, runs: NDArray) -> Commands:
+    """Return commands with one second from row to row of a run."""
+    time = np.empty(len(q))
+    for name in np.unique(runs):
+        time[runs == name] = np.arange((runs == name).sum())
+    return Commands(q, runs, time)
+
+
 def fits(
     model: HybridForwardModel,
     q: NDArray,
@@ -125,7 +133,8 @@ def fits(
 
     def fitted(play: float | str | None) -> HybridForwardModel:
         hybrid = clone(model).set_params(play=play)
-        return hybrid.fit(Commands(q, runs), x, weights, groups)
+        rows = timed(q, groups if runs is None else runs)
+        return hybrid.fit(rows, x, weights, groups)
 
     none = fitted(None)
     used = slice(None) if weights is None else weights > 0.0
@@ -145,7 +154,7 @@ def commands(model: HybridForwardModel, y: NDArray, groups: NDArray) -> NDArray:
     play = model.play_
     if play is None:
         return y
-    return by_group(lambda rows: play.command(rows)[0], y, groups)
+    return by_group(lambda rows: play.command(rows, dt=1.0)[0], y, groups)
 
 
 def simulated(kind: str, hysteresis: Hysteresis, draws: int) -> list[list[str]]:
@@ -160,7 +169,7 @@ def simulated(kind: str, hysteresis: Hysteresis, draws: int) -> list[list[str]]:
         x_new = tips(by_group(hysteresis, q_new, new))
 
         for name, model in fits(trunk_model(), q, x, groups).items():
-            predicted = far(model.predict(Commands(q_new, new)), x_new).mean()
+            predicted = far(model.predict(timed(q_new, new)), x_new).mean()
             sent = commands(model, q_new, new)
             with torch.no_grad():
                 promised = model.module_(torch.from_numpy(q_new)).numpy()
@@ -193,7 +202,7 @@ def trunk_of_motors(cases: list[Case], data_home: str | None) -> list[list[str]]
         for start, runs in {"run": groups, "runs in a row": joined}.items():
             models = fits(nominal, q, known, groups, runs, weights)
             for name, model in models.items():
-                y = model.effective(Commands(q, runs))
+                y = model.effective(timed(q, runs))
                 network = ELMRegressorCV(200, relevance_rounds=0, random_state=0)
                 network.fit(y[~test], x[~test], groups=groups[~test])
                 error = far(network.predict(y[test]), x[test])
@@ -209,7 +218,7 @@ def nine_tendons(cases: list[Case]) -> list[list[str]]:
 
         nominal = HybridForwardModel(case.chain, "drop", calibrate=case.calibrate)
         for name, model in fits(nominal, case.q, case.x, case.groups).items():
-            error = far(model.predict(Commands(q_new, new)), x_new)
+            error = far(model.predict(timed(q_new, new)), x_new)
             errors.setdefault(name, []).append(error)
     return [[name, *_by_fold(parts)] for name, parts in errors.items()]
 

@@ -22,6 +22,7 @@ from hysteresis import (
     far,
     many_plays,
     motions,
+    timed,
     tips,
 )
 from numpy.typing import NDArray
@@ -43,7 +44,7 @@ def from_the_ends(commands: Commands, rng: np.random.Generator) -> Commands:
     q = commands.q.reshape(-1, ROWS, 9)
     start = 0.05 * rng.choice([-1.0, 1.0], (len(q), 1, 9))
     q = 0.25 + (q - 0.25) * late + start * (1.0 - late)
-    return Commands(q.reshape(-1, 9), commands.runs)
+    return timed(q.reshape(-1, 9), commands.run_of_rows)
 
 
 def line(model: HybridForwardModel, new: Commands, x: NDArray, groups: NDArray) -> str:
@@ -70,13 +71,13 @@ def main() -> None:
             for seed in range(arguments.draws):
                 rng = np.random.default_rng(200 + seed)
                 q, groups = motions(rng, 24)
-                commands = Commands(q, groups // in_a_row)
+                commands = timed(q, groups // in_a_row)
                 model = HybridForwardModel(
                     TRUNK, "quadratic", coupling="serial", play="auto", coverage=0.9
                 )
                 model.fit(commands, measured(friction, commands, rng), groups=groups)
                 q, groups = motions(rng, 48)
-                alike = Commands(q, groups // in_a_row)
+                alike = timed(q, groups // in_a_row)
                 for name, new in {
                     "alike": alike,
                     "from the ends": from_the_ends(alike, rng),

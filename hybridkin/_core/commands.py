@@ -27,8 +27,7 @@ class Commands:
         Run of every row. The rows of a run follow each other without a break, and each run starts
         without hysteresis. Default: one run; for a fit with `groups`, each group.
     time : array-like of shape (N,), optional
-        Time of every row, ascending in each run [s]. Only creep needs it. Default: one second from
-        row to row.
+        Time of every row, ascending in each run [s]. Only creep needs it.
 
     Examples
     --------

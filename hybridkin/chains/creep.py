@@ -88,7 +88,7 @@ class CreepOperator(HysteresisOperator):
         gains = np.broadcast_to(self.gains.reshape(size, -1), (size, n))
         return [Stage(-size, (gains, self.times))]
 
-    def _inside(self, q: NDArray, steps: ArrayLike) -> NDArray:
+    def _inside(self, q: NDArray, steps: NDArray | None) -> NDArray:
         """Return the slow states (T, J, n)."""
         slow = []
         for time in self.times:

@@ -46,7 +46,7 @@ class HysteresisOperator(ABC):
         return (self,)
 
     def apply(
-        self, q: Any, state: Numbers | None = None, dt: ArrayLike = 1.0
+        self, q: Any, state: Numbers | None = None, dt: ArrayLike | None = None
     ) -> tuple[Any, Any]:
         """Return the effective changes of a motion, and the state at its end.
 
@@ -56,9 +56,9 @@ class HysteresisOperator(ABC):
             Commanded tendon length changes in order of time [m].
         state : array or Tensor of shape (R, n), optional
             State at the end of the previous motion. None: start without hysteresis, y_0 = q_0.
-        dt : float or array-like of shape (T,), default=1.0
-            Time since the row before, of every row [s]. Only creep needs it. Without `state` the
-            first one has no effect.
+        dt : float or array-like of shape (T,), optional
+            Time since the row before, of every row [s]. Creep needs it; without `state` the first
+            one has no effect.
 
         Returns
         -------
@@ -75,7 +75,7 @@ class HysteresisOperator(ABC):
         return self._moved(q, "q", state, dt)
 
     def command(
-        self, y: Any, state: Numbers | None = None, dt: ArrayLike = 1.0
+        self, y: Any, state: Numbers | None = None, dt: ArrayLike | None = None
     ) -> tuple[Any, Any]:
         """Return the commands that give the effective changes y: the inverse of `apply`.
 
@@ -87,7 +87,7 @@ class HysteresisOperator(ABC):
             Desired effective changes in order of time [m].
         state : array or Tensor of shape (R, n), optional
             State at the end of the previous motion. None: start without hysteresis, q_0 = y_0.
-        dt : float or array-like of shape (T,), default=1.0
+        dt : float or array-like of shape (T,), optional
             Time since the row before, of every row, as in `apply` [s].
 
         Returns
@@ -116,7 +116,7 @@ class HysteresisOperator(ABC):
         groups : array-like of shape (N,)
             Motion of every row.
         time : array-like of shape (N,), optional
-            Time of every row, ascending in each motion [s]. Default: one second from row to row.
+            Time of every row, ascending in each motion [s]. Creep needs it.
 
         Returns
         -------
@@ -126,7 +126,8 @@ class HysteresisOperator(ABC):
         Raises
         ------
         ValueError
-            For wrong shapes, entries that are not finite or times that decrease.
+            For wrong shapes, entries that are not finite, times that decrease, and creep without
+            times.
         """
         rows = real_array(q, "q")
         effective = np.empty_like(rows)
@@ -141,7 +142,7 @@ class HysteresisOperator(ABC):
 
         The arguments are those of `apply_by_group`. A single backlash has no such states.
         """
-        states = [self._inside(q[:1], 0.0)[:0]]
+        states = [self._inside(q[:1], None)[:0]]
         order = [np.arange(0)]
         for motion, steps in _motions(q, groups, time):
             states.append(self._inside(q[motion], steps))
@@ -152,7 +153,7 @@ class HysteresisOperator(ABC):
     def stages(self, n: int) -> list[Stage]:
         """Return the operator of n actuators as stages, for kernels."""
 
-    def _inside(self, q: NDArray, steps: ArrayLike) -> NDArray:
+    def _inside(self, q: NDArray, steps: NDArray | None) -> NDArray:
         """Return the inner states (T, R, n) of a motion, see `inner_states`."""
         return np.empty((len(q), 0, q.shape[1]))
 
@@ -166,7 +167,7 @@ class HysteresisOperator(ABC):
         motion: Any,
         name: str,
         state: Numbers | None,
-        dt: ArrayLike,
+        dt: ArrayLike | None,
         lead: bool = False,
     ) -> tuple[Any, Any]:
         """Return effective changes (or with `lead` commands), and the last state."""
@@ -177,6 +178,14 @@ class HysteresisOperator(ABC):
             raise ValueError(f"`{name}` must hold at least one actuator, got none.")
         if not np.isfinite(rows).all():
             raise ValueError(f"`{name}` must be finite, got NaN or infinity.")
+        if dt is None:
+            dt = 0.0
+            if self.creeps and (len(rows) > 1 or state is not None):
+                raise ValueError(
+                    "the times of the rows [s] must be given, as the actuators creep: `dt` or "
+                    "`time` of an operator, Commands(q, runs, time) of a model, --time of "
+                    "`hybridkin`."
+                )
         steps = _checked_steps(dt, len(rows))
         stages = self.stages(n)
         last = self._start(rows, name, state, stage_numbers(stages).n_rows)
@@ -205,17 +214,17 @@ class HysteresisOperator(ABC):
 
 def _motions(
     q: NDArray, groups: ArrayLike, time: ArrayLike | None
-) -> Iterator[tuple[NDArray, ArrayLike]]:
+) -> Iterator[tuple[NDArray, NDArray | None]]:
     """Yield the rows of each motion, and the time since the row before of each row [s]."""
     check_shape(q, "q", ("N", "n"))
     names = labels(groups, len(q))
     times = None if time is None else checked_times(time, names)
     for name in np.unique(names):
         rows = np.flatnonzero(names == name)
-        if times is None:
-            yield rows, 1.0
-        else:
-            yield rows, np.diff(times[rows], prepend=times[rows[:1]])
+        steps = None
+        if times is not None:
+            steps = np.diff(times[rows], prepend=times[rows[:1]])
+        yield rows, steps
 
 
 def checked_times(time: ArrayLike, names: NDArray) -> NDArray:

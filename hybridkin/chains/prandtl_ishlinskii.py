@@ -89,7 +89,7 @@ class PrandtlIshlinskiiOperator(HysteresisOperator):
         half = np.broadcast_to(0.5 * self.widths[:, None], slopes.shape)
         return [Stage(len(half), (half, slopes))]
 
-    def _inside(self, q: NDArray, steps: ArrayLike) -> NDArray:
+    def _inside(self, q: NDArray, steps: NDArray | None) -> NDArray:
         """Return the plays (T, K, n)."""
         plays = [PlayOperator(width).apply(q)[0] for width in self.widths]
         return np.stack(plays, axis=1)

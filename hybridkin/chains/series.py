@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from hybridkin.chains.hysteresis import HysteresisOperator
 from hybridkin.native.hysteresis import Stage
@@ -31,10 +31,10 @@ class HysteresisSeries(HysteresisOperator):
     >>> import numpy as np
     >>> from hybridkin import CreepOperator, HysteresisSeries, PlayOperator
     >>> hysteresis = HysteresisSeries([PlayOperator(0.5), CreepOperator([0.2], [10.0])])
-    >>> y, state = hysteresis.apply(np.array([[0.0], [1.0], [1.0]]))
+    >>> y, state = hysteresis.apply(np.array([[0.0], [1.0], [1.0]]), dt=1.0)
     >>> y.ravel().round(3)
     array([0.   , 0.614, 0.627])
-    >>> hysteresis.command(y)[0].ravel()
+    >>> hysteresis.command(y, dt=1.0)[0].ravel()
     array([0., 1., 1.])
     """
 
@@ -76,7 +76,7 @@ class HysteresisSeries(HysteresisOperator):
         """Return the stages of all operators."""
         return [stage for operator in self.operators for stage in operator.stages(n)]
 
-    def _inside(self, q: NDArray, steps: ArrayLike) -> NDArray:
+    def _inside(self, q: NDArray, steps: NDArray | None) -> NDArray:
         """Return the inner states (T, R, n) of all operators."""
         states = []
         for operator in self.operators:

@@ -73,6 +73,8 @@ def play_of(
 def choose_hysteresis(spec: Spec, rows: Rows) -> HysteresisOperator | None:
     """Return the hysteresis of least error on held-out motions; None if none helps.
 
+    Rows without times tell nothing of creep.
+
     Parameters
     ----------
     spec : Spec
@@ -100,7 +102,7 @@ def choose_hysteresis(spec: Spec, rows: Rows) -> HysteresisOperator | None:
             rows.counts,
             groups,
             rows.run_of_rows,
-            rows.times,
+            np.zeros(len(rows)) if rows.time is None else rows.time,
         )
     )
 
@@ -134,22 +136,22 @@ def continued(
     """Return the motion of the actuators (N, n), which go on from the past, and the new past."""
     moved = np.empty_like(rows.X)
     runs = rows.run_of_rows
-    times = rows.times
     for run in dict.fromkeys(runs.tolist()):
         rows_of_run = np.flatnonzero(runs == run)
-        first = times[rows_of_run[0]]
-        state = None
-        before = first - 1.0
-        if past is not None and past.run == run:
-            state = past.state
-            if rows.time is not None:
-                before = past.time
-        if before > first:
-            raise ValueError(
-                f"`time` must not decrease within a run, but {first:g} s follows {before:g} s; "
-                "give a new run another name."
-            )
-        steps = np.diff(times[rows_of_run], prepend=before)
+        last = past if past is not None and past.run == run else None
+        steps = None
+        end = 0.0
+        if rows.time is not None:
+            times = rows.time[rows_of_run]
+            before = times[0] if last is None else last.time
+            if before > times[0]:
+                raise ValueError(
+                    f"`time` must not decrease within a run, but {times[0]:g} s follows "
+                    f"{before:g} s; give a new run another name."
+                )
+            steps = np.diff(times, prepend=before)
+            end = float(times[-1])
+        state = None if last is None else last.state
         moved[rows_of_run], state = operator.apply(rows.X[rows_of_run], state, steps)
-        past = Past(run, float(times[rows_of_run[-1]]), state)
+        past = Past(run, end, state)
     return moved, past

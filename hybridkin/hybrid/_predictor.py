@@ -58,7 +58,6 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     radius_: Radius | None
     _learned: Learned
     _noise: float
-    _timed: bool | None  # whether the fit had times; None: not known, of an older file
     _fitted_rows: NDArray
     _single_output: bool
     _fitted_range: TrainingRange
@@ -188,15 +187,13 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Raises
         ------
         ValueError
-            If the actuators creep, the fit had times, and these rows have none.
+            If the actuators creep, and these rows have no times.
         """
         check_is_fitted(self, "module_")
         commands = Commands.of(X)
         rows = check_inputs(self, commands.q)
         if self.play_ is None or not len(rows):
             return rows
-        if len(rows) > 1:
-            self._check_times(commands.time is not None)
         return self.play_.apply_by_group(rows, commands.run_of_rows, commands.time)
 
     def error_weight(self, X: object) -> NDArray:
@@ -277,22 +274,6 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         states = self.play_.inner_states(rows, commands.run_of_rows, commands.time)
         seen = self._state_range.moved(-self.change_.shift)
         return seen.beyond(states).max(axis=(1, 2), initial=0.0) <= 0.0
-
-    def _check_times(self, timed: bool) -> None:
-        """Raise if creep counts seconds and rows have no times; warn the other way round."""
-        creeps = self.play_ is not None and self.play_.creeps
-        if not creeps or self._timed in (None, timed):
-            return
-        if self._timed:
-            raise ValueError(
-                "`X` must have times, as the actuators creep: Commands(q, runs, time), with "
-                "`time` in seconds as in the fit; for `hybridkin` name the column by --time."
-            )
-        message = (
-            "`X` has times, but the fit had none: its creep takes each row for one second. Fit to "
-            "rows with times, or leave them out."
-        )
-        warnings.warn(message, stacklevel=4)
 
     def _follow_robot(self) -> None:
         """Set the module and its mechanical model after the change and the drift of the robot."""

@@ -27,7 +27,7 @@ class Rows:
     groups: NDArray | None = None  # (N,), motion of every row; held out together
     # (N,), which rows follow each other in time without a break; None: those of a group
     runs: NDArray | None = None
-    time: NDArray | None = None  # (N,), [s]; None: one second from row to row of a run
+    time: NDArray | None = None  # (N,) [s]
     # (M,), the row here of each of the M given rows; -1: none
     place: NDArray | None = None
     # Shaped like y: measured minus mechanical model [m], in a fit
@@ -57,18 +57,6 @@ class Rows:
         if self.runs is not None:
             return self.runs
         return np.zeros(len(self)) if self.groups is None else self.groups
-
-    @property
-    def times(self) -> NDArray:
-        """The time of every row, (N,) [s]."""
-        if self.time is not None:
-            return self.time
-        times = np.empty(len(self))
-        names = self.run_of_rows
-        for name in np.unique(names):
-            run = names == name
-            times[run] = np.arange(run.sum())
-        return times
 
     @cached_property
     def directions(self) -> Directions:
@@ -109,8 +97,7 @@ class Rows:
 
     def in_runs(self) -> Self:
         """Return the rows in order of time, without those that repeat the row before."""
-        timed = replace(self, time=self.times)
-        return timed._merged(runs=True)
+        return self._merged(runs=True)
 
     def effective(self, operator: HysteresisOperator) -> Self:
         """Return the rows with what the actuators do in place of the commands."""

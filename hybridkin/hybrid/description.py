@@ -102,7 +102,6 @@ def stored_hybrid(model: HybridForwardModel) -> Stored:
         feature_names_in=vars(model).get("feature_names_in_", []),
         single_output=model._single_output,
         noise=model._noise,
-        timed=model._timed,
         learned=model._learned.kind,
         rejected=model._learned.rejected,
         held_out=model._learned.held_out,
@@ -197,9 +196,6 @@ def hybrid_of(stored: Stored, training: object) -> HybridForwardModel:
     model.calibration_ = model.radius_ = model._past = None
     model.candidates_ = None
     model.play_ = _play_of(stored, n)
-    model._timed = None
-    if "timed" in stored.settings:
-        model._timed = stored.value("timed", (bool, None))
     model._state_range = None
     if "state_range" in stored.arrays:
         states = stored.array("state_range", (2, "R", n))

@@ -54,11 +54,6 @@ from hybridkin.hybrid.held_out import MEAN_LENGTH, Predictions
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.hidden_layer import check_rows
 
-_NO_TIMES = (
-    "`X` has no times, but the actuators creep: a row counts as one second, also in trackers. Give "
-    "Commands(X, runs, time) with times in seconds."
-)
-
 
 class Start(NamedTuple):
     """Where the choices of a fit to a part of a log start: those of the fit to the whole log."""
@@ -266,8 +261,8 @@ class HybridForwardModel(HybridPredictor):
         ------
         ValueError
             For settings that are not allowed, shapes that do not fit the mechanical model, data
-            that are not finite or that a scaler has made unitless, and fewer than two different
-            rows to learn from (three with `coverage`).
+            that are not finite or that a scaler has made unitless, fewer than two different rows
+            to learn from (three with `coverage`), and creep without times.
 
         Warns
         -----
@@ -276,8 +271,8 @@ class HybridForwardModel(HybridPredictor):
             function of q; if tendons of a ConstantCurvatureChain contradict each other, as slack
             tendons do (`predict` and the Jacobians warn too); if no row moves along directions of X
             that move the tip, in which corrections are then constant; if numbers look like
-            millimetres; if there are too few groups for `coverage`; if the actuators creep
-            and the rows have no times; and the warnings of `calibrate`.
+            millimetres; if there are too few groups for `coverage`; and the warnings of
+            `calibrate`.
         """
         for message in self._fit(X, y, sample_weight, groups).messages:
             warnings.warn(message, stacklevel=2)
@@ -310,11 +305,8 @@ class HybridForwardModel(HybridPredictor):
         self.play_, of_play = play_of(self.play, spec, log.in_runs())
         messages += of_play
         self._past: Past | None = None
-        self._timed = log.time is not None
         self._state_range = None
         if self.play_ is not None:
-            if self.play_.creeps and not self._timed:
-                messages.append(_NO_TIMES)
             settings = replace(settings, commanded=rows.directions)
             spec = replace(spec, commanded=rows.directions)
             states = self.play_.inner_states(log.X, log.run_of_rows, log.time)
@@ -399,7 +391,6 @@ class HybridForwardModel(HybridPredictor):
             _check_positive("alpha", alpha, np.inf)
         rows = self._checked_rows(X, y, sample_weight, reset=False)
         if self.play_ is not None:
-            self._check_times(rows.time is not None)
             moved, self._past = continued(self.play_, rows, self._past)
             rows = replace(rows, X=moved)
         self._warn_of_units(rows)
@@ -476,7 +467,6 @@ class HybridForwardModel(HybridPredictor):
         rows = self._checked_rows(X, y, None, groups, reset=False)
         check_parameters(parameters, rows.tips.shape[1] % 3 == 0)
         if self.play_ is not None:
-            self._check_times(rows.time is not None)
             rows = rows.effective(self.play_)
         self._warn_of_units(rows)
         self.change_, message = likeliest_change(

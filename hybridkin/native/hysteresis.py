@@ -29,12 +29,14 @@ class Stage(NamedTuple):
 class Hysteresis(Protocol):
     """What the kernels and inverse kinematics need of an operator of hysteresis."""
 
-    def apply(self, q: Any, state: Any = None, dt: ArrayLike = 1.0) -> tuple[Any, Any]:
+    def apply(
+        self, q: Any, state: Any = None, dt: ArrayLike | None = None
+    ) -> tuple[Any, Any]:
         """Return the effective changes of commands (T, n), and the state at their end."""
         ...
 
     def command(
-        self, y: Any, state: Any = None, dt: ArrayLike = 1.0
+        self, y: Any, state: Any = None, dt: ArrayLike | None = None
     ) -> tuple[Any, Any]:
         """Return the commands of effective changes (T, n), and the state at their end."""
         ...

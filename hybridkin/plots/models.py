@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 from typing_extensions import Required
 
+from hybridkin._core.commands import Commands
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
 from hybridkin.plots._arrays import plain, positions, shaped
@@ -142,7 +143,8 @@ def _predicted_tips(model: Predictor, chain: Chain, q: NDArray) -> NDArray:
     """Return the tips (K, 3) that a hybrid of the chain predicts, of poses and markers too."""
     if not len(q):
         return np.empty((0, 3))
-    x = plain(model.predict(q), "x")
+    each_alone = Commands(q, np.arange(len(q)))  # no row is the past of another one
+    x = plain(model.predict(each_alone), "x")
     if chain.n_outputs == 3:
         return x[:, :3]
     return x[:, -3:]

@@ -34,6 +34,7 @@ LOG_SUFFIXES = (".csv", ".tsv", ".txt", ".npz", ".parquet", ".pq")
 
 _MODEL = "model.safetensors"
 _ROBOT = "robot.toml"
+_LONG = 1e9  # time after which all creep has come [s]
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,11 +126,11 @@ class LoadedModel:
     def commands(self, q: NDArray, time: NDArray | None = None) -> NDArray:
         """Return the commands (N, n) that move the actuators along q (N, n), row after row.
 
-        The times (N,) of the rows matter with creep [s].
+        The times (N,) of the rows matter with creep [s]; without them the robot rests at each row.
         """
         if self.play is None:
             return q
-        steps = 1.0 if time is None else np.diff(time, prepend=time[:1])
+        steps = _LONG if time is None else np.diff(time, prepend=time[:1])
         commands, _ = self.play.command(q, dt=steps)
         return commands
 

@@ -266,7 +266,9 @@ def _lead_in(track: Track, start: NDArray | None, domain: Domain) -> NDArray:
     end = track.effective[0]
     play = domain.loaded.play
     if play is not None:
-        end = play.command(np.stack([start, end]))[0][1].clip(*domain.of_commands)
+        # With creep only a start: the track then begins with the state after these commands.
+        led, _ = play.command(np.stack([start, end]), dt=1.0)
+        end = led[1].clip(*domain.of_commands)
     way = end - start
     dt = _period(track)
     speed = limits.dq_max

@@ -23,10 +23,10 @@ def log_of(operator, groups=8, rows=30, noise=1e-3):
     waves = np.stack([np.sin(turn), np.sin(2.0 * turn), np.cos(turn)])
     q = (rng.uniform(-1.0, 1.0, (groups, 3, 3)) @ waves).transpose(0, 2, 1).reshape(-1, 3)
     names = np.repeat(np.arange(groups), rows)
-    y = q if operator is None else operator.apply_by_group(q, names)
+    time = np.tile(np.arange(rows, dtype=float), groups)
+    y = q if operator is None else operator.apply_by_group(q, names, time)
     x = y @ M.T + noise * rng.standard_normal(q.shape)
     model = as_forward_model(lambda q: q @ torch.from_numpy(M.T))
-    time = np.tile(np.arange(rows, dtype=float), groups)
     return HysteresisLog(model, q, x, np.ones(len(q)), names, names, time)
 
 

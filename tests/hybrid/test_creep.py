@@ -197,27 +197,28 @@ def test_scikit_learn_splits_runs_and_times(as_frame):
     assert_allclose(results["test_score"], scores, rtol=1e-12)
 
 
-def test_a_model_knows_whether_its_fit_had_times(tmp_path):
+def test_a_model_of_creep_needs_times(tmp_path):
     q, x, groups, time = log(CREEP, 4, seed=0)
-    timed = HybridForwardModel(CHAIN, "linear", play=CREEP)
-    timed.fit(Commands(q, groups, time), x, groups=groups)
-    untimed = HybridForwardModel(CHAIN, "linear", play=CREEP)
-    with pytest.warns(UserWarning, match="`X` has no times, but the actuators creep"):
-        untimed.fit(q, x, groups=groups)
-    save_model(timed, tmp_path / "timed.safetensors")
-    for model in (timed, load_model(tmp_path / "timed.safetensors")):
-        with pytest.raises(ValueError, match=r"`X` must have times, .*in seconds"):
+    fitted = HybridForwardModel(CHAIN, "linear", play=CREEP)
+    with pytest.raises(ValueError, match=r"times .* must be given, .*Commands"):
+        fitted.fit(Commands(q, groups), x)
+    fitted.fit(Commands(q, groups, time), x, groups=groups)
+    save_model(fitted, tmp_path / "model.safetensors")
+    for model in (fitted, load_model(tmp_path / "model.safetensors")):
+        with pytest.raises(ValueError, match=r"times .* must be given, .*Commands"):
             model.predict(Commands(q, groups))
-        with pytest.raises(ValueError, match="`X` must have times"):
-            model.partial_fit(q[:1], x[:1])
-        with pytest.raises(ValueError, match="`X` must have times"):
+        with pytest.raises(ValueError, match=r"times .* must be given"):
+            model.partial_fit(q[:2], x[:2])
+        with pytest.raises(ValueError, match=r"times .* must be given"):
             model.adapt(q[:5], x[:5])
         assert model.predict(q[:1]).shape == (1, 3)  # one row needs no times
-    save_model(untimed, tmp_path / "untimed.safetensors")
-    for model in (untimed, load_model(tmp_path / "untimed.safetensors")):
-        with pytest.warns(UserWarning, match="the fit had none: its creep takes each row"):
-            timed_rows = model.predict(Commands(q, groups, np.tile(np.arange(40.0), 4)))
-        assert_allclose(timed_rows, model.predict(Commands(q, groups)), rtol=0, atol=1e-15)
+
+
+@pytest.mark.slow
+def test_creep_is_not_looked_for_without_times():
+    q, x, groups, _ = log(SLIDE, 10, seed=0)
+    model = HybridForwardModel(CHAIN, "linear", coupling="serial", play="auto")
+    assert not model.fit(Commands(q, groups), x, groups=groups).play_.creeps
 
 
 def test_partial_fits_go_on_within_a_run():

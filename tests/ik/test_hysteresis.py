@@ -196,11 +196,11 @@ def test_a_pause_with_creep_is_part_of_the_state(convert):
         tracker.step(convert(target))
     _, rested = operator.apply(tracker.q[None], tracker.state, dt=[1e5])
     moved = np.abs(
-        np.asarray(tracker.effective) - np.asarray(operator.apply(tracker.q[None], rested)[0])
+        np.asarray(tracker.effective) - np.asarray(operator.apply(tracker.q[None], rested, 0.0)[0])
     )
     tracker.reset(tracker.q, rested)
     np.testing.assert_allclose(
-        tracker.effective, operator.apply(tracker.q[None], rested)[0][0], rtol=0, atol=1e-14
+        tracker.effective, operator.apply(tracker.q[None], rested, 0.0)[0][0], rtol=0, atol=1e-14
     )
     assert moved.max() > 1e-4
     assert type(tracker.state) is type(tracker.q)

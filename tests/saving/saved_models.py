@@ -11,6 +11,7 @@ from sklearn.kernel_ridge import KernelRidge
 from sklearn.linear_model import LinearRegression
 
 from hybridkin import (
+    Commands,
     ConstantCurvatureChain,
     CreepOperator,
     ElasticTendonChain,
@@ -198,6 +199,8 @@ def predictions(model: Any, q: Any) -> dict[str, Any]:
         chain: Any = model
         x, J = (part.numpy() for part in chain.forward_and_jacobian(torch.from_numpy(q)))
         return {"x": x, "J": J}
+    if isinstance(model, HybridForwardModel) and model.play_ is not None:
+        q = Commands(q, time=np.arange(float(len(q))))
     x, J = model.predict_and_jacobian(q)
     said = {"x": x, "J": J}
     if isinstance(model, HybridForwardModel):

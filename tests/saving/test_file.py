@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from safetensors.numpy import load_file, save_file
 from saved_models import FOLDER, predictions, write_models
 
-from hybridkin import load_model
+from hybridkin import Commands, load_model
 from hybridkin.saving._file import VERSION, write
 from hybridkin.saving.header import model_header
 
@@ -69,7 +69,8 @@ def test_stored_hybrids_learn_on(path):
     model = load_model(path)
     wanted = said["x"] + 0.02
     before = np.abs(model.predict(q[:1]) - wanted[:1]).max()
-    model.partial_fit(np.repeat(q[:1], 30, 0), np.repeat(wanted[:1], 30, 0))
+    rows = Commands(np.repeat(q[:1], 30, 0), time=np.arange(30.0))
+    model.partial_fit(rows, np.repeat(wanted[:1], 30, 0))
     assert np.abs(model.predict(q[:1]) - wanted[:1]).max() < 0.3 * before
 
 
