@@ -243,7 +243,11 @@ class ELMRegressorCV(FittedNetwork):
 def growing_network(random_state=None):
     """Return the network of comparisons: 250 to 1000 neurons, input scales in three rounds."""
     return ELMRegressorCV(
-        250, relevance_rounds=3, max_hidden=1000, random_state=random_state
+        250,
+        weight_scales=(0.1, 0.4, 1.6),
+        relevance_rounds=3,
+        max_hidden=1000,
+        random_state=random_state,
     )
 
 
