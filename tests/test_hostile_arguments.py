@@ -258,7 +258,7 @@ ENTRIES = {
     "trajectories.line": (trajectories.line, {"start": X[0], "end": X[1], **AXES}),
     "trajectories.from_csv": (
         trajectories.from_csv,
-        {"path": POINTS, "dt": None, "unit": "m"},
+        {"path": POINTS, "dt": 0.05, "unit": "m"},
     ),
     "datasets.Log": (
         datasets.Log,
@@ -335,7 +335,6 @@ ENTRIES = {
         },
     ),
     "workflow.open_model": (workflow.open_model, {"path": SAVED, "robot": ROBOT}),
-    "workflow.read_path": (workflow.read_path, {"path": POINTS, "unit": "m", "dt": 0.05}),
     "workflow.scaled_path": (workflow.scaled_path, {"path": PATH, "scale": 0.5}),
     "workflow.path_limits": (
         workflow.path_limits,

@@ -451,7 +451,7 @@ def _path_of(arguments: argparse.Namespace, loaded: LoadedModel) -> Trajectory |
     if arguments.path is None:
         return None
     unit = arguments.unit or loaded.log_format().x_unit
-    return hybridkin.workflow.read_path(arguments.path, unit=unit, dt=arguments.dt)
+    return hybridkin.trajectories.from_csv(arguments.path, unit=unit, dt=arguments.dt)
 
 
 def _log_of(

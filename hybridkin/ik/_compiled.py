@@ -129,7 +129,7 @@ class Core:
     """
 
     def __init__(self, settings: StepSettings, models: list[Program]) -> None:
-        self.plan = Plan(settings.stored())
+        self.plan = Plan(settings.write_plan)
         self._made_of = (settings, models)
         self.n, self.m = self.plan.lengths(self.plan.root)
         self.width = math.prod(settings.task.shape)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import ClassVar, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import torch
@@ -32,7 +32,6 @@ from hybridkin._core.kernel_numbers import (
 )
 from hybridkin._core.model import Portable
 from hybridkin._core.plan import NoKernel, Plan
-from hybridkin._core.stored import Layout, Stored
 from hybridkin.ik._half_spaces import HalfSpaces
 from hybridkin.ik.tasks import PointsTask, PoseTask, PositionTask, Task, Tolerance
 from hybridkin.native.hysteresis import stage_numbers
@@ -44,7 +43,6 @@ Posture: TypeAlias = Callable[[Tensor], Tensor]
 _FAST = 5.0
 _TURN = 2.0 * math.pi
 _FULL = 0.999  # a range of this fraction of a turn counts as a whole turn
-_VECTORS = ("q_min", "q_max", "dq_max", "ddq_max", "posture")  # in the kernel's order
 PLANE_ROUNDS = 8  # of alternating projections onto a plane and a box
 
 
@@ -124,42 +122,6 @@ def _in_words(limits: Tensor) -> str:
     return " to ".join(dict.fromkeys(ends))
 
 
-def _write_plan(plan: Plan, stored: Stored) -> int:
-    """Write the node of a step: limits, posture and weights, rates, and the plane to keep to."""
-    model = plan.stack(stored.parts.values())
-    n = plan.lengths(model)[0]
-    scale = stored.array("scale")
-    m = len(scale)
-    plan.limit("rows of a task", m)
-    settings = stored.settings
-    vectors = [stored.array(name, [n], finite=False) for name in _VECTORS]
-    weights = stored.array("weights", [n])
-    pulls = stored.array("pulls", [n])
-    periods = stored.array("periods", [n], finite=False)
-    normals = stored.array("normals").T
-    spaces = stored.array("spaces")
-    plan.limit("actuators", spaces.shape[1])  # they share arrays of the kernels
-    if len(normals) > IK_NORMALS:
-        raise NoKernel(
-            f"the log leaves {len(normals)} directions of q out, more than {IK_NORMALS}"
-        )
-    gain = -1.0 if settings["gain"] is None else settings["gain"]
-    # Steps of more than a second end at the posture.
-    beta = 1.0 if settings["beta"] is None else settings["beta"]
-    damping = -1.0 if settings["damping"] == "adaptive" else settings["damping"]
-    rates = [gain, beta, settings["dt"], damping]
-    flags = IK_LIMITED * (settings["limits"] == "saturate")
-    flags |= IK_POSTURE * settings["has_posture"]
-    flags |= IK_WEIGHTS * bool((weights != 1.0).any())
-    flags |= IK_ACCELERATES * settings["accelerates"]
-    flags |= IK_PULLS * bool(pulls.any())
-    flags |= IK_POSE * settings["pose"]
-    numbers = [*vectors, weights**-0.5, rates, scale, periods, pulls]
-    numbers += [normals, spaces, stored.array("offsets"), stored.array("hysteresis")]
-    entries = [model, flags, len(normals), spaces.shape[1], *settings["stages"]]
-    return plan.node("ik", n, m, numbers, *entries)
-
-
 @dataclass(frozen=True)
 class StepSettings(Portable):
     """All inputs of a step except q and the target; see `InverseKinematics`.
@@ -170,8 +132,6 @@ class StepSettings(Portable):
     whole turn, else inf. `pulls` is that of the robot, see `ForwardModel`. `n_actuators` is None if
     neither settings nor model define it.
     """
-
-    layout: ClassVar[Layout] = Layout("inverse_kinematics", {}, write_plan=_write_plan)
 
     task: Task
     q_min: Tensor
@@ -331,13 +291,13 @@ class StepSettings(Portable):
         """Whether there is a preferred configuration."""
         return self.posture is not None and self.beta != 0.0
 
-    def stored(self) -> Stored:
-        """Return the description of the settings, with the model as their part.
+    def write_plan(self, plan: Plan) -> int:
+        """Write the node of a step into a plan, after its model, and return its place.
 
         Raises
         ------
         TypeError
-            If they could only be stored as code: a task of another class than those of
+            If it could only be stored as code: a task of another class than those of
             `hybridkin.tasks`, or a posture that is a function; or if n is not known.
         """
         n = self.n_actuators
@@ -349,45 +309,57 @@ class StepSettings(Portable):
             raise TypeError(
                 "the number of actuators is unknown; give one limit for each"
             )
-        # No posture, weights, plane or half-spaces are zeros, ones, and no rows.
-        arrays = {
-            "posture": np.zeros(n),
-            "weights": np.ones(n),
-            "normals": np.zeros((n, 0)),
-            "scale": np.repeat(self.task.units, self.task.parts),
-            "spaces": np.zeros((sum(self.task.parts), 0)),
-            "offsets": np.zeros(0),
-            "hysteresis": np.zeros(0),
-        }
+        model = plan.stack([model.stored() for model in self.task.steered])
+        scale = np.repeat(self.task.units, self.task.parts)
+        plan.limit("rows of a task", len(scale))
+
+        # Numbers of all actuators, in the kernel's order; no posture is zero, no weights are one.
+        posture = 0.0 if self.posture is None else self.posture
+        weights = np.ones(n)
+        if self.weights is not None:
+            weights = np.broadcast_to(as_array(self.weights), n)
+        vectors = [self.q_min, self.q_max, self.dq_max, self.ddq_max, posture]
+        numbers = [np.broadcast_to(as_array(vector), n) for vector in vectors]
+        numbers += [weights**-0.5, self._kernel_rates(), scale]
+        for vector in (self.periods, self.pulls):
+            numbers.append(np.broadcast_to(as_array(vector), n))
+
+        n_normals = 0
+        if self.plane is not None:
+            normals = as_array(self.plane[1]).T
+            n_normals = len(normals)
+            numbers.append(normals)
+        if n_normals > IK_NORMALS:
+            raise NoKernel(
+                f"the log leaves {n_normals} directions of q out, more than {IK_NORMALS}"
+            )
+        n_spaces = 0
+        if self.tip_limits is not None:
+            n_spaces = len(self.tip_limits.offsets)
+            plan.limit("actuators", n_spaces)  # they share arrays of the kernels
+            numbers += [as_array(part).T for part in self.tip_limits]
         stages = [0, 0]
         if self.task.hysteresis is not None:
             described = stage_numbers(self.task.hysteresis.stages(n))
             stages = described.code
-            arrays["hysteresis"] = described.numbers
-        for name in (*_VECTORS, "weights", "periods", "pulls"):
-            value = getattr(self, name)
-            if value is not None:
-                arrays[name] = np.broadcast_to(as_array(value), n)
-        if self.plane is not None:
-            arrays["normals"] = as_array(self.plane[1])
-        if self.tip_limits is not None:
-            arrays["spaces"] = as_array(self.tip_limits.normals).T
-            arrays["offsets"] = as_array(self.tip_limits.offsets)
-        models = {str(k): m.stored() for k, m in enumerate(self.task.steered)}
-        return Stored.of(
-            self.layout.kind,
-            arrays,
-            models,
-            beta=self.beta,
-            gain=self.gain,
-            damping=self.damping,
-            limits=self.limits,
-            dt=self.dt,
-            has_posture=self.has_posture,
-            accelerates=self.accelerates,
-            pose=self.task.has_rotation,
-            stages=stages,
-        )
+            numbers.append(described.numbers)
+
+        flags = IK_LIMITED * (self.limits == "saturate")
+        flags |= IK_POSTURE * self.has_posture
+        flags |= IK_WEIGHTS * bool((weights != 1.0).any())
+        flags |= IK_ACCELERATES * self.accelerates
+        flags |= IK_PULLS * bool(self.pulls.any())
+        flags |= IK_POSE * self.task.has_rotation
+        entries = [model, flags, n_normals, n_spaces, *stages]
+        return plan.node("ik", n, len(scale), numbers, *entries)
+
+    def _kernel_rates(self) -> list[float]:
+        """Return gain (negative: 1 / period), beta, period and damping (negative: adaptive)."""
+        gain = -1.0 if self.gain is None else self.gain
+        # Steps of more than a second end at the posture.
+        beta = 1.0 if self.beta is None else self.beta
+        damping = -1.0 if isinstance(self.damping, str) else self.damping
+        return [gain, beta, self.dt, damping]
 
     # The plane of q to keep to, where the log lies in one.
 

@@ -215,21 +215,6 @@ class Track(Generic[ArrayT]):
     limit_margin: ArrayT
 
     @property
-    def mean_error(self) -> float:
-        """Mean of `error` over all points where it is not NaN [m]."""
-        return float(np.nanmean(as_array(self.error)))
-
-    @property
-    def p95_error(self) -> float:
-        """Error that 95 % of the points do not exceed [m]."""
-        return float(np.nanquantile(as_array(self.error), 0.95))
-
-    @property
-    def max_error(self) -> float:
-        """Largest error [m]."""
-        return float(np.nanmax(as_array(self.error)))
-
-    @property
     def largest_step(self) -> float:
         """Largest change of one actuator from one point to the next, in the unit of q."""
         return float(np.abs(np.diff(as_array(self.q), axis=0)).max(initial=0.0))

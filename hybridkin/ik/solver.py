@@ -21,7 +21,6 @@ from hybridkin._core.arrays import (
     whole,
 )
 from hybridkin._core.html import html_table
-from hybridkin._core.stored import Stored
 from hybridkin.ik._compiled import Core, core_of
 from hybridkin.ik._gram import singular_values
 from hybridkin.ik._half_spaces import half_spaces
@@ -224,16 +223,6 @@ class InverseKinematics:
         for model in settings.task.models:
             rows[f"model: {type(model).__name__}"] = model.html_rows()
         return html_table(type(self).__name__, rows)
-
-    def stored(self) -> Stored:
-        """Return the description of the solver, with its model as a part, for kernels.
-
-        Raises
-        ------
-        TypeError
-            If it could only be stored as code, e.g. a posture that is a function.
-        """
-        return self.settings.stored()
 
     def step(
         self,

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from os import PathLike
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from hybridkin._core.arrays import as_path, one_of, real_array, shaped
 from hybridkin._core.units import METRES
@@ -269,16 +269,25 @@ def from_csv(
         A text file with comma-separated columns t, x, y, z, or x, y, z if `dt` is given. One line
         of names and lines that start with # are allowed.
     dt : float, optional
-        Time between rows [s], for files without a time column.
+        Time between points [s]; a file with times is interpolated linearly to this period.
     unit : {"m", "cm", "mm"}, default="m"
         Unit of the positions in the file. Times are seconds.
 
     Returns
     -------
     Trajectory
-        In metres and seconds, with the times of the file.
+        In metres and seconds.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ValueError
+        If the file has no times and `dt` is not given, or is not a table of numbers.
     """
     one_of(unit, "unit", METRES)
+    if dt is not None:
+        dt = _period(dt, "dt")
     path = as_path(path)
     if not path.is_file():
         raise FileNotFoundError(
@@ -295,12 +304,15 @@ def from_csv(
         raise ValueError(
             f"`path` must be a CSV file of points, {path} is not text."
         ) from error
-    if dt is None:
-        columns = 4
-        need = "t, x, y, z"
-    else:
+    columns = 4
+    need = "t, x, y, z"
+    if max(map(len, rows), default=0) == 3:
         columns = 3
-        need = "x, y, z, because `dt` is given"
+        need = "x, y, z"
+        if dt is None:
+            raise ValueError(
+                f"{path} has no times; give the time between its points (--dt 0.02)."
+            )
     named = bool(rows) and not re.match(
         r"[-+.\d]|nan|inf", rows[0][0].strip(), re.IGNORECASE
     )
@@ -313,11 +325,20 @@ def from_csv(
         raise ValueError(
             f"{path} must have rows of {columns} columns ({need}), got {table.shape}."
         )
+    x = METRES[unit] * table[:, -3:]
+    if dt is not None and columns == 3:
+        return Trajectory(dt * np.arange(len(table)), x)
+    timed = Trajectory(table[:, 0], x)
     if dt is None:
-        t = table[:, 0]
-    else:
-        t = _period(dt, "dt") * np.arange(len(table))
-    return Trajectory(t, METRES[unit] * table[:, -3:])
+        return timed
+    n_steps = int(periods(timed.duration, dt) + 1e-9)
+    return interpolated(timed, timed.t[0] + dt * np.arange(n_steps + 1))
+
+
+def interpolated(path: Trajectory, t: NDArray) -> Trajectory:
+    """Return the points of a path at other times (N,) [s], linear between its points."""
+    columns = [np.interp(t, path.t, column) for column in path.x.T]
+    return Trajectory(t, np.stack(columns, axis=1))
 
 
 def periods(duration: float, dt: float) -> float:

@@ -29,7 +29,6 @@ from hybridkin._core.kernel_numbers import (
 from hybridkin._core.model import ForwardModel, as_forward_model
 from hybridkin._core.plan import NoKernel, Plan
 from hybridkin._core.rotations import rotation
-from hybridkin._core.stored import Stored
 from hybridkin._core.version import __version__
 
 _FOLDER = Path(__file__).parent
@@ -95,6 +94,7 @@ class _Task(Protocol):
 class _Settings(Protocol):
     @property
     def task(self) -> _Task: ...
+    def write_plan(self, plan: Plan) -> int: ...
 
 
 class _Tracker(Protocol):
@@ -115,7 +115,6 @@ class _Controller(Protocol):
 
     @property
     def settings(self) -> _Settings: ...
-    def stored(self) -> Stored: ...
     def tracker(
         self, q0: NDArray | Tensor, *, memory: float | None = None
     ) -> _Tracker: ...
@@ -239,7 +238,10 @@ def c_project(
     else:
         modules = [as_forward_model(model)]
     try:
-        plan = Plan((controller or modules[0]).stored())
+        if controller:
+            plan = Plan(controller.settings.write_plan)
+        else:
+            plan = Plan(modules[0].stored())
         _check_stack(plan, dtype)
     except (NoKernel, TypeError) as error:
         way = "use it from Python, or a model and a task that have kernels"

@@ -60,7 +60,7 @@ def view(
         Measured rows to show, from `datasets.load_log` or `workflow.read_log`. A click on a row
         moves the robot there.
     path : Trajectory, optional
-        A path that a button starts, in a loop; from `workflow.read_path` or `trajectories`.
+        A path that a button starts, in a loop; from `trajectories`.
     q_min, q_max, dq_max, ddq_max : float or array-like of shape (n,), optional
         Limits of position, speed and acceleration [unit of q, s]. Default: those of the model and
         its description; else the range of the log, and one second for the whole range.

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from hybridkin.workflow.film import animate_track
     from hybridkin.workflow.fit import fit_log
     from hybridkin.workflow.fit_record import FitRecord
-    from hybridkin.workflow.path import read_path, scaled_path, shape_path
+    from hybridkin.workflow.path import scaled_path, shape_path
     from hybridkin.workflow.planning import next_rows
     from hybridkin.workflow.track import TrackRecord, track_path
     from hybridkin.workflow.verify import Verification, verify_track
@@ -43,7 +43,6 @@ __all__ = [
     "open_model",
     "path_limits",
     "read_log",
-    "read_path",
     "scaled_path",
     "shape_path",
     "track_path",
@@ -66,7 +65,6 @@ _NAMES_OF = {
     "fit": ("fit_log",),
     "fit_record": ("FitRecord",),
     "path": (
-        "read_path",
         "scaled_path",
         "shape_path",
     ),

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hybridkin._core.arrays import as_array, as_path, number, one_of, real_array
+from hybridkin._core.arrays import as_array, number, one_of, real_array
 from hybridkin.ik import trajectories
 from hybridkin.ik.trajectories import Trajectory
 from hybridkin.workflow.domain import Domain, PathLimits
@@ -24,66 +23,6 @@ _SHAPES = {
     "spiral": ("first radius", "last radius"),
     "line": ("x", "y", "z"),
 }
-
-
-def read_path(
-    path: str | Path, *, unit: str = "m", dt: float | None = None
-) -> Trajectory:
-    """Return a path from a CSV file of t, x, y, z or x, y, z.
-
-    Parameters
-    ----------
-    path : str or Path
-        The file; with three columns `dt` is required.
-    unit : {"m", "cm", "mm"}, default="m"
-        Unit of the positions.
-    dt : float, optional
-        Time between points [s]; a file with times is interpolated linearly to this period.
-
-    Returns
-    -------
-    Trajectory
-        Points [m] and times [s].
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If the file has no times and `dt` is not given, or is not a table of numbers.
-    """
-    file = as_path(path)
-    if dt is not None:
-        dt = number(dt, "dt")
-    if not file.is_file():
-        raise FileNotFoundError(
-            f"`path` must be a CSV file of points, there is none at {file}."
-        )
-    try:
-        lines = file.read_text(encoding="utf-8-sig").splitlines()
-    except UnicodeDecodeError as error:
-        raise ValueError(
-            f"`path` must be a CSV file of points, {file} is not text."
-        ) from error
-    rows = [line.split(",") for line in lines if line.strip() and line[0] != "#"]
-    if max(map(len, rows), default=0) == 3:
-        if dt is None:
-            raise ValueError(
-                f"{file} has no times; give the time between its points (--dt 0.02)."
-            )
-        return trajectories.from_csv(file, dt=dt, unit=unit)
-    timed = trajectories.from_csv(file, unit=unit)
-    if dt is None:
-        return timed
-    n_steps = int(trajectories.periods(timed.duration, dt) + 1e-9)
-    t = timed.t[0] + dt * np.arange(n_steps + 1)
-    return interpolated(timed, t)
-
-
-def interpolated(path: Trajectory, t: NDArray) -> Trajectory:
-    """Return the points of a path at other times (N,) [s], linear between its points."""
-    columns = [np.interp(t, path.t, column) for column in path.x.T]
-    return Trajectory(t, np.stack(columns, axis=1))
 
 
 def scaled_path(path: Trajectory, scale: float) -> Trajectory:

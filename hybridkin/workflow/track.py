@@ -25,7 +25,6 @@ from hybridkin.ik.trajectories import Trajectory
 from hybridkin.workflow.domain import Domain, PathLimits, path_limits
 from hybridkin.workflow.errors import Errors
 from hybridkin.workflow.model import LoadedModel, hysteresis_in_words, play_widths
-from hybridkin.workflow.path import interpolated
 from hybridkin.workflow.reach import better_place, check_reach
 from hybridkin.workflow.report import (
     Progress,
@@ -350,7 +349,9 @@ def best_track(
 def _in_steps(path: Trajectory, n: int) -> Trajectory:
     """Return the path with every segment between two points cut into n."""
     places = np.arange((len(path) - 1) * n + 1) / n
-    return interpolated(path, np.interp(places, np.arange(len(path)), path.t))
+    return trajectories.interpolated(
+        path, np.interp(places, np.arange(len(path)), path.t)
+    )
 
 
 def _thinned(track: Track, every: int) -> Track:

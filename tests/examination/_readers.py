@@ -17,7 +17,7 @@ from saved_models import FOLDER, predictions
 from hybridkin import RigidChain, load_model, robots
 from hybridkin.datasets import load_armlab, load_asl_trunk, load_log
 from hybridkin.ik import trajectories
-from hybridkin.workflow import open_model, read_path
+from hybridkin.workflow import open_model
 
 URDF = b"""<robot name="arm"><link name="base"/><link name="upper"/><link name="hand"/>
 <joint name="turn" type="revolute"><parent link="base"/><child link="upper"/>
@@ -88,8 +88,7 @@ def _read_log(path: Path, k: int) -> None:
 
 
 def _read_points(path: Path, k: int) -> None:
-    read = [trajectories.from_csv, read_path][k % 2]
-    path_read = read(path) if k % 3 else read(path, dt=0.02)
+    path_read = trajectories.from_csv(path, dt=None if k % 3 else 0.02)
     _finite("the path", path_read.x)
 
 

@@ -56,7 +56,7 @@ class Uses:
             "solve": ik.solve(target, now, max_iter=8, restarts=0).q,
             "track": ik.track(self.array(X[8:10]), q0=now).q,
             "tracker": ik.tracker(now).step(target),
-            "stored": Plan(ik.stored()).data,
+            "stored": Plan(ik.settings.write_plan).data,
         }
         self.tracker.reset(now)
         results["reset"] = self.tick()

@@ -215,8 +215,6 @@ def test_feedback_on_the_plant_removes_what_the_model_does_not_know():
     assert_close(torch.from_numpy(blind.x), CHAIN(torch.from_numpy(blind.q)))
     np.testing.assert_allclose(blind.error, np.linalg.norm(blind.x_measured - path, axis=1))
     np.testing.assert_allclose(blind.q, ik.track(path).q, atol=1e-14)
-    assert (seeing.mean_error, seeing.max_error) == (seeing.error.mean(), seeing.error.max())
-    assert 0.94 < (seeing.error <= seeing.p95_error).mean() < 0.96
     assert seeing.largest_step == np.abs(np.diff(seeing.q, axis=0)).max()
 
 
@@ -243,7 +241,7 @@ def test_a_failing_plant_loses_only_its_own_point():
         IKStatus.INVALID_INPUT if i == 3 else IKStatus.CONVERGED for i in range(10)
     ]
     assert np.isfinite(track.q).all()
-    assert np.isfinite(track.max_error)
+    assert np.isfinite(np.nanmax(track.error))
     assert seen == [(i, 10) for i in range(10)]
 
 

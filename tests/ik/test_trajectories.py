@@ -104,3 +104,9 @@ def test_csv_with_and_without_times(tmp_path):
     path = from_csv(file, dt=0.25)
     assert_array_equal(path.t, [0.0, 0.25])
     assert_array_equal(path.x, [[1, 2, 3], [4, 5, 6]])
+    with pytest.raises(ValueError, match="has no times; give the time between its points"):
+        from_csv(file)
+    file.write_text("0.0,1,2,3\n0.5,4,5,6\n")
+    path = from_csv(file, dt=0.25)
+    assert_array_equal(path.t, [0.0, 0.25, 0.5])
+    assert_array_equal(path.x[1], [2.5, 3.5, 4.5])

@@ -149,7 +149,7 @@ def test_what_has_no_kernel_runs_in_torch():
     for ik in others:
         assert ik.tracker(q).backend.startswith("torch: ")
         with pytest.raises((TypeError, NoKernel)):
-            Plan(ik.stored())
+            Plan(ik.settings.write_plan)
     single = InverseKinematics(BHA, **limits).tracker(q.astype(np.float32))
     assert single.backend == "torch: `q0` is no float64 array of NumPy"
 
