@@ -54,6 +54,9 @@ HK_FULL_LEVERAGE = 3.0  # the same for a leverage
 HK_LONGEST = 1.5  # bound of a correction, relative to the longest one of a training row
 HK_BOX_STEEPNESS = 100.0  # of the distance outside a box, per squared width of it
 
+HK_J, HK_DISTANCE = 1, 2  # asked for besides x
+HK_IF_SAME = 4  # only if what the plan was made of has not changed
+
 # A step of inverse kinematics.
 IK_LIMITED, IK_POSTURE, IK_WEIGHTS, IK_ACCELERATES, IK_PULLS = 1, 2, 4, 8, 16  # flags
 IK_POSE = 32  # the task is a pose, and not a vector of coordinates

@@ -5,9 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
+
+_FLOAT64 = np.dtype(np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,15 +32,23 @@ class PlausibleRows:
 
     def hold(self, q: NDArray) -> bool:
         """Return whether all rows of q (N, n) lie within the bounds."""
-        if self.hold_row(q):
-            return True
         with np.errstate(all="ignore"):  # numbers too large for float64 are outside
             largest = np.abs((q - self.rest) @ self.weights.T).max(initial=0.0)
         return bool(largest <= 1.0)
 
-    def hold_row(self, q: NDArray) -> bool:
-        """Return whether q (N, n) is one row of small numbers, so finite and within the bounds."""
-        return len(q) == 1 and math.hypot(*q[0].tolist()) <= self._small
+    def hold_row(self, q: object) -> TypeGuard[NDArray]:
+        """Return whether q is an array of one row (1, n) of small numbers, within the bounds."""
+        return (
+            type(q) is np.ndarray
+            and q.dtype == _FLOAT64
+            and q.shape == self._shape
+            and q.flags.c_contiguous
+            and math.hypot(*q.tolist()[0]) <= self._small
+        )
+
+    @cached_property
+    def _shape(self) -> tuple[int, int]:
+        return 1, len(self.rest)
 
     @cached_property
     def _small(self) -> float:

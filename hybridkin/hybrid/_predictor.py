@@ -6,7 +6,7 @@ import warnings
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, TypeGuard
+from typing import Any
 
 import numpy as np
 import torch
@@ -63,7 +63,10 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     _fitted_range: TrainingRange
     _state_range: TrainingRange | None  # of the states inside of the hysteresis
     _drift: Drift
-    _plausible_rows: PlausibleRows | None
+    _plausible_rows: PlausibleRows | None = None
+    _plain_rows: PlausibleRows | None = (
+        None  # which need no other check, nor hysteresis
+    )
 
     def predict(
         self,
@@ -287,8 +290,11 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             mechanical = self.change_.after(mechanical)
         self.mechanical_model_ = mechanical
         self._plausible_rows = None
+        self._plain_rows = None
         if self._chain is not None:
             self._plausible_rows = self._chain.plausible_rows()
+        if self.play_ is None and "feature_names_in_" not in vars(self):
+            self._plain_rows = self._plausible_rows
 
     def _tips(
         self, q: NDArray, enough: float = 0.0, **results: bool
@@ -312,20 +318,6 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             return (ways.numpy(),)
         return (after - before,)
 
-    def _is_plausible_row(self, X: object) -> TypeGuard[NDArray]:
-        """Return whether X is one row that needs no other check, and no change by hysteresis."""
-        plausible = self._plausible_rows
-        return (
-            type(X) is np.ndarray
-            and X.dtype == _FLOAT64
-            and X.shape == (1, self.n_features_in_)
-            and X.flags.c_contiguous
-            and plausible is not None
-            and plausible.hold_row(X)
-            and self.play_ is None
-            and "feature_names_in_" not in vars(self)
-        )
-
     def _evaluated(
         self,
         function: Callable[[NDArray], Sequence[NDArray]],
@@ -333,9 +325,8 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         warn: bool = True,
     ) -> list[NDArray]:
         """Return the results of a function of rows q for the rows of X, in the dtype of X."""
-        if "module_" not in vars(self):
-            check_is_fitted(self, "module_")
-        if self._is_plausible_row(X):
+        plain = self._plain_rows
+        if plain is not None and plain.hold_row(X):
             rows = X
             q = X
         else:

@@ -84,7 +84,7 @@ def _tips(model: ForwardModel) -> _Tips:
     program = Program(plan)
 
     def tips(z: Tensor) -> tuple[Tensor, Tensor]:
-        x, J, _ = program.evaluate(z.numpy(), jacobian=True)
+        x, J = program.evaluate(z.numpy(), jacobian=True)
         return torch.from_numpy(x), torch.from_numpy(J)
 
     return tips

@@ -174,6 +174,7 @@ def hybrid_of(stored: Stored, training: object) -> HybridForwardModel:
     model.error_model_ = None
     model._learned = _learned(stored)
     restore_columns(model, stored, n)
+    model.play_ = _play_of(stored, n)
     model._single_output = stored.value("single_output", bool)
     model.change_ = Change(stored.array("shift", (n,)), stored.array("motion", (4, 4)))
     center = stored.array("drift_center", (n,))
@@ -195,7 +196,6 @@ def hybrid_of(stored: Stored, training: object) -> HybridForwardModel:
     model._fitted_range = TrainingRange(*stored.array("training_range", (2, n)))
     model.calibration_ = model.radius_ = model._past = None
     model.candidates_ = None
-    model.play_ = _play_of(stored, n)
     model._state_range = None
     if "state_range" in stored.arrays:
         states = stored.array("state_range", (2, "R", n))

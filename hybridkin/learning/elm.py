@@ -116,7 +116,7 @@ class FittedNetwork(MultiOutputMixin, RegressorMixin, BaseEstimator):
         program = program_of(self.module_)
         if program is not None:
             X = check_inputs(self, X)
-            return self._shaped(X, program.evaluate(X, jacobian)[: 1 + jacobian])
+            return self._shaped(X, program.evaluate(X, jacobian))
         if jacobian:
             return self._map(X, ELM.forward_and_jacobian)
         return self._map(X, lambda elm, q: (elm(q),))

@@ -6,7 +6,7 @@ import ctypes
 import os
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
@@ -16,7 +16,14 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from hybridkin._core.kernel_numbers import ACTIVATIONS, HK_GROUP, checksum
+from hybridkin._core.kernel_numbers import (
+    ACTIVATIONS,
+    HK_DISTANCE,
+    HK_GROUP,
+    HK_IF_SAME,
+    HK_J,
+    checksum,
+)
 from hybridkin._core.model import ForwardModel, PortableModule
 from hybridkin._core.plan import NoKernel, Plan
 
@@ -26,9 +33,7 @@ _LEVELS = {"hk_v2": 2, "hk_v3": 3, "hk_v4": 4}  # smallest hk_level() of each
 _CHUNK = 20_000  # rows per task of a thread
 _BYTE = ctypes.c_char
 
-Results = tuple[
-    NDArray[np.float64], NDArray[np.float64] | None, NDArray[np.float64] | None
-]
+Results = tuple[NDArray[np.float64], ...]
 
 
 def library() -> ctypes.CDLL | None:
@@ -98,6 +103,13 @@ def _fault(opened: ctypes.CDLL) -> str:
         *results,
         ctypes.c_double,
     ]
+    opened.hk_changed.argtypes = [pointer, ctypes.c_int64]
+    opened.hk_evaluate_row.argtypes = [
+        pointer,
+        pointer,
+        ctypes.c_int32,
+        ctypes.c_double,
+    ]
     opened.hk_work.argtypes = [pointer, ctypes.c_int32]
     opened.hk_work.restype = ctypes.c_int64
     opened.hk_ik_tick.argtypes = [pointer]
@@ -122,12 +134,12 @@ def _is_right(opened: ctypes.CDLL) -> bool:
     beside = q[:, None, None] + 1e-5 * np.stack([np.eye(3), -np.eye(3)])
     for write, right in ((_two_halves, x), (_three_units, 1.0 / (1.0 + np.exp(-q)))):
         program = Program(Plan(write), opened)
-        x_beside, _, _ = program.evaluate(beside)
+        (x_beside,) = program.evaluate(beside)
         ahead, behind = x_beside.swapaxes(0, 1)
         slopes = np.swapaxes(ahead - behind, 1, 2) / 2e-5
         # All rows at once, then one by one.
         for rows in (slice(None), *range(len(q))):
-            y, J, _ = program.evaluate(q[rows], True)
+            y, J = program.evaluate(q[rows], True)
             value_error = np.abs(y - right[rows]).max()
             slope_error = np.abs(J - slopes[rows]).max()
             if not (value_error < 1e-12 and slope_error < 1e-8):
@@ -180,13 +192,38 @@ class Call:
         self.place = self._pointers.ctypes.data
 
 
+class Sources:
+    """Arrays that a plan was made of, to see whether they have changed since.
+
+    Parameters
+    ----------
+    arrays : list of (ndarray, ndarray)
+        Each with a copy of what it held.
+    """
+
+    def __init__(self, arrays: Sequence[tuple[NDArray, NDArray]] = ()) -> None:
+        self._arrays = arrays
+        table = [(a.ctypes.data, b.ctypes.data, a.nbytes) for a, b in arrays]
+        self._table = np.array(table, dtype=np.int64)  # of hk_source
+        self.pointers = self._table.ctypes.data, len(arrays)
+
+    def changed(self) -> bool:
+        """Return whether any of them holds other bytes."""
+        return opened_library().hk_changed(*self.pointers) > 0
+
+
+_NO_SOURCES = Sources()
+
+
 class ThreadCall(threading.local, Call):
     """A call that has memory of its own in every thread, also for the results of one row."""
 
-    def __init__(self, plan: Plan, opened: ctypes.CDLL) -> None:
-        super().__init__(plan, opened)
+    def __init__(
+        self, plan: Plan, opened: ctypes.CDLL, sources: Sources = _NO_SOURCES
+    ) -> None:
         self.results = np.empty(plan.n_outputs * (1 + plan.n_inputs) + 1)
-        self.at_results = address(self.results)
+        at_results = self.results.ctypes.data
+        super().__init__(plan, opened, at_results, *sources.pointers)  # hk_row
 
 
 class Program:
@@ -198,14 +235,23 @@ class Program:
         The model.
     opened : ctypes.CDLL, optional
         The library. Default: `library()`.
+    sources : Sources, optional
+        What the plan was made of, for HK_IF_SAME.
     """
 
-    def __init__(self, plan: Plan, opened: ctypes.CDLL | None = None) -> None:
+    def __init__(
+        self,
+        plan: Plan,
+        opened: ctypes.CDLL | None = None,
+        sources: Sources = _NO_SOURCES,
+    ) -> None:
         opened = opened or opened_library()
         self.plan = plan
         self._sizes = plan.n_inputs, plan.n_outputs
         self._evaluate = opened.hk_evaluate
-        self._call = ThreadCall(plan, opened)
+        self._evaluate_row = opened.hk_evaluate_row
+        self._sources = sources
+        self._call = ThreadCall(plan, opened, sources)
 
     def __reduce__(self) -> tuple[type[Program], tuple[Plan]]:
         return Program, (self.plan,)
@@ -217,7 +263,7 @@ class Program:
         distance: bool = False,
         enough: float = 0.0,
     ) -> Results:
-        """Return x (..., m), dx/dq (..., m, n) or None, and the domain distance (...) or None.
+        """Return those of x (..., m), dx/dq (..., m, n) and domain distance (...) asked for.
 
         More than 20,000 rows are shared among the threads that torch may use. The number of
         threads does not change the result.
@@ -236,34 +282,33 @@ class Program:
         lead = q.shape[:-1]
         n, m = self._sizes
         if q.size == n == q.shape[-1]:
-            return self._evaluate_row(q, jacobian, distance, enough)
+            asked = HK_J * jacobian + HK_DISTANCE * distance
+            results = self.row(np.asarray(q, np.float64), asked, enough)
+            assert results is not None
+            return results
         x = np.empty((*lead, m))
         J = np.empty((*lead, m, n)) if jacobian else None
         d = np.empty(lead) if distance else None
         self._fill(q, [(x, m), (J, m * n), (d, 1)], enough)
-        return x, J, d
+        return tuple([a for a in (x, J, d) if a is not None])
 
-    def _evaluate_row(
-        self, q: NDArray, jacobian: bool, distance: bool, enough: float
-    ) -> Results:
-        """Return the results of one row (..., n), quickly: they share an array."""
+    def row(self, q: NDArray, asked: int, enough: float) -> Results | None:
+        """Return the results of one row (..., n), quickly: they share an array.
+
+        None with HK_IF_SAME in what is asked for, if the sources have changed.
+        """
+        call = self._call
+        if self._evaluate_row(call.place, q.tobytes(), asked, enough):
+            return None
         lead = q.shape[:-1]
         n, m = self._sizes
-        end = m + m * n
-        call = self._call
-        at_x = call.at_results
-        at_J = at_x + 8 * m if jacobian else None
-        at_d = at_x + 8 * end if distance else None
-        row = np.asarray(q, np.float64).tobytes()
-        self._evaluate(call.place, row, 1, at_x, at_J, at_d, enough)
-        results = call.results.copy()
-        J = None
-        d = None
-        if jacobian:
-            J = results[m:end].reshape(*lead, m, n)
-        if distance:
-            d = results[end:].reshape(lead)
-        return results[:m].reshape(*lead, m), J, d
+        numbers = call.results.copy()
+        results = (numbers[:m].reshape(*lead, m),)
+        if asked & HK_J:
+            results += (numbers[m:-1].reshape(*lead, m, n),)
+        if asked & HK_DISTANCE:
+            results += (numbers[-1:].reshape(lead),)
+        return results
 
     def domain(
         self, q: NDArray, slope: bool = False, enough: float = 0.0
@@ -326,13 +371,11 @@ class _Compiled:
 
     def __init__(self, model: ForwardModel) -> None:
         self.program = None
+        self.row_shape = None
         self.reason = ""
         self.tensors = []
-        self.strided = []
-        self.views = []
-        self.content = []
-        self.shared_views = []
-        self.shared_content = []
+        self.sources = Sources()
+        self.shared = Sources()
         self.dicts = []
         self.settings = []
         modules = [*model.modules()]
@@ -353,27 +396,37 @@ class _Compiled:
                     "the compiled core needs tensors on the CPU, no inference tensors"
                 )
             self.tensors = tensors
-            self.views = [*map(_memory, tensors)]
-            self.content = [*map(bytearray, self.views)]
+            memory = [*map(_memory, tensors)]
+            copies = [a.copy() for a in memory]
             self._remember()
             plan = Plan(model.stored(), shares=True)
-            self._part_shared(plan)
-            self.program = Program(plan)
+            self._set_sources(plan, memory, copies)
+            self.program = Program(plan, sources=self.sources)
+            self.row_shape = (1, plan.n_inputs)
         except (ValueError, TypeError) as error:
             self.reason = str(error).split(";")[0]
 
-    def _part_shared(self, plan: Plan) -> None:
-        """Keep the bytes of the tensors that the plan shares apart from those of the others."""
-        shared = {array.ctypes.data for array in plan.shared.values()}
-        for k in reversed(range(len(self.tensors))):
-            if self.places[k] in shared:
-                self.shared_views.append(self.views.pop(k))
-                self.shared_content.append(self.content.pop(k))
+    def _set_sources(
+        self, plan: Plan, memory: list[NDArray], copies: list[NDArray]
+    ) -> None:
+        """Keep the tensors that the plan shares apart from the others."""
+        places = {array.ctypes.data for array in plan.shared.values()}
+        own = []
+        shared = []
+        for place, *arrays in zip(self.places, memory, copies, strict=True):
+            if place in places:
+                shared.append(arrays)
+            else:
+                own.append(arrays)
+        self.sources = Sources(own)
+        self.shared = Sources(shared)
 
     def _remember(self) -> None:
         """Remember the places of the tensors and the settings."""
         self.places = [*map(Tensor.data_ptr, self.tensors)]
-        self.strided = [a for a in self.tensors if _can_be_strided(a)]
+        movable = [a for a in self.tensors if _can_be_strided(a)]
+        self.contiguous = [a for a in movable if a.is_contiguous()]
+        self.strided = [a for a in movable if not a.is_contiguous()]
         self.strides = [*map(Tensor.stride, self.strided)]
         self.values = self._values()
 
@@ -381,12 +434,8 @@ class _Compiled:
         """Return the present values of the settings."""
         return [attributes.get(name) for attributes, name in self.settings]
 
-    def holds(self, copies: bool) -> bool:
-        """Return whether the model is still the same.
-
-        The program itself sees writes to the tensors that it shares. So they are only compared for
-        those who have copies of the plan.
-        """
+    def holds(self) -> bool:
+        """Return whether the model still has the same tensors, in the same places, and settings."""
         try:
             if self.dicts != self.parts:  # identity first; else tensors are compared
                 return False
@@ -394,17 +443,16 @@ class _Compiled:
             return False
         return (
             self.values == self._values()
-            and self.content == self.views
             and [*map(Tensor.data_ptr, self.tensors)] == self.places
+            and all(map(Tensor.is_contiguous, self.contiguous))
             and [*map(Tensor.stride, self.strided)] == self.strides
-            and not (copies and self.shared_content != self.shared_views)
         )
 
 
-def _memory(a: Tensor) -> memoryview:
+def _memory(a: Tensor) -> NDArray:
     """Return the memory that a tensor reads."""
     whole = torch.empty(0, dtype=a.dtype, device=a.device)
-    return whole.set_(a.untyped_storage()).numpy().data
+    return whole.set_(a.untyped_storage()).numpy()
 
 
 def _can_be_strided(a: Tensor) -> bool:
@@ -435,10 +483,15 @@ def program_of(model: ForwardModel, copies: bool = True) -> Program | None:
     The model keeps its program until a buffer or a submodule changes. Without `copies` of the plan,
     also while large buffers change that the program shares, which takes less time to find out.
     """
+    if library() is None:
+        return None
     compiled = model.__dict__.get("_program")
-    if compiled is None or not compiled.holds(copies):
-        if library() is None:
-            return None
+    if (
+        compiled is None
+        or not compiled.holds()
+        or compiled.sources.changed()
+        or (copies and compiled.shared.changed())
+    ):
         compiled = model.__dict__["_program"] = _Compiled(model)
     return compiled.program
 
@@ -484,12 +537,22 @@ def evaluate(
     ((2, 3), (2, 3, 3))
     """
     q = np.asarray(q, np.float64)
+    compiled = model.__dict__.get("_program")
+    if (
+        value
+        and compiled is not None
+        and q.shape == compiled.row_shape
+        and compiled.holds()
+    ):
+        asked = HK_IF_SAME + HK_J * jacobian + HK_DISTANCE * distance
+        results = compiled.program.row(q, asked, enough)
+        if results is not None:
+            return results
     program = program_of(model, copies=False)
     if program is not None:
         if not (value or jacobian):
             return (program.domain(q, enough=enough)[0],)
-        results = program.evaluate(q, jacobian, distance, enough)
-        return tuple([part for part in results if part is not None])
+        return program.evaluate(q, jacobian, distance, enough)
     rows = torch.from_numpy(np.require(q, requirements="W"))
     results = []
     with torch.no_grad():

@@ -54,9 +54,8 @@ def test_results_are_those_of_torch(lead):
     assert distance.shape == lead
     assert not distance.any()
     assert all(a.flags.c_contiguous and a.dtype == np.float64 for a in (x, J, distance))
-    x, J, distance = library.program_of(model).evaluate(q)
-    assert J is None
-    assert distance is None
+    (alone,) = library.program_of(model).evaluate(q)
+    assert_close(alone, x, rtol=0.0, atol=1e-15)
 
 
 @pytest.mark.needs_core
@@ -114,9 +113,9 @@ def test_wrong_numbers_are_refused(elsewhere, monkeypatch, kind):
     evaluate = library.Program.evaluate
 
     def wrong(self, q, *what):
-        x, J, distance = evaluate(self, q, *what)
-        x[..., 2] *= 1.0 + 1e-11 * (self.plan.kind(self.plan.root) == kind)
-        return x, J, distance
+        results = evaluate(self, q, *what)
+        results[0][..., 2] *= 1.0 + 1e-11 * (self.plan.kind(self.plan.root) == kind)
+        return results
 
     monkeypatch.setattr(library.Program, "evaluate", wrong)
     assert backend(chain()).endswith("computes wrong numbers")
@@ -139,6 +138,30 @@ def test_a_program_is_kept_until_the_model_changes():
         assert library.program_of(model) is program
         agree(program.evaluate(ROWS[:3], jacobian=True)[:2], by_torch(model, ROWS[:3]))
         first = program
+
+
+@pytest.mark.needs_core
+def test_single_rows_see_each_change():
+    """They are compared in the core; a row of another length is none for it."""
+    model, q = chain(), ROWS[:1]
+    library.evaluate(model, q)
+    for change in (
+        lambda: model.offsets.add_(0.01),
+        lambda: model.offsets.data.mul_(2.0),
+        lambda: model.base.numpy().__setitem__((0, 3), 0.02),
+        lambda: setattr(model.base, "data", model.base.data.clone()),
+        lambda: setattr(model.base, "data", model.base.data.flip(0)),
+        lambda: model.base.t_(),
+        lambda: setattr(model, "base", torch.diag(torch.tensor([1.0, -1, -1, 1])).double()),
+        lambda: model.load_state_dict(chain(base=torch.eye(4)).state_dict()),
+        lambda: model.load_state_dict(chain().state_dict(), assign=True),
+        lambda: model.float(),
+        lambda: model.double(),
+    ):
+        change()
+        agree(library.evaluate(model, q, jacobian=True), by_torch(model, q))
+    with pytest.raises(ValueError, match="must have shape"):
+        library.evaluate(model, q[:, :5])
 
 
 def compute(model):

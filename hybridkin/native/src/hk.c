@@ -1,5 +1,7 @@
 /* The compiled core: the kernels for one row and for blocks of rows, and what Python calls. */
 
+#include <string.h>
+
 #include "plan.h"
 
 #define HK_ROW_LANES /* one row of a network has lanes over the hidden units */
@@ -106,6 +108,40 @@ HK_API void hk_evaluate(const hk_call *call, const real *q, int64_t rows, real *
             hk_block(&plan, at, hkv_aligned(call->work), q + r * n,
                      (int)(rows - r < HK_LANES ? rows - r : HK_LANES), x ? x + r * m : NULL,
                      J ? J + r * m * n : NULL, distance ? distance + r : NULL);
+}
+
+/* Bytes that a plan was made of, and a copy of what they were then. */
+typedef struct {
+    const void *now, *then;
+    int64_t bytes;
+} hk_source;
+
+/* Whether any of them have changed. */
+HK_API int32_t hk_changed(const hk_source *source, int64_t count) {
+    for (; count > 0; count--, source++)
+        if (memcmp(source->now, source->then, (size_t)source->bytes)) return 1;
+    return 0;
+}
+
+/* What single rows are evaluated with; x (m), J (m, n) and the distance stand in `results`. */
+typedef struct {
+    hk_call call;
+    real *results;
+    const hk_source *sources;
+    int64_t count;
+} hk_row;
+
+/* A row q (n), see hk_evaluate; `asked` says what is computed. With HK_IF_SAME, nothing is where the
+   sources have changed, and 1 is returned. */
+HK_API int32_t hk_evaluate_row(const hk_row *row, const real *q, int32_t asked, real enough) {
+    if (asked & HK_IF_SAME && hk_changed(row->sources, row->count)) return 1;
+    const hk_call *call = &row->call;
+    const hk_plan plan = {call->code, call->data, enough};
+    const int at = (int)call->at, n = call->code[at + HK_N], m = call->code[at + HK_M];
+    real *x = row->results, *J = x + m, *distance = J + m * n;
+    hk_model(&plan, at, q, x, asked & HK_J ? J : NULL, asked & HK_DISTANCE ? distance : NULL,
+             call->work);
+    return 0;
 }
 
 /* Rows (rows, n) through hysteresis, see hysteresis.h: commands, or with `lead` what the actuators are
