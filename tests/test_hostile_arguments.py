@@ -287,8 +287,8 @@ ENTRIES = {
     ),
     "load_model": (load_model, {"path": SAVED, "device": None}),
     "plots.ErrorHistogramDisplay": (
-        lambda unit, bins, errors: drawn(plots.ErrorHistogramDisplay(errors), unit=unit, bins=bins),
-        {"errors": {"a": X[:, 0] ** 2}, "unit": "cm", "bins": 5},
+        lambda unit, errors: drawn(plots.ErrorHistogramDisplay(errors), unit=unit),
+        {"errors": {"a": X[:, 0] ** 2}, "unit": "cm"},
     ),
     "plots.TrackingDisplay": (
         lambda unit, plane, **k: drawn(plots.TrackingDisplay(**k), unit=unit, plane=plane),
@@ -699,7 +699,6 @@ META = ROWS.to("meta")
         ("x", lambda: calibrate(trunk(), Q, HUGE, ("radii",))),
         ("groups", lambda: calibrate(trunk(), Q, X, ("radii",), groups=NAN_GROUPS)),
         ("groups", lambda: choose_geometry(trunk(), Q, X, groups=GROUPS[:3])),
-        ("bins", lambda: plots.ErrorHistogramDisplay({"a": [0.1]}).plot(object(), bins=-1)),
         ("row", lambda: plots.WorkspaceDisplay(X, X, row=0.5)),
         ("names", lambda: plots.ActuatorDisplay({"a": Q}, [3], names=["a"])),
         ("limits", lambda: plots.ActuatorDisplay({"a": Q}, [3], limits=[1.0])),

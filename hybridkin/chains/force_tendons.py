@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from hybridkin._core.arrays import Numbers, Transform, identity, whole
 from hybridkin._core.stored import Layout, Restore, Stored
@@ -124,34 +124,6 @@ class _Shape:
         """The second derivative (N, 3 A, 3 A) of the energy by the arcs."""
         by_gravity = self.gravity.hessian().permute(2, 0, 1)
         return torch.diag(self.statics.stiffness) - by_gravity
-
-    def imbalance_change(self, change: _Statics, d_forces: Tensor) -> Tensor:
-        """Return the change (N, 3 A, P) of the imbalance at fixed arcs along P changes.
-
-        The changes of all entries, and of the forces (N, n, P), have P as the last axis. The work
-        of gravity is linear in weights, offsets and direction.
-        """
-        statics = self.statics
-        elastic = change.stiffness[..., None] * self.strain[:, None]
-        preload = statics.stiffness[:, None] * change.rest
-        tendons = torch.einsum("iap,ni->apn", change.readings, self.forces)
-        tendons = tendons + torch.einsum("ia,nip->apn", statics.readings, d_forces)
-
-        columns = self.arcs[:, None].expand(-1, change.weights.shape[1], -1)
-        segments = segments_of(columns, statics.offsets[:, None, None])
-        weights = statics.weights[:, None, None]
-        down = statics.down[:, None, None]
-        heavier = WorkOfGravity(segments, change.weights[..., None], down).gradient()
-        turned = WorkOfGravity(segments, weights, change.down[..., None]).gradient()
-        gravity = heavier + turned
-        if change.offsets.any():
-            longer = segments._replace(
-                offset=segments.offset + change.offsets[..., None]
-            )
-            gravity = gravity + WorkOfGravity(longer, weights, down).gradient()
-            gravity = gravity - WorkOfGravity(segments, weights, down).gradient()
-        total = elastic - preload[..., None] + tendons - gravity
-        return total.permute(2, 0, 1)
 
 
 class ForceTendonChain(ArcChain):
@@ -356,11 +328,6 @@ class ForceTendonChain(ArcChain):
         return "N" if (self.gains == 1.0).all() else "as in training"
 
     @property
-    def reach(self) -> Tensor:
-        """Length of the body without forces and weight, shape () [m]."""
-        return self.lengths.sum()
-
-    @property
     def rigid_length(self) -> Tensor:
         """Upper bound of the length of rigid offsets and of the way to a marker, shape () [m]."""
         return self.offsets.abs().sum() + self.marker_offsets.abs().sum()
@@ -394,10 +361,6 @@ class ForceTendonChain(ArcChain):
 
     def plausible_rows(self) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Return None: every force is plausible."""
-
-    def longest(self, largest: Tensor) -> float:
-        """Return infinity: a soft body can become longer under its weight."""
-        return torch.inf
 
     def backbone(self, q: Tensor, n_points: int = 20) -> Tensor:
         """Return points (..., S * n_points + 1, 3) along the robot, base to end [m]."""
@@ -463,39 +426,6 @@ class ForceTendonChain(ArcChain):
             down=base[:3, :3].mT @ down,
         )
 
-    def _statics_change(self, changes: Mapping[str, Tensor]) -> _Statics:
-        """Return the changes of `_statics` along P changes of the geometry, P as the last axis."""
-        k = self.arcs_per_segment
-        statics = self._statics()
-        outer = 1.0 - self._lost_radii(self.taper).flatten()[:, None]
-
-        def of_arcs(values: Tensor) -> Tensor:
-            return values.double().repeat_interleave(k, dim=-1).mT
-
-        wider = -self._lost_radii(changes["taper"]).flatten(1).mT / outer
-        longer = of_arcs(changes["lengths"] / self.lengths)
-        softer = of_arcs(changes["axial_stiffness"] / self.axial_stiffness)
-        axial = softer + 2.0 * wider - longer
-        softer = of_arcs(changes["bending_stiffness"] / self.bending_stiffness)
-        bending = softer + 4.0 * wider - longer
-        relative = torch.cat([axial, bending, bending])
-
-        weight = of_arcs(changes["weight"] * self.lengths) * outer**2 / k
-        rests = [changes["lengths"], *changes["rest_bends"].unbind(-1)]
-        bends = self._changes_of_bends(changes)
-        readings = nn.functional.pad(bends, (self.n_segments, 0))
-        offsets = torch.zeros_like(longer)
-        offsets[k - 1 :: k] = changes["offsets"].T
-        down = offsets.new_tensor(self.gravity)
-        return _Statics(
-            stiffness=statics.stiffness[:, None] * relative,
-            rest=torch.cat([of_arcs(part / k) for part in rests]),
-            readings=of_arcs(readings).permute(2, 1, 0),
-            weights=weight + statics.weights[:, None] * (2.0 * wider + longer),
-            offsets=offsets,
-            down=(down @ changes["base"][:, :3, :3].double()).T,
-        )
-
     def _arcs_of_rows(self, rows: Tensor) -> Tensor:
         return self._at_rest(rows.double()).to(rows)
 
@@ -520,12 +450,12 @@ class ForceTendonChain(ArcChain):
         """
         q = rows.double()
         arcs, compliance = self._shapes(q)
-        shape = _Shape(self._statics(), arcs, self.forces(q))
-        changes = self._all_changes(tangents)
-        pulled = (q * self.gains > 0.0) * q
-        d_forces = pulled[..., None] * changes["gains"].T
-        forcing = shape.imbalance_change(self._statics_change(changes), d_forces)
-        by_geometry = -compliance @ forcing
+
+        def imbalance(chain: ForceTendonChain) -> Tensor:
+            return _Shape(chain._statics(), arcs, chain.forces(q)).imbalance
+
+        forcing = self._slope_of(imbalance, tangents)  # (3 A, N, P)
+        by_geometry = -compliance @ forcing.permute(1, 0, 2)
 
         def change(by_arcs: Tensor) -> Tensor:
             return by_arcs @ by_geometry.to(by_arcs)

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from hybridkin.plots._canvas import COLORS
 from hybridkin.plots._scene import Line, Scene
 
-_FAR = 1.2  # from the eye to the middle, in longest sides of the scene
+# From the middle to the eye, in longest sides of the scene; as the axes of matplotlib at the start.
+_EYE = 1.2 * np.array([0.433, -0.75, 0.5])
 _WIDTH = 0.003  # of a line of width 1, in the same unit
 _DOT = 0.016  # size of a marker
 
@@ -22,7 +23,6 @@ _DOT = 0.016  # size of a marker
 def page(
     scene: Scene,
     fps: float,
-    view: tuple[float, float],
     progress: Callable[[int, int], None] | None,
 ) -> str:
     """Return the page as HTML that needs no other file."""
@@ -36,7 +36,7 @@ def page(
     with redirect_stdout(io.StringIO()):  # it prints, also if not verbose
         server = viser.ViserServer("127.0.0.1", 0, verbose=False)
     try:
-        return _recorded(server, scene, fps, view, progress)
+        return _recorded(server, scene, fps, progress)
     finally:
         with redirect_stdout(io.StringIO()):
             server.stop()
@@ -46,18 +46,14 @@ def _recorded(
     server: Any,
     scene: Scene,
     fps: float,
-    view: tuple[float, float],
     progress: Callable[[int, int], None] | None,
 ) -> str:
     """Draw all frames on a server that nobody looks at, and return what it recorded."""
     longest = float((scene.high - scene.low).max())
     middle = 0.5 * (scene.low + scene.high) / longest
-    elevation, azimuth = np.radians(view)
-    level = np.cos(elevation)
-    eye = [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)]
     server.scene.set_up_direction("+z")
     server.initial_camera.look_at = middle
-    server.initial_camera.position = middle + _FAR * np.array(eye)
+    server.initial_camera.position = middle + _EYE
     server.scene.add_frame("/base", axes_length=0.15, axes_radius=0.004)
     paths = [Line("path reached", scene.x[None], COLORS[0], 1.0)]
     if scene.target is not None:

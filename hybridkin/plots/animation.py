@@ -230,7 +230,6 @@ class TrackAnimation(Display):
         *,
         unit: str = "cm",
         speed: float = 1.0,
-        view: tuple[float, float] = (30.0, -60.0),
         dpi: float | None = None,
         progress: Callable[[int, int], None] | None = None,
     ) -> Path:
@@ -246,8 +245,6 @@ class TrackAnimation(Display):
             Of the axes and of the error.
         speed : float, default=1.0
             Speed of the film over that of the motion.
-        view : (float, float), default=(30.0, -60.0)
-            Elevation and azimuth of the view [deg]; of a page at the start.
         dpi : float, optional
             Pixels per inch of a film of 9 x 4.5 inches. Default: 160, of a gif 80.
         progress : callable, optional
@@ -278,12 +275,12 @@ class TrackAnimation(Display):
         scene = self._scene(unit)
         fps = speed * self.fps
         if kind == ".html":
-            text = page(scene, fps, view, progress)
+            text = page(scene, fps, progress)
             write_file(path, lambda staging: staging.write_text(text, encoding="utf-8"))
             return path
         writer = _writer(kind, fps)
         figure = Figure(figsize=_SIZE, layout="constrained")
-        stage = _stage(figure, scene, view)
+        stage = _stage(figure, scene)
         if dpi is None:
             dpi = _DPI[kind]
 
@@ -371,12 +368,11 @@ def _evenly(t: NDArray | None, n_rows: int, most: int) -> NDArray:
     return np.unique(np.rint(rows).astype(int))
 
 
-def _stage(figure: Figure, scene: Scene, view: tuple[float, float]) -> Stage:
+def _stage(figure: Figure, scene: Scene) -> Stage:
     """Return the robot on the left of a figure, and the error, if there is one, on the right."""
     grid = figure.add_gridspec(1, 2, width_ratios=(1.5, 1.0))
     place = grid[:] if scene.error is None else grid[0]
     space = figure.add_subplot(place, projection="3d")
-    space.view_init(*view)
     error_ax = None
     if scene.error is not None:
         error_ax = figure.add_subplot(grid[1])

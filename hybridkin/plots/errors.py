@@ -9,7 +9,6 @@ from matplotlib.axes import Axes
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Self
 
-from hybridkin._core.arrays import whole
 from hybridkin.plots._arrays import distance, named, plain, positions
 from hybridkin.plots._canvas import (
     Display,
@@ -18,6 +17,8 @@ from hybridkin.plots._canvas import (
     looks_of,
     scale_of,
 )
+
+_BINS = 40  # of a histogram, from zero to the largest error
 
 
 class _ErrorDisplay(Display):
@@ -97,7 +98,7 @@ class ErrorHistogramDisplay(_ErrorDisplay):
     'tip error [cm]'
     """
 
-    def plot(self, ax: Axes | None = None, *, unit: str = "cm", bins: int = 40) -> Self:
+    def plot(self, ax: Axes | None = None, *, unit: str = "cm") -> Self:
         """Draw the histograms, the mean of each model marked, and return self.
 
         Parameters
@@ -106,8 +107,6 @@ class ErrorHistogramDisplay(_ErrorDisplay):
             Default: those of a new figure of pyplot.
         unit : {"m", "cm", "mm"}, default="cm"
             Unit of the error.
-        bins : int, default=40
-            Bins from zero to the largest error.
 
         Returns
         -------
@@ -116,9 +115,8 @@ class ErrorHistogramDisplay(_ErrorDisplay):
         """
         finite = self._known(unit)
         ax = axes_or_new(ax)
-        bins = whole(bins, "bins", most=10_000)
         top = max(float(errors.max()) for errors in finite.values()) or 1e-3
-        edges = np.linspace(0.0, top, bins + 1).tolist()
+        edges = np.linspace(0.0, top, _BINS + 1).tolist()
         for look, (name, values) in zip(looks_of(finite), finite.items(), strict=True):
             color = look["color"]
             label = f"{name}: mean {values.mean():.2f}, max {values.max():.1f} {unit}"
