@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,10 +19,9 @@ def follow_in_numpy(
     parts = []
     first = 0
     for stage in stages:
-        part_of = _Plays.of if stage.size > 0 else _Creep.of
         last = first + abs(stage.size) + 1
-        inside = state[first + 1 : last]
-        parts.append(part_of(stage, state[first], inside, state[last]))
+        kind = _Plays if stage.size > 0 else _Creep
+        parts.append(kind(stage, state[first : last + 1]))
         first = last
     results = np.empty_like(rows)
     for t, row in enumerate(rows):
@@ -41,34 +38,25 @@ def follow_in_numpy(
     return results
 
 
-@dataclass(frozen=True)
 class _Part:
     """A stage, and views of the state: its command (n,), what is inside, and its result (n,)."""
 
-    command: NDArray
-    inside: NDArray
-    result: NDArray
+    def __init__(self, state: NDArray) -> None:
+        self.command = state[0]
+        self.inside = state[1:-1]
+        self.result = state[-1]
 
 
-@dataclass(frozen=True)
 class _Plays(_Part):
     """A sum of plays with half the widths, the slopes and the weights (K, n)."""
 
-    half: NDArray
-    slopes: NDArray
-    weights: NDArray
-
-    @classmethod
-    def of(
-        cls, stage: Stage, command: NDArray, inside: NDArray, result: NDArray
-    ) -> _Plays:
-        dtype = inside.dtype
-        most = np.finfo(dtype).max / 4  # wider ones never move a tendon
+    def __init__(self, stage: Stage, state: NDArray) -> None:
+        super().__init__(state)
+        most = np.finfo(state.dtype).max / 4  # wider ones never move a tendon
         half, slopes = stage.numbers
-        half = np.minimum(half, most).astype(dtype)
-        slopes = slopes.astype(dtype)
-        weights = np.diff(slopes, axis=0, prepend=0.0)
-        return cls(command, inside, result, half, slopes, weights.astype(dtype))
+        self.half = np.minimum(half, most).astype(state.dtype)
+        self.slopes = slopes.astype(state.dtype)
+        self.weights = np.diff(self.slopes, axis=0, prepend=0.0).astype(state.dtype)
 
     def follow(self, seconds: float) -> None:
         """Follow the command."""
@@ -104,19 +92,13 @@ class _Plays(_Part):
         self.inside[:] = np.clip(self.inside, low, command + self.half)
 
 
-@dataclass(frozen=True)
 class _Creep(_Part):
     """Creep with the gains (J, n) and the time constants (J,)."""
 
-    gains: NDArray
-    times: NDArray
-
-    @classmethod
-    def of(
-        cls, stage: Stage, command: NDArray, inside: NDArray, result: NDArray
-    ) -> _Creep:
-        gains, times = stage.numbers
-        return cls(command, inside, result, gains.astype(inside.dtype), times)
+    def __init__(self, stage: Stage, state: NDArray) -> None:
+        super().__init__(state)
+        gains, self.times = stage.numbers
+        self.gains = gains.astype(state.dtype)
 
     def follow(self, seconds: float) -> None:
         """Follow the command after some seconds."""

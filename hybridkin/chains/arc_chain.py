@@ -345,7 +345,8 @@ class ArcChain(MarkedChain):
         Tensor of shape (..., S + 1, 4, 4)
             Homogeneous transforms into the measuring frame; the last one is the robot's end.
         """
-        return self._poses(*self.arcs(q), self.arc_offsets, q)
+        after_arcs = self._poses(*self.arcs(q), self.arc_offsets, q)
+        return after_arcs[..., :: self.arcs_per_segment, :, :]
 
     def pose(self, q: Tensor) -> Tensor:
         """Return the tip's pose in the measuring frame, shape (..., 4, 4)."""
@@ -400,19 +401,13 @@ class ArcChain(MarkedChain):
             Positions in the measuring frame [m].
         """
         n_points = whole(n_points, "n_points", most=10**6)
-        length, bending = self.arcs(q)
-        poses = self._poses(length, bending, self.offsets)
-        # A part of an arc is an arc of that part of its length and of its bending.
-        part = torch.arange(1, n_points + 1, dtype=q.dtype, device=q.device) / n_points
-        lengths = part * length[..., None]
-        bendings = part[:, None] * bending[..., None, :]
-        steps = transforms(lengths, bendings, torch.zeros_like(part))
-        starts = poses[..., :-1, None, :, :]
-        points = (starts @ steps)[..., :3, 3]
-        ends = poses[..., 1:, :3, 3]  # after the offsets
-        points[..., -1, :] = ends
-        origin = poses[..., :1, :3, 3]
-        return torch.cat([origin, points.flatten(-3, -2)], dim=-2)
+        places = []
+        for segment in range(self.n_segments):
+            for point in range(1, n_points + 1):
+                places.append((segment + point / n_points, 0.0, 0.0, 0.0))
+        points = self._marked(places)(q).unflatten(-1, (-1, 3))
+        start = self.base[:3, 3].to(points).expand(*q.shape[:-1], 1, 3)
+        return torch.cat([start, points], dim=-2)
 
     def extra_repr(self) -> str:
         """Return the summary shown by repr()."""
@@ -556,14 +551,14 @@ class ArcChain(MarkedChain):
         return parts[..., 0], parts[..., 1:]
 
     def _poses(
-        self, length: Tensor, bending: Tensor, offsets: Tensor, q: Tensor | None = None
+        self, length: Tensor, bending: Tensor, offsets: Tensor, q: Tensor
     ) -> Tensor:
-        """Return the poses of the base and after all arcs; with q, turned by the stage."""
+        """Return the poses of the base and after all arcs, turned by the stage."""
         steps = transforms(length, bending, offsets.to(length))
         base = self.base.to(length).expand(*length.shape[:-1], 4, 4)
         frames = itertools.accumulate(steps.unbind(-3), torch.matmul, initial=base)
         poses = torch.stack([*frames], dim=-3)
-        if self.stage is None or q is None:
+        if self.stage is None:
             return poses
         return rolled(poses, self.metres(q)[..., :1])
 

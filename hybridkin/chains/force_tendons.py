@@ -362,22 +362,6 @@ class ForceTendonChain(ArcChain):
     def plausible_rows(self) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Return None: every force is plausible."""
 
-    def backbone(self, q: Tensor, n_points: int = 20) -> Tensor:
-        """Return points (..., S * n_points + 1, 3) along the robot, base to end [m]."""
-        n_points = whole(n_points, "n_points", most=10**6)
-        places = []
-        for segment in range(self.n_segments):
-            for point in range(1, n_points + 1):
-                places.append((segment + point / n_points, 0.0, 0.0, 0.0))
-        points = self._marked(places)(q).unflatten(-1, (-1, 3))
-        start = self.base[:3, 3].to(points).expand(*q.shape[:-1], 1, 3)
-        return torch.cat([start, points], dim=-2)
-
-    def poses(self, q: Tensor) -> Tensor:
-        """Return the poses (..., S + 1, 4, 4) of the base and of the ends of all segments."""
-        after_arcs = self._poses(*self.arcs(q), self.arc_offsets, q)
-        return after_arcs[..., :: self.arcs_per_segment, :, :]
-
     def _set_markers(self, markers: Sequence[Marker]) -> None:
         super()._set_markers(markers)
         offsets = [offset for _, *offset in self.markers]

@@ -188,14 +188,7 @@ def _next(command: argparse.ArgumentParser) -> None:
         metavar="LOG",
         help="log of what is measured so far",
     )
-    add(
-        "--path",
-        type=Path,
-        metavar="PATH.csv",
-        help="where the error matters (everywhere)",
-    )
-    add("--dt", type=positive, metavar="S", help="time between points of the path [s]")
-    add("--unit", choices=METRES, help="unit of the path (that of x in the log)")
+    _add_path(command, "where the error matters (everywhere)")
     _add_limits(command)
     _add_log(command)
 
@@ -336,9 +329,7 @@ def _view(command: argparse.ArgumentParser) -> None:
     add = command.add_argument
     _add_model(command)
     add("log", type=Path, nargs="?", metavar="LOG", help="measured rows to show")
-    add("--path", type=Path, metavar="CSV", help="path of the tip to follow in a loop")
-    add("--dt", type=positive, metavar="S", help="time between points of the path [s]")
-    add("--unit", choices=METRES, help="unit of the path (that of x in the log)")
+    _add_path(command, "path of the tip to follow in a loop")
     add(
         "--host",
         default="127.0.0.1",
@@ -553,6 +544,13 @@ def _describe(command: argparse.ArgumentParser) -> None:
         command, "log", "MODEL|ROBOT.toml|LOG", "model, robot description or log"
     )
     _add_log(command)
+
+
+def _add_path(command: argparse.ArgumentParser, text: str) -> None:
+    add = command.add_argument
+    add("--path", type=Path, metavar="PATH.csv", help=text)
+    add("--dt", type=positive, metavar="S", help="time between points of the path [s]")
+    add("--unit", choices=METRES, help="unit of the path (that of x in the log)")
 
 
 def _add_limits(command: argparse.ArgumentParser) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import difflib
+import itertools
 import os
 import re
 import warnings
@@ -324,22 +325,12 @@ def _read(path: Path, delimiter: str | None) -> _Table:
     return _read_text(path, delimiter)
 
 
-@dataclass(frozen=True)
-class _Cells:
-    """The columns of a text, with empty cells if rows are short; made on access."""
-
-    by_row: Sequence[list[str]]
-
-    def __getitem__(self, i: int) -> list[str]:
-        return [row[i] if i < len(row) else "" for row in self.by_row]
-
-
 class _Table(NamedTuple):
     """The unconverted columns of a file; for text also the line of every row."""
 
     path: Path
     header: list[str]
-    columns: Sequence[NDArray | Sequence[str]] | _Cells
+    columns: Sequence[NDArray | Sequence[str]]
     lines: NDArray | None = None
 
     def names(self, argument: str, names: Sequence[str]) -> list[str]:
@@ -484,9 +475,10 @@ def _read_text(path: Path, delimiter: str | None) -> _Table:
                 f'A quote (") in line {line - n_lines} of {str(path)!r} hides rows up to line '
                 f"{line}; close or remove it."
             )
-    header = [name.strip() for name in rows[0][1]]
-    lines = np.array([line for line, _ in rows[1:]], dtype=int)
-    return _Table(path, header, _Cells([row for _, row in rows[1:]]), lines)
+    lines, cells = zip(*rows, strict=True)
+    header = [name.strip() for name in cells[0]]
+    columns = [column[1:] for column in itertools.zip_longest(*cells, fillvalue="")]
+    return _Table(path, header, columns, np.array(lines[1:], dtype=int))
 
 
 def _read_npz(path: Path) -> _Table:

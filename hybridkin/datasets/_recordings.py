@@ -133,8 +133,8 @@ def load_armlab(data_home: str | os.PathLike[str] | None = None) -> Bunch:
     FileNotFoundError
         If the file does not exist; the message names its source.
     """
-    path = _path(data_home, "armlab_3cable", "armlab_3cable.npz")
-    file = _arrays(path, {"cable_shortening_mm": (3,), "tip_mm": (3,), "row": ()})
+    shapes = {"cable_shortening_mm": (3,), "tip_mm": (3,), "row": ()}
+    file = _arrays(data_home, "armlab_3cable", shapes)
     # Commands are multiples of 0.1 mm, stored in single precision.
     tenths = np.rint(file["cable_shortening_mm"].astype(float) * 10).astype(int)
     return _recording(
@@ -171,9 +171,8 @@ def load_asl_trunk(data_home: str | os.PathLike[str] | None = None) -> Bunch:
     FileNotFoundError
         If the file does not exist; the message names its source.
     """
-    path = _path(data_home, "asl_trunk_static", "asl_trunk_static.npz")
     shapes = {"u": (6,), "disk_pos_m": (3, 3), "run_id": (), "kind": ()}
-    file = _arrays(path, shapes)
+    file = _arrays(data_home, "asl_trunk_static", shapes)
     disks = file["disk_pos_m"]
     return _recording(
         load_asl_trunk,
@@ -213,7 +212,6 @@ def load_asu_bellows(data_home: str | os.PathLike[str] | None = None) -> Bunch:
     FileNotFoundError
         If the file does not exist; the message names its source.
     """
-    path = _path(data_home, "asu_bellows", "asu_bellows.npz")
     shapes = {
         "pressure_pa": (6,),
         "pressure_command_pa": (6,),
@@ -222,7 +220,7 @@ def load_asu_bellows(data_home: str | os.PathLike[str] | None = None) -> Bunch:
         "run_id": (),
         "t": (),
     }
-    file = _arrays(path, shapes)
+    file = _arrays(data_home, "asu_bellows", shapes)
     return _recording(
         load_asu_bellows,
         "asu_bellows",
@@ -262,8 +260,8 @@ def load_soromox_tentacle(data_home: str | os.PathLike[str] | None = None) -> Bu
     FileNotFoundError
         If the file does not exist; the message names its source.
     """
-    path = _path(data_home, "soromox_tentacle", "soromox_tentacle.npz")
-    file = _arrays(path, {"force_n": (2,), "marker_m": (4, 3)})
+    shapes = {"force_n": (2,), "marker_m": (4, 3)}
+    file = _arrays(data_home, "soromox_tentacle", shapes)
     markers = file["marker_m"].astype(float)
     return _recording(
         load_soromox_tentacle,
@@ -275,8 +273,13 @@ def load_soromox_tentacle(data_home: str | os.PathLike[str] | None = None) -> Bu
     )
 
 
-def _arrays(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, NDArray]:
+def _arrays(
+    data_home: str | os.PathLike[str] | None,
+    folder: str,
+    shapes: Mapping[str, tuple[int, ...]],
+) -> dict[str, NDArray]:
     """Return the arrays of a recording; raise if the rows of some do not have these shapes."""
+    path = _path(data_home, folder, f"{folder}.npz")
     file = arrays_of(path)
     n_rows = len(next(iter(file.values()), ()))
     for name, shape in shapes.items():

@@ -11,18 +11,6 @@ from torch import Tensor
 from hybridkin._core.kernel_numbers import IK_HEALTHY
 
 
-class SingularValues(NamedTuple):
-    """The smallest and the largest singular value of a Jacobian, each of shape (...,)."""
-
-    sigma_min: Tensor
-    sigma_max: Tensor
-
-    @property
-    def is_singular(self) -> Tensor:
-        """Whether a direction is (nearly) lost, shape (...), bool."""
-        return self.sigma_min < IK_HEALTHY * self.sigma_max
-
-
 class RowGram(NamedTuple):
     """G = J J^T of a Jacobian in parts, and the singular values of J.
 
@@ -35,13 +23,10 @@ class RowGram(NamedTuple):
     sigma_min: Tensor
     sigma_max: Tensor
 
-
-def singular_values(J: Tensor) -> SingularValues:
-    """Return the smallest and the largest singular value of J (..., m, n), as `row_gram`."""
-    if J.shape[-2] != 3:
-        squares = torch.linalg.eigvalsh(_finite_gram(J))
-        return SingularValues(*_roots(squares[..., 0], squares[..., -1]))
-    return SingularValues(*_roots(*_extreme_eigenvalues(*_entries_3x3(J))))
+    @property
+    def is_singular(self) -> Tensor:
+        """Whether a direction is (nearly) lost, shape (...), bool."""
+        return self.sigma_min < IK_HEALTHY * self.sigma_max
 
 
 def row_gram(J: Tensor) -> RowGram:

@@ -19,7 +19,7 @@ from hybridkin._core.kernel_numbers import (
     IK_SLOW_STEPS,
     IK_STATIONARY,
 )
-from hybridkin.ik._gram import apply_columns, apply_rows, singular_values
+from hybridkin.ik._gram import apply_columns, apply_rows, row_gram
 from hybridkin.ik._settings import Bounds, StepSettings
 from hybridkin.ik._starts import even_starts, nearest_starts
 from hybridkin.ik._step import limited_step, null_step
@@ -111,7 +111,7 @@ class Search:
             q = self._beside_singular_start(q, target)
         best = self._attempt(q, target)
         missed = (~best.reached).nonzero()[:, 0]
-        rows = missed[singular_values(best.J[missed]).is_singular]
+        rows = missed[row_gram(best.J[missed]).is_singular]
         nudged = self._nudged(best)[rows]
         self._try_again(best, rows, nudged[:, None])
         if restarts > 0:
@@ -128,7 +128,7 @@ class Search:
         At a straight backbone, motions that cancel to first order would be missed.
         """
         _, J = self.settings.evaluate(q[:1])
-        if not singular_values(J).is_singular.all():
+        if not row_gram(J).is_singular.all():
             return q
         at_start = self._start(q, target)
         stay = at_start.reached | ~torch.isfinite(at_start.error)

@@ -22,7 +22,7 @@ from hybridkin._core.arrays import (
 )
 from hybridkin._core.html import html_table
 from hybridkin.ik._compiled import Core, core_of
-from hybridkin.ik._gram import singular_values
+from hybridkin.ik._gram import row_gram
 from hybridkin.ik._half_spaces import half_spaces
 from hybridkin.ik._implicit import differentiable as with_derivatives
 from hybridkin.ik._search import Search
@@ -429,7 +429,7 @@ class InverseKinematics:
         x, J = settings.evaluate(q_plain)
         e = task.difference(x, target)
         error = e.norm(dim=-1)
-        singular = singular_values(J)
+        singular = row_gram(J)
         reached = task.reached(e, tolerance)
         status = statuses(
             task, q_plain, error, reached, solution.held, singular.is_singular

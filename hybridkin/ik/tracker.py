@@ -17,7 +17,7 @@ from torch import Tensor
 from hybridkin._core.arrays import as_array, as_tensor, is_numpy, number
 from hybridkin._core.model import Portable
 from hybridkin.ik._compiled import Follower, Tick, core_of, why_torch
-from hybridkin.ik._gram import singular_values
+from hybridkin.ik._gram import row_gram
 from hybridkin.ik._hysteresis import Lead
 from hybridkin.ik._settings import Array, StepSettings, require
 from hybridkin.ik._step import StepRows, control_step
@@ -321,7 +321,7 @@ class Tracker(Portable):
             held = tick.step.saturated.any(-1) | tick.step.stopped
             damped = tick.step.damping > 0.0
         *states, J, held, damped = map(torch.cat, zip(*rows, strict=True))
-        return [*states, singular_values(J).sigma_min, held, damped]
+        return [*states, row_gram(J).sigma_min, held, damped]
 
     def _measured(self, plant: Plant, i: int) -> Tensor:
         """Return the plant's tip (1, ...), NaN if the plant raises.

@@ -14,6 +14,7 @@ from torch.testing import assert_close
 from hybridkin import ConstantCurvatureChain, ElasticTendonChain
 from hybridkin._core.model import reverse_jacobian
 from hybridkin._core.stumpff import next_stumpff, stumpff
+from hybridkin.chains._arcs import transforms
 
 RADII = [0.100, 0.093, 0.079]
 THREE = 2 * math.pi / 3 * torch.arange(3, dtype=torch.float64)
@@ -395,9 +396,13 @@ def test_another_tip_lies_on_the_backbone(name, at, rng):
         expected = whole.poses(q)[:, int(at)]
         assert_close(x, expected[:, :3, 3], rtol=0, atol=2e-15)
     else:
-        # The first n - 1 of n points of a segment lie on its arc.
-        points = whole.backbone(q, n_points=20)
-        assert_close(x, points[:, round(20 * at)], rtol=0, atol=2e-15)
+        # A part of an arc is an arc of that part of its length and of its bending.
+        k, part = int(at), at - int(at)
+        length, bending = whole.arcs(q)
+        step = transforms(part * length[:, k], part * bending[:, k], torch.zeros(4).double())
+        expected = (whole.poses(q)[:, k] @ step)[:, :3, 3]
+        assert_close(x, expected, rtol=0, atol=2e-15)
+        assert_close(whole.backbone(q, 20)[:, round(20 * at)], x, rtol=0, atol=2e-15)
     _, J_reverse = reverse_jacobian(chain.forward, q)
     assert_close(J, J_reverse, rtol=1e-13, atol=1e-13 * float(J.abs().max()))
     J_pose = chain.pose_jacobian(q)
