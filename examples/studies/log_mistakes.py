@@ -39,7 +39,8 @@ from sklearn.linear_model import LinearRegression
 
 from hybridkin import ConstantCurvatureChain, ElasticTendonChain, HybridForwardModel
 from hybridkin.datasets import Log, check_log
-from hybridkin.hybrid.estimator import fit_quietly
+from hybridkin.hybrid.estimator import prepared
+from hybridkin.hybrid.log_fit import fit_to_log
 from hybridkin.workflow.report import Report
 
 N_MOTIONS, N_ROWS = 12, 16  # of the fitted log
@@ -490,12 +491,11 @@ def examined(case: Case, fit: bool | None = None) -> Outcome:
     # What data decide at once; lengths and stiffnesses stay nominal, as many users leave them.
     names = ("radii", "base") if case.base_is_free else ("radii",)
     model = HybridForwardModel(case.chain, LinearRegression(), calibrate=names)
-    messages = fit_quietly(
-        model, case.log.q, case.log.x, groups=case.log.groups
-    ).messages
+    fitted = fit_to_log(*prepared(model, case.log.q, case.log.x, case.log.groups))
+    messages = fitted.messages
     kinds += ("calibration",) * bool(messages)
     with torch.no_grad():
-        tips = model.module_(torch.from_numpy(case.test.q)).numpy()
+        tips = fitted.hybrid.module(torch.from_numpy(case.test.q)).numpy()
     error = float(np.linalg.norm(tips - case.test.x, axis=1).mean())
     return Outcome(kinds, " ".join([advice, *messages]), error)
 

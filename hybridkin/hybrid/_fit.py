@@ -15,7 +15,7 @@ from hybridkin.calibration.choice import unmoved
 from hybridkin.calibration.measured import points
 from hybridkin.chains.chain import Chain
 from hybridkin.hybrid._guards import GroupDistance, Plane, fit_guard
-from hybridkin.hybrid._module import Hybrid, HybridModule
+from hybridkin.hybrid._module import Hybrid, HybridModule, TipCorrection
 from hybridkin.hybrid._rows import Rows, rare_marker
 from hybridkin.hybrid._spec import FittedError, Spec, Weighted, residuals
 from hybridkin.hybrid._wrapped import Stacked, WithPose, posed
@@ -30,6 +30,12 @@ class FittedHybrid(NamedTuple):
     spec: Spec  # with the calibrated mechanical model
     error: FittedError
     module: Hybrid
+
+    def take_low_rank(self, q: Tensor) -> None:
+        """Give networks and their guards a leverage of low rank, for training rows q (N, n)."""
+        for part in [*self.module.modules()]:
+            if isinstance(part, TipCorrection):
+                part.take_low_rank(q)
 
     def predict(self, X: NDArray) -> NDArray:
         """Return the tips (N, m) at actuator vectors (N, n) [m]."""

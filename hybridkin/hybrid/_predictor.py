@@ -26,13 +26,14 @@ from hybridkin.chains.hysteresis import HysteresisOperator
 from hybridkin.hybrid._adapt import Change
 from hybridkin.hybrid._drift import Drift
 from hybridkin.hybrid._fit import known_tips
+from hybridkin.hybrid._hysteresis import Past
 from hybridkin.hybrid._module import Hybrid
 from hybridkin.hybrid._radius import Radius
 from hybridkin.hybrid._range import TrainingRange
 from hybridkin.hybrid._rows import Rows
-from hybridkin.hybrid._spec import Learned
 from hybridkin.hybrid._wrapped import in_columns, pose_difference
 from hybridkin.hybrid.cv_results import CvResults
+from hybridkin.hybrid.log_fit import HybridFit
 from hybridkin.learning.hidden_layer import check_inputs
 from hybridkin.native.library import evaluate
 
@@ -53,15 +54,13 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     change_: Change
     mechanical_model_: ForwardModel | None
     calibration_: CalibrationResult | None
+    error_model_: object
+    candidates_: dict[str, Hybrid] | None
     cv_results_: CvResults | None
     play_: HysteresisOperator | None
     radius_: Radius | None
-    _learned: Learned
-    _noise: float
-    _fitted_rows: NDArray
-    _single_output: bool
-    _fitted_range: TrainingRange
-    _state_range: TrainingRange | None  # of the states inside of the hysteresis
+    _fitted: HybridFit
+    _past: Past | None
     _drift: Drift
     _plausible_rows: PlausibleRows | None = None
     _plain_rows: PlausibleRows | None = (
@@ -209,7 +208,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     @property
     def training_range_(self) -> TrainingRange:
         """The range of q in the fit, where it lies after `adapt` [unit of q]."""
-        return self._fitted_range.moved(-self.change_.shift)
+        return self._fitted.training_range.moved(-self.change_.shift)
 
     @property
     def _repr_html_(self) -> Callable[[], str]:
@@ -271,12 +270,28 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def _are_states_seen(self, X: object) -> NDArray[np.bool_]:
         """Return whether the log had the states inside of the hysteresis (N,)."""
         commands = Commands.of(X)
-        if self.play_ is None or self._state_range is None:
+        states_of_log = self._fitted.state_range
+        if self.play_ is None or states_of_log is None:
             return np.ones(len(commands), dtype=bool)
         rows = check_inputs(self, commands.q)
         states = self.play_.inner_states(rows, commands.run_of_rows, commands.time)
-        seen = self._state_range.moved(-self.change_.shift)
+        seen = states_of_log.moved(-self.change_.shift)
         return seen.beyond(states).max(axis=(1, 2), initial=0.0) <= 0.0
+
+    def _take(self, fit: HybridFit) -> None:
+        """Become the model of a fit; the robot has not changed since."""
+        self._fitted = fit
+        self.fitted_module_ = fit.module
+        self.error_model_ = fit.error_model
+        self.calibration_ = fit.calibration
+        self.cv_results_ = fit.comparison
+        self.candidates_ = fit.candidates
+        self.play_ = fit.play
+        self.radius_ = fit.radius
+        self.change_ = Change.none(self.n_features_in_)
+        self._drift = fit.no_drift
+        self._past = None
+        self._follow_robot()
 
     def _follow_robot(self) -> None:
         """Set the module and its mechanical model after the change and the drift of the robot."""
@@ -339,6 +354,6 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if rows.dtype != _FLOAT64:
             with np.errstate(over="ignore"):  # too large for float32
                 arrays = [array.astype(rows.dtype) for array in arrays]
-        if self._single_output:
+        if self._fitted.single_output:
             arrays = [array[:, 0] if array.ndim > 1 else array for array in arrays]
         return arrays

@@ -72,7 +72,7 @@ def conformal_radius(
     Lee, Barber & Willett, Distribution-free inference with hierarchical data (2023), the rank by
     groups; Vovk, Annals of Mathematics and AI 74 (2015), the pooling over folds.
     """
-    spec = replace(spec, held_out=False)
+    spec = replace(spec, held_out=False, progress=None)
     y = rows.tips
     groups = rows.groups
     if groups is None:

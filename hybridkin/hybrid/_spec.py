@@ -18,7 +18,7 @@ from hybridkin._core.arrays import countable
 from hybridkin._core.directions import Directions
 from hybridkin._core.model import ForwardModel
 from hybridkin.calibration.calibrate import CalibrationResult, fit_geometry, refitted
-from hybridkin.calibration.choice import GeometryChoice, choose_geometry
+from hybridkin.calibration.choice import GeometryChoice, Start, choose_geometry
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
 from hybridkin.hybrid._drift import too_far
@@ -129,6 +129,7 @@ class Spec:
     calibrate: tuple[str, ...] | str = ()  # geometry to calibrate, or "auto"
     guard: str | None = "leverage"
     output: str = "position"
+    starts: tuple[Start | None, ...] = ()  # of that choice: those of all rows of a log
     geometry: GeometryChoice | None = None  # how `calibrate` was chosen
     calibration: CalibrationResult | None = None  # how `mechanical` was calibrated
     messages: tuple[str, ...] = ()  # warnings of that choice and calibration
@@ -142,12 +143,10 @@ class Spec:
         self,
         rows: Rows,
         geometry: GeometryChoice | None = None,
-        of_all: GeometryChoice | None = None,
     ) -> Spec:
         """Return the specification with the parameters to calibrate, chosen on the rows or given.
 
         For a list and an error model that chooses, a plain chain is compared with elastic tendons.
-        A choice on all rows of the log gives the starts.
         """
         automatic = self.calibrate == "auto"
         if not self.calibrate or not (automatic or self.error_model.chooses):
@@ -161,7 +160,7 @@ class Spec:
                 weights=rows.weights,
                 outside=self.error_model.learns,
                 parameters=None if automatic else self.calibrate,
-                starts=() if of_all is None else of_all.starts,
+                starts=self.starts,
             )
         return replace(
             self,

@@ -36,12 +36,14 @@ from hybridkin.chains.prandtl_ishlinskii import PrandtlIshlinskiiOperator
 from hybridkin.chains.series import HysteresisSeries
 from hybridkin.hybrid._adapt import Change
 from hybridkin.hybrid._drift import Drift
+from hybridkin.hybrid._module import Hybrid
 from hybridkin.hybrid._radius import Radius
 from hybridkin.hybrid._range import TrainingRange
 from hybridkin.hybrid._spec import Learned
 from hybridkin.hybrid._wrapped import WithPose, in_columns
 from hybridkin.hybrid.cv_results import CvResults
 from hybridkin.hybrid.estimator import HybridForwardModel
+from hybridkin.hybrid.log_fit import HybridFit
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.elm_cv import ELMRegressorCV
 
@@ -74,6 +76,7 @@ def stored_hybrid(model: HybridForwardModel) -> Stored:
     """Return the description of a fitted hybrid."""
     if "module_" not in vars(model):
         raise TypeError("`model` must be fitted before it is saved; call `fit` first.")
+    fit = model._fitted
     nominal = model.mechanical_model
     params = params_of(model)
     del params["mechanical_model"], params["error_model"]
@@ -86,25 +89,25 @@ def stored_hybrid(model: HybridForwardModel) -> Stored:
                 f"drift_{name}": array for name, array in model._drift._asdict().items()
             },
             **model.change_._asdict(),
-            "training_range": model._fitted_range,
-            **_stored_play(model.play_),
-            "state_range": model._state_range,
-            "radius": model.radius_,
-            "fitted_rows": model._fitted_rows,
+            "training_range": fit.training_range,
+            **_stored_play(fit.play),
+            "state_range": fit.state_range,
+            "radius": fit.radius,
+            "fitted_rows": fit.fitted_rows,
         },
         {
-            "module": model.fitted_module_.stored(),
+            "module": fit.module.stored(),
             "nominal": None if nominal is None else as_forward_model(nominal).stored(),
         },
         params=params,
         error_model=_setting(model.error_model),
         n_features_in=model.n_features_in_,
         feature_names_in=vars(model).get("feature_names_in_", []),
-        single_output=model._single_output,
-        noise=model._noise,
-        learned=model._learned.kind,
-        rejected=model._learned.rejected,
-        held_out=model._learned.held_out,
+        single_output=fit.single_output,
+        noise=fit.noise,
+        learned=fit.learned.kind,
+        rejected=fit.learned.rejected,
+        held_out=fit.learned.held_out,
     )
 
 
@@ -154,7 +157,6 @@ def _friction_of(stored: Stored, n: int) -> HysteresisOperator | None:
 def hybrid_of(stored: Stored, training: object) -> HybridForwardModel:
     """Return the fitted hybrid from its description and the result of `training_of`."""
     n = stored.value("n_features_in", int)
-    restore = restorer()
     model = estimator_of(HybridForwardModel, stored.value("params", dict))
     if isinstance(model.calibrate, list):
         model.calibrate = tuple(model.calibrate)
@@ -166,24 +168,22 @@ def hybrid_of(stored: Stored, training: object) -> HybridForwardModel:
     if isinstance(model.error_model, dict):
         model.error_model = _estimator(model.error_model)
     model._checked_error_model()
-    model.fitted_module_ = restore(stored.part("module"))
-    if isinstance(model.fitted_module_, WithPose) != (model.output == "pose"):
+    restore_columns(model, stored, n)
+    module: Hybrid = restorer()(stored.part("module"))
+    if isinstance(module, WithPose) != (model.output == "pose"):
         raise ValueError(
             f"`output` {model.output!r} does not fit {stored.part('module').kind!r}"
         )
-    model.error_model_ = None
-    model._learned = _learned(stored)
-    restore_columns(model, stored, n)
-    model.play_ = _play_of(stored, n)
-    model._single_output = stored.value("single_output", bool)
-    model.change_ = Change(stored.array("shift", (n,)), stored.array("motion", (4, 4)))
     center = stored.array("drift_center", (n,))
     q = torch.tensor(center[None], device="cpu")
     try:  # arrays that do not fit together fail here, not in use
-        columns = in_columns(model.fitted_module_, model.output)
         with torch.no_grad():
-            m = columns(q).shape[1]
-        model._drift = _restored_drift(stored, Drift.of_range(q, m))
+            m = in_columns(module, model.output)(q).shape[1]
+        drift = _restored_drift(stored, Drift.of_range(q, m))
+        model._take(_restored_fit(stored, training, module, drift.emptied()))
+        shift = stored.array("shift", (n,))
+        model.change_ = Change(shift, stored.array("motion", (4, 4)))
+        model._drift = drift
         model._follow_robot()
         with torch.no_grad():
             columns = in_columns(model.module_, model.output)
@@ -193,30 +193,43 @@ def hybrid_of(stored: Stored, training: object) -> HybridForwardModel:
         raise ValueError("the arrays do not fit together") from error
     if not (torch.isfinite(x).all() and torch.isfinite(J).all()):
         raise ValueError("the arrays do not give finite numbers")
-    model._fitted_range = TrainingRange(*stored.array("training_range", (2, n)))
-    model.calibration_ = model.radius_ = model._past = None
-    model.candidates_ = None
-    model._state_range = None
+    return model
+
+
+def _restored_fit(
+    stored: Stored, training: object, module: Hybrid, no_drift: Drift
+) -> HybridFit:
+    """Return what the fit of a described hybrid found, without what files do not contain."""
+    n = stored.value("n_features_in", int)
+    states = None
     if "state_range" in stored.arrays:
-        states = stored.array("state_range", (2, "R", n))
-        model._state_range = TrainingRange(*states)
+        states = TrainingRange(*stored.array("state_range", (2, "R", n)))
+    radius = None
     if "radius" in stored.arrays:
-        radius = stored.array("radius", (3,), finite=False).tolist()
-        inside, coverage, n_rows = radius
+        numbers = stored.array("radius", (3,), finite=False).tolist()
+        inside, coverage, n_rows = numbers
         if not (inside >= 0.0 and 0.0 < coverage < 1.0 and n_rows < inf):
             raise ValueError(
                 "`radius` must hold a radius, a coverage and a number of rows"
             )
-        model.radius_ = Radius(inside, coverage, int(n_rows))
-    model._fitted_rows = stored.array("fitted_rows", "N")
-    model.cv_results_ = None
+        radius = Radius(inside, coverage, int(n_rows))
+    comparison = None
     if isinstance(training, dict) and training.get("cv_results"):
         results = training["cv_results"].items()
-        model.cv_results_ = cast(
-            CvResults, {key: _array(value) for key, value in results}
-        )
-    model._noise = stored.value("noise", float)
-    return model
+        comparison = cast(CvResults, {key: _array(value) for key, value in results})
+    return HybridFit(
+        module=module,
+        learned=_learned(stored),
+        noise=stored.value("noise", float),
+        fitted_rows=stored.array("fitted_rows", "N"),
+        single_output=stored.value("single_output", bool),
+        training_range=TrainingRange(*stored.array("training_range", (2, n))),
+        no_drift=no_drift,
+        comparison=comparison,
+        play=_play_of(stored, n),
+        state_range=states,
+        radius=radius,
+    )
 
 
 def _restored_drift(stored: Stored, empty: Drift) -> Drift:
@@ -235,7 +248,7 @@ def _restored_drift(stored: Stored, empty: Drift) -> Drift:
 
 def training_of(model: HybridForwardModel) -> dict[str, object]:
     """Return the results of the training of a fitted hybrid as JSON values, errors in metres."""
-    results: dict[str, object] = {"rows": len(model._fitted_rows)}
+    results: dict[str, object] = {"rows": len(model._fitted.fitted_rows)}
     calibration = model.calibration_
     if calibration is not None:
         results["calibration"] = {

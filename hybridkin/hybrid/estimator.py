@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import copy
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -17,9 +16,7 @@ from torch import nn
 
 from hybridkin._core.arrays import labels, number, table
 from hybridkin._core.commands import Commands
-from hybridkin._core.digests import row_digests
 from hybridkin._core.model import PoseModel, as_forward_model
-from hybridkin.calibration.choice import GeometryChoice
 from hybridkin.calibration.measured import (
     check_finite,
     check_unscaled,
@@ -30,44 +27,18 @@ from hybridkin.chains.hysteresis import HysteresisOperator, checked_times
 from hybridkin.chains.markers import MarkedChain
 from hybridkin.hybrid._adapt import (
     PARAMETERS,
-    Change,
     check_parameters,
     likeliest_change,
 )
-from hybridkin.hybrid._drift import Drift
-from hybridkin.hybrid._fit import few_rows, fit_hybrid, fit_messages
 from hybridkin.hybrid._html import fitted_rows
-from hybridkin.hybrid._hysteresis import (
-    Past,
-    continued,
-    moved_without,
-    play_of,
-)
-from hybridkin.hybrid._module import TipCorrection
+from hybridkin.hybrid._hysteresis import continued
 from hybridkin.hybrid._predictor import HybridPredictor
-from hybridkin.hybrid._radius import Radius, conformal_radius
-from hybridkin.hybrid._range import TrainingRange, state_range
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._settings import CONSTRAINTS, error_model_of
 from hybridkin.hybrid._spec import ErrorModel, Spec, residuals
-from hybridkin.hybrid.held_out import MEAN_LENGTH, Predictions
+from hybridkin.hybrid.log_fit import HybridFit, Settings, fit_to_log
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.hidden_layer import check_rows
-
-
-class Start(NamedTuple):
-    """Where the choices of a fit to a part of a log start: those of the fit to the whole log."""
-
-    error_model: ErrorModel
-    geometry: GeometryChoice | None
-
-
-class QuietFit(NamedTuple):
-    """What a fit without warnings gives besides the fitted model."""
-
-    messages: list[str]  # of its warnings
-    start: Start  # for fits to parts of the rows
-    outside: Predictions | None  # with a start: of the candidates of "auto"
 
 
 class HybridForwardModel(HybridPredictor):
@@ -274,77 +245,11 @@ class HybridForwardModel(HybridPredictor):
             millimetres; if there are too few groups for `coverage`; and the warnings of
             `calibrate`.
         """
-        for message in self._fit(X, y, sample_weight, groups).messages:
+        fitted = fit_to_log(*prepared(self, X, y, groups, sample_weight))
+        self._take(fitted.hybrid)
+        for message in fitted.messages:
             warnings.warn(message, stacklevel=2)
         return self
-
-    def _fit(
-        self,
-        X: object,
-        y: object,
-        sample_weight: ArrayLike | None = None,
-        groups: ArrayLike | None = None,
-        geometry: GeometryChoice | None = None,
-        progress: Callable[[int, int], None] | None = None,
-        compared: bool = False,
-        start: Start | None = None,
-    ) -> QuietFit:
-        """Fit, see `fit_quietly`."""
-        error_model = self._checked_error_model()
-        of_all = None
-        if start is not None:
-            error_model = error_model.starting_at(start.error_model)
-            of_all = start.geometry
-        log = self._checked_rows(X, y, sample_weight, groups)
-        rows = log.distinct()
-        settings = self._spec(error_model, log)
-        settings = replace(settings, held_out=start is None, compared=compared)
-        messages = few_rows(rows, settings, self.coverage)
-        self._fitted_rows = rows.digests()
-        spec = settings.with_geometry_chosen(rows, geometry, of_all)
-        self.play_, of_play = play_of(self.play, spec, log.in_runs())
-        messages += of_play
-        self._past: Past | None = None
-        self._state_range = None
-        if self.play_ is not None:
-            settings = replace(settings, commanded=rows.directions)
-            spec = replace(spec, commanded=rows.directions)
-            states = self.play_.inner_states(log.X, log.run_of_rows, log.time)
-            self._state_range = state_range(states, log)
-            rows = log.effective(self.play_).distinct()
-        fitted = fit_hybrid(replace(spec, progress=progress), rows)
-        for part in [*fitted.module.modules()]:
-            if isinstance(part, TipCorrection):
-                part.take_low_rank(rows.q)
-        self.calibration_ = fitted.spec.calibration
-        self.error_model_ = fitted.error.result
-        self._learned = fitted.error.learned
-        self.cv_results_ = fitted.error.comparison
-        self.candidates_ = fitted.error.candidates
-        self.fitted_module_ = fitted.module
-        self.change_ = Change.none(rows.X.shape[1])
-        self._single_output = rows.y.ndim == 1
-        self._fitted_range = TrainingRange.of(rows.X)
-        self._drift = Drift.of_range(rows.q, rows.tips.shape[1])
-        self._follow_robot()
-        self._noise = fitted.error.noise
-        self.radius_: Radius | None = None
-        if self.coverage is not None:
-            measured = rows
-            moved = None
-            if self.play_ is not None:
-                measured = log.take(np.flatnonzero(log.counts > 0.0))
-                moved = partial(moved_without, self.play, spec, log)
-            self.radius_, of_radius = conformal_radius(
-                settings, measured, self.coverage, moved
-            )
-            messages += of_radius
-        messages += fit_messages(fitted.spec, rows)
-        return QuietFit(
-            [*dict.fromkeys(messages)],
-            Start(fitted.error.settled, spec.geometry),
-            fitted.error.outside,
-        )
 
     def partial_fit(
         self,
@@ -402,7 +307,7 @@ class HybridForwardModel(HybridPredictor):
         residual = error.reshape(rows.tips.shape) - learned
         drift = self._drift.learned(rows.q.numpy(), residual, rows.counts, decay)
         if alpha is None:
-            alpha = drift.likeliest_alpha(self._noise)
+            alpha = drift.likeliest_alpha(self._fitted.noise)
         self._drift = drift._replace(alpha=float(alpha))
         self._follow_robot()
         return self
@@ -470,11 +375,15 @@ class HybridForwardModel(HybridPredictor):
             rows = rows.effective(self.play_)
         self._warn_of_units(rows)
         self.change_, message = likeliest_change(
-            self.fitted_module_, rows, self._noise, self._drift.scale, parameters
+            self.fitted_module_,
+            rows,
+            self._fitted.noise,
+            self._drift.scale,
+            parameters,
         )
         if message is not None:
             warnings.warn(message, stacklevel=2)
-        self._drift = self._drift.emptied()
+        self._drift = self._fitted.no_drift
         self._past = None
         self._follow_robot()
         return self
@@ -591,48 +500,20 @@ def _check_positive(name: str, value: object, high: float) -> None:
         raise ValueError(f"`{name}` must lie in (0, {high:g}], got {value!r}.")
 
 
-def fit_quietly(
+def prepared(
     model: HybridForwardModel,
     X: object,
-    y: NDArray,
+    y: object,
     groups: ArrayLike | None = None,
-    *,
-    geometry: GeometryChoice | None = None,
-    progress: Callable[[int, int], None] | None = None,
-    compared: bool = False,
-    start: Start | None = None,
-    log: tuple[NDArray, NDArray] | None = None,
-) -> QuietFit:
-    """Fit as `HybridForwardModel.fit` does, without warnings.
-
-    Parameters
-    ----------
-    model : HybridForwardModel
-        The estimator; it is fitted in place.
-    X, y, groups
-        As for its `fit`.
-    geometry : GeometryChoice, optional
-        What to calibrate. Default: chosen on the rows.
-    progress : callable, optional
-        Gets (done, total).
-    compared : bool, default=False
-        Whether a comparison follows that gives the error to expect, see `expect`; until then
-        ``expected_distance`` has the penalties of all rows.
-    start : Start, optional
-        That of the same model fitted to a whole log, of which X and y are a part. All choices
-        start there, and errors on held-out rows that predictions do not need are not computed.
-        "auto" fits only its ``candidates_``.
-    log : tuple of ndarray, optional
-        All rows (q, x) of the log, if X and y are some of them: all count as fitted.
-    """
-    quiet_fit = model._fit(X, y, None, groups, geometry, progress, compared, start)
-    if log is not None:
-        model._fitted_rows = np.unique(row_digests(*log))
-    return quiet_fit
+    sample_weight: ArrayLike | None = None,
+) -> tuple[Settings, Rows]:
+    """Return the checked settings of a model and the rows of a log, for `fit_to_log`."""
+    error_model = model._checked_error_model()
+    log = model._checked_rows(X, y, sample_weight, groups)
+    return Settings(model._spec(error_model, log), model.play, model.coverage), log
 
 
-def expect(model: HybridForwardModel, distance: float) -> None:
-    """Let "auto" expect the mean error of a comparison on new motions [m]."""
-    if model.cv_results_ is not None:
-        model.cv_results_["expected_distance"] = distance
-        model._noise = distance / MEAN_LENGTH
+def with_fit(model: HybridForwardModel, fit: HybridFit) -> HybridForwardModel:
+    """Return a model, after `prepared`, as its `fit` returns it."""
+    model._take(fit)
+    return model

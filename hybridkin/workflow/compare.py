@@ -23,9 +23,10 @@ from hybridkin.calibration.choice import GeometryChoice, choose_geometry
 from hybridkin.calibration.measured import distances, folds
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.robots import RobotDescription
-from hybridkin.hybrid.estimator import HybridForwardModel, Start, fit_quietly
+from hybridkin.hybrid.estimator import HybridForwardModel, prepared, with_fit
 from hybridkin.hybrid.held_out import HeldOut, Predictions, chosen_blend
 from hybridkin.hybrid.log_distance import held_out_distances
+from hybridkin.hybrid.log_fit import LogFit, Start, fit_to_log
 from hybridkin.learning.elm_cv import growing_network
 from hybridkin.learning.regressor_modules import error_module
 from hybridkin.native.library import evaluate
@@ -268,17 +269,17 @@ def with_play_detected(
     in_order = rows.named and not rows.n_late
     if mechanical.start is not None and settings.auto and in_order:
         model = HybridForwardModel(mechanical.model, "drop", play="auto")
-        fit_quietly(model, rows.commands, rows.x, rows.motions)
-        play = None if model.play_ is None else "auto"
+        fitted = fit_to_log(*prepared(model, rows.commands, rows.x, rows.motions))
+        play = None if fitted.hybrid.play is None else "auto"
     return replace(settings, play=play)
 
 
 class FittedModels(NamedTuple):
-    """The models that can be saved, fitted to all rows, and the starts of their fits to parts."""
+    """The models that can be saved, and their fits to all rows."""
 
     mechanical: Mechanical
     models: dict[str, HybridForwardModel]
-    starts: dict[str, Start]
+    fits: dict[str, LogFit]
 
 
 def fit_to_all(
@@ -286,8 +287,6 @@ def fit_to_all(
     robot: RobotDescription,
     settings: FitSettings,
     mechanical: Mechanical,
-    *,
-    log: tuple[NDArray, NDArray] | None = None,
     progress: Progress = quiet,
 ) -> FittedModels:
     """Return every model that can be saved, fitted to all rows.
@@ -298,30 +297,20 @@ def fit_to_all(
         As for `compare_by_group`.
     mechanical : Mechanical
         That of all rows.
-    log : tuple of ndarray, optional
-        All rows (q, x) of the log, if it was thinned: all count as fitted.
     progress : callable, optional
         Called with (what, done, total).
     """
     models = models_to_save(robot, mechanical, settings)
-    starts = {}
+    fits = {}
     for name, model in models.items():
         progress_of_fit = partial(progress, f"fitting {name} to all motions")
         progress_of_fit(0, 1)
         if name == AUTO:  # it will be saved
             model.set_params(coverage=settings.coverage)
-        quiet_fit = fit_quietly(
-            model,
-            rows.commands,
-            rows.x,
-            rows.motions,
-            geometry=mechanical.geometry,
-            progress=progress_of_fit,
-            compared=True,
-            log=log,
-        )
-        starts[name] = quiet_fit.start
-    return FittedModels(mechanical, models, starts)
+        checked, log = prepared(model, rows.commands, rows.x, rows.motions)
+        spec = replace(checked.spec, progress=progress_of_fit, compared=True)
+        fits[name] = fit_to_log(replace(checked, spec=spec), log, mechanical.geometry)
+    return FittedModels(mechanical, models, fits)
 
 
 def compare_by_group(
@@ -362,6 +351,7 @@ def compare_by_group(
         Errors [m] by model and row, the fold of each row, and the choices of each fold.
     """
     parts = folds(rows.q, rows.motions, settings.n_folds)
+    starts = {name: fit.start for name, fit in fitted.fits.items()}
     jobs = []
     for train, test in parts:
         jobs.append(
@@ -371,7 +361,7 @@ def compare_by_group(
                 rows.rows(train),
                 rows.rows(test),
                 fitted.mechanical,
-                fitted.starts,
+                starts,
             )
         )
     most = max(1, len(rows.q) // _ROWS_PER_PROCESS[settings.auto])
@@ -446,15 +436,11 @@ def _one_fold(
     choices = {}
     auto = None
     for name, model in models_to_save(robot, mechanical, settings).items():
-        quiet_fit = fit_quietly(
-            model,
-            train.commands,
-            train.x,
-            train.motions,
-            geometry=mechanical.geometry,
-            start=starts[name],
-        )
-        if quiet_fit.outside is None or model.candidates_ is None:
+        checked, log = prepared(model, train.commands, train.x, train.motions)
+        near_all = checked.starting_at(starts[name])
+        fitted = fit_to_log(near_all, log, mechanical.geometry)
+        model = with_fit(model, fitted.hybrid)
+        if fitted.outside is None or model.candidates_ is None:
             tips[name] = evaluate(model.module_, test.q)[0]
             if name in (DATA_ELM, HYBRID_ELM):
                 choices[name] = choice_in_words(model)
@@ -464,8 +450,8 @@ def _one_fold(
             tips[_in_table(candidate)] = evaluate(module, q)[0]
         auto = _AutoOfFold(
             [*model.candidates_],
-            quiet_fit.outside,
-            quiet_fit.start.geometry,
+            fitted.outside,
+            fitted.start.geometry,
             memory_in_words(model),
         )
     distance = held_out_distances(train.q, train.motions, test.q)
@@ -484,21 +470,20 @@ def _blended(
 
     Predictions (K, N, m) of the other folds choose the weights of a fold.
     """
-    names = rows.motions.astype(str)
     labels = fold
     if len(autos) == 2:
         # A fold has only one other; the motions of that one take the place of folds.
-        labels = np.unique(names, return_inverse=True)[1]
-    label_of = dict(zip(names, labels, strict=True))
+        _, labels = np.unique(rows.motions, return_inverse=True)
+    motions, first = np.unique(rows.motions, return_index=True)
     blend = np.empty_like(rows.x)
     words = []
     for k, auto in enumerate(autos):
         others = fold != k
         counts = np.ones(others.sum())
         held_out = Predictions(
-            predicted[:, others], rows.x[others], counts, names[others]
+            predicted[:, others], rows.x[others], counts, rows.motions[others]
         )
-        outer = [label_of[str(name)] for name in np.asarray(auto.outside.groups)]
+        outer = labels[first[np.searchsorted(motions, auto.outside.groups)]]
         both = HeldOut.of(held_out, auto.outside, np.append(labels[others], outer))
         weights, results = chosen_blend(auto.names, both, auto.geometry)
         blend[~others] = np.tensordot(weights, predicted[:, ~others], 1)

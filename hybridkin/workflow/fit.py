@@ -12,7 +12,8 @@ import numpy as np
 
 from hybridkin.chains.robots import RobotDescription
 from hybridkin.datasets import Log
-from hybridkin.hybrid.estimator import HybridForwardModel, expect, fit_quietly
+from hybridkin.hybrid.estimator import HybridForwardModel, prepared, with_fit
+from hybridkin.hybrid.log_fit import fit_to_log
 from hybridkin.saving.saved_model import save_model
 from hybridkin.workflow.calibrated import Calibration, deviations
 from hybridkin.workflow.choices import auto_in_words, choice_in_words
@@ -102,17 +103,18 @@ def fit_log(
     for message in messages:
         warnings.warn(message, stacklevel=2)
     settings = with_play_detected(settings, rows, mechanical)
-    whole = complete.q, complete.x
-    fitted = fit_to_all(rows, robot, settings, mechanical, log=whole, progress=progress)
+    fitted = fit_to_all(rows, robot, settings, mechanical, progress)
     compared = compare_by_group(
         rows, robot, settings, fitted, n_jobs=n_jobs, progress=progress
     )
     saved = AUTO if settings.auto else _best_to_save(compared)
     model = fitted.models[saved]
+    fit = fitted.fits[saved]
     if settings.coverage is not None and not settings.auto:
         model.set_params(coverage=settings.coverage)
-        fit_quietly(model, rows.commands, rows.x, rows.motions, log=whole)
-    expect(model, float(compared.errors[saved].mean()))
+        fit = fit_to_log(*prepared(model, rows.commands, rows.x, rows.motions))
+    hybrid = fit.hybrid.of_all_rows(complete.q, complete.x)
+    model = with_fit(model, hybrid.expecting(float(compared.errors[saved].mean())))
     progress("writing the report", 0, 1)
     held_out = {}
     for name, errors in compared.errors.items():

@@ -12,7 +12,8 @@ from hybridkin import (
     robots,
 )
 from hybridkin.hybrid._radius import _quantile
-from hybridkin.hybrid.estimator import fit_quietly
+from hybridkin.hybrid.estimator import prepared, with_fit
+from hybridkin.hybrid.log_fit import fit_to_log
 
 
 def motions(seed, n_motions=240, n=6, noise=2e-3):
@@ -38,8 +39,8 @@ def few(n, coverage, groups=True, error_model="drop"):
     """Return a fit to few motions, its warnings, and its rows."""
     q, x, motion = motions(0, n, 4)
     model = HybridForwardModel(robots.bionic_handling_assistant(), error_model, coverage=coverage)
-    quiet_fit = fit_quietly(model, q, x, groups=motion if groups else None)
-    return model, quiet_fit.messages, q
+    fitted = fit_to_log(*prepared(model, q, x, motion if groups else None))
+    return with_fit(model, fitted.hybrid), fitted.messages, q
 
 
 @pytest.mark.parametrize(("n", "finite"), [(8, False), (9, True)])
@@ -110,7 +111,8 @@ def test_a_radius_of_two_motions_holds_out_one_and_then_rows(n, error_model):
     model = HybridForwardModel(
         chain, error_model, calibrate=["radii"], coverage=0.5, random_state=0
     )
-    messages = fit_quietly(model, q, x, groups=motion).messages
-    assert (model.radius_.inside < 0.2) == (not any("`coverage`" in text for text in messages))
+    fitted = fit_to_log(*prepared(model, q, x, motion))
+    told = any("`coverage`" in text for text in fitted.messages)
+    assert (fitted.hybrid.radius.inside < 0.2) == (not told)
     with pytest.raises(ValueError, match="`groups` must hold at least two motions"):
-        fit_quietly(model, q[:12], x[:12], groups=motion[:12])
+        model.fit(q[:12], x[:12], groups=motion[:12])

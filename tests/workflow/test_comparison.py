@@ -8,8 +8,9 @@ import torch
 from numpy.testing import assert_allclose, assert_array_equal
 
 from hybridkin import ConstantCurvatureChain, HybridForwardModel, datasets, robots
-from hybridkin.hybrid.estimator import fit_quietly
+from hybridkin.hybrid.estimator import prepared, with_fit
 from hybridkin.hybrid.held_out import Predictions
+from hybridkin.hybrid.log_fit import fit_to_log
 from hybridkin.workflow import FitSettings
 from hybridkin.workflow.compare import (
     AUTO,
@@ -107,8 +108,10 @@ def test_a_fit_near_another_one_chooses_as_from_nothing():
     robot, rows = measured(6)
     for error_model in ("linear", "quadratic"):
         model = HybridForwardModel(robot.chain, error_model, coupling="serial")
-        start = fit_quietly(model, rows.q, rows.x, rows.motions).start
-        near = HybridForwardModel(robot.chain, error_model, coupling="serial")
-        fit_quietly(near, rows.q, rows.x, rows.motions, start=start)
-        assert near.error_model_.alphas == model.error_model_.alphas
-        assert_allclose(near.predict(rows.q), model.predict(rows.q), rtol=0.0, atol=1e-7)
+        settings, log = prepared(model, rows.q, rows.x, rows.motions)
+        fitted = fit_to_log(settings, log)
+        near = fit_to_log(settings.starting_at(fitted.start), log)
+        assert near.hybrid.error_model.alphas == fitted.hybrid.error_model.alphas
+        x = with_fit(model, fitted.hybrid).predict(rows.q)
+        x_near = with_fit(model, near.hybrid).predict(rows.q)
+        assert_allclose(x_near, x, rtol=0.0, atol=1e-7)
