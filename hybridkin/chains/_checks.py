@@ -60,13 +60,19 @@ def filled(
     return tensor.expand(shape).clone()
 
 
-def stiffness(value: Numbers, name: str, dtype: torch.dtype, size: int) -> Tensor:
-    """Return one positive stiffness per segment, shape (S,)."""
-    tensor = filled(value, name, dtype, (size,))
-    if not (tensor > 1.0 / LARGEST).all():
-        need = f"must be positive, over {1.0 / LARGEST:g}"
-        raise ValueError(f"`{name}` {need}, got {tensor.tolist()}.")
-    return tensor
+def stiffnesses(
+    bending: Numbers, axial: Numbers, dtype: torch.dtype, size: int
+) -> dict[str, Tensor]:
+    """Return positive bending and axial stiffnesses of all segments, each of shape (S,)."""
+    given = {"bending_stiffness": bending, "axial_stiffness": axial}
+    checked = {}
+    for name, value in given.items():
+        tensor = filled(value, name, dtype, (size,))
+        if not (tensor > 1.0 / LARGEST).all():
+            need = f"must be positive, over {1.0 / LARGEST:g}"
+            raise ValueError(f"`{name}` {need}, got {tensor.tolist()}.")
+        checked[name] = tensor
+    return checked
 
 
 def arc_geometry(

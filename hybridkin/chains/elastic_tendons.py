@@ -15,7 +15,7 @@ from hybridkin._core.arrays import Numbers, Transform
 from hybridkin._core.plan import Plan
 from hybridkin._core.stored import Layout, Stored
 from hybridkin.chains import _slack
-from hybridkin.chains._checks import filled, float_dtype, stiffness
+from hybridkin.chains._checks import filled, float_dtype, stiffnesses
 from hybridkin.chains.arc_chain import (
     STRUCTURE,
     ArcChain,
@@ -229,15 +229,9 @@ class ElasticTendonChain(ArcChain):
         if axial_stiffness is None:
             axial_stiffness = 10.0
         S = self.n_segments
-        geometry |= {
-            "bending_stiffness": stiffness(
-                bending_stiffness, "bending_stiffness", dtype, S
-            ),
-            "axial_stiffness": stiffness(axial_stiffness, "axial_stiffness", dtype, S),
-            "tendon_zeros": filled(
-                tendon_zeros, "tendon_zeros", dtype, (self.n_actuators,)
-            ),
-        }
+        zeros = filled(tendon_zeros, "tendon_zeros", dtype, (self.n_actuators,))
+        geometry |= stiffnesses(bending_stiffness, axial_stiffness, dtype, S)
+        geometry["tendon_zeros"] = zeros
         self._table: _Table | None = None
         self._set_geometry(geometry)
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from hybridkin._core.arrays import Numbers, Transform, identity, whole
 from hybridkin._core.stored import Layout, Restore, Stored
 from hybridkin.chains._arcs import WorkOfGravity, segments_of
-from hybridkin.chains._checks import filled, float_dtype, numeric, stiffness
+from hybridkin.chains._checks import filled, float_dtype, numeric, stiffnesses
 from hybridkin.chains._slack import WithoutDerivative, applied
 from hybridkin.chains.arc_chain import STRUCTURE, ArcChain, Change
 from hybridkin.chains.chain import Chain
@@ -293,11 +293,8 @@ class ForceTendonChain(ArcChain):
         self.gravity = tuple((down / down.norm()).tolist())
         self._last: _LastShapes | None = None
         self.arcs_per_segment = whole(arcs, "arcs", most=_MOST_ARCS)
+        geometry |= stiffnesses(bending_stiffness, axial_stiffness, dtype, S)
         geometry |= {
-            "bending_stiffness": stiffness(
-                bending_stiffness, "bending_stiffness", dtype, S
-            ),
-            "axial_stiffness": stiffness(axial_stiffness, "axial_stiffness", dtype, S),
             "weight": weights,
             "taper": tapers,
             "marker_offsets": geometry["base"].new_zeros(1, 3),

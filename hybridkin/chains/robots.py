@@ -32,16 +32,11 @@ BHA_LENGTH_LIMITS = (0.10, 0.40)
 _COLUMNS = ("groups", "runs", "time")
 
 
-def bionic_handling_assistant(tool: float = 0.0) -> ConstantCurvatureChain:
+def bionic_handling_assistant() -> ConstantCurvatureChain:
     """Return the nominal chain of Festo's Bionic Handling Assistant.
 
     Three segments of three chambers at 0, 120 and 240 degrees; q holds the nine chamber lengths,
     segment by segment from the base.
-
-    Parameters
-    ----------
-    tool : float, default=0.0
-        Rigid length after the last segment [m].
 
     Returns
     -------
@@ -59,7 +54,7 @@ def bionic_handling_assistant(tool: float = 0.0) -> ConstantCurvatureChain:
     >>> robots.bionic_handling_assistant().n_actuators
     9
     """
-    return ConstantCurvatureChain([0.100, 0.093, 0.079], offsets=[0.0, 0.0, tool])
+    return ConstantCurvatureChain([0.100, 0.093, 0.079])
 
 
 @dataclass(frozen=True)

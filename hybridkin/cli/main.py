@@ -122,7 +122,7 @@ def _interruptible() -> Iterator[None]:
 
 def _next(arguments: argparse.Namespace, stages: Stages) -> _Result:
     workflow = hybridkin.workflow
-    loaded = workflow.open_model(arguments.model, arguments.robot)
+    loaded = _model_of(arguments)
     measured = None
     if arguments.log is not None:
         measured = _log_of(loaded, arguments, stages, chain=loaded.chain)
@@ -194,7 +194,7 @@ def _replaced_model(arguments: argparse.Namespace) -> str:
 
 
 def _evaluate(arguments: argparse.Namespace, stages: Stages) -> _Result:
-    loaded = hybridkin.workflow.open_model(arguments.model, arguments.robot)
+    loaded = _model_of(arguments)
     nominal = loaded.chain if loaded.header is None else None
     log = _log_of(loaded, arguments, stages, chain=nominal)
     _note(log.report, stages)
@@ -207,7 +207,7 @@ def _evaluate(arguments: argparse.Namespace, stages: Stages) -> _Result:
 
 
 def _view(arguments: argparse.Namespace, stages: Stages) -> _Result:
-    loaded = hybridkin.workflow.open_model(arguments.model, arguments.robot)
+    loaded = _model_of(arguments)
     log = None
     if arguments.log is not None:
         log = _log_of(loaded, arguments, stages, base_is_free=True)
@@ -228,7 +228,7 @@ def _view(arguments: argparse.Namespace, stages: Stages) -> _Result:
 
 def _track(arguments: argparse.Namespace, stages: Stages) -> _Result:
     workflow = hybridkin.workflow
-    loaded = workflow.open_model(arguments.model, arguments.robot)
+    loaded = _model_of(arguments)
     if (arguments.path is None) == (arguments.shape is None):
         raise ValueError("give either a file of points or --shape, one of the two.")
     log_format = loaded.log_format()
@@ -267,7 +267,7 @@ def _track(arguments: argparse.Namespace, stages: Stages) -> _Result:
 
 
 def _verify(arguments: argparse.Namespace, stages: Stages) -> _Result:
-    loaded = hybridkin.workflow.open_model(arguments.model, arguments.robot)
+    loaded = _model_of(arguments)
     log_format = _log_format(arguments, loaded.log_format(), arguments.model)
     log = _read(arguments, replace(log_format, groups=None), stages)
     report = hybridkin.workflow.verify_track(
@@ -278,7 +278,7 @@ def _verify(arguments: argparse.Namespace, stages: Stages) -> _Result:
 
 def _animate(arguments: argparse.Namespace, stages: Stages) -> _Result:
     report = hybridkin.workflow.animate_track(
-        hybridkin.workflow.open_model(arguments.model, arguments.robot),
+        _model_of(arguments),
         arguments.track,
         arguments.out,
         unit=arguments.unit,
@@ -290,7 +290,7 @@ def _animate(arguments: argparse.Namespace, stages: Stages) -> _Result:
 
 
 def _export(arguments: argparse.Namespace, stages: Stages) -> _Result:
-    loaded = hybridkin.workflow.open_model(arguments.model, arguments.robot)
+    loaded = _model_of(arguments)
     if arguments.fmu is not None:
         kind = "fmu"
     elif arguments.mex:
@@ -423,6 +423,11 @@ _COMMANDS = (
     _demo,
 )
 _RUN = {command.__name__[1:]: command for command in _COMMANDS}
+
+
+def _model_of(arguments: argparse.Namespace) -> LoadedModel:
+    """Return the model that the arguments name."""
+    return hybridkin.workflow.open_model(arguments.model, arguments.robot)
 
 
 def _limits(

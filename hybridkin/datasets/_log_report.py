@@ -8,6 +8,8 @@ from dataclasses import asdict, dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridkin._core.stored import plain
+
 SEVERITIES = ("error", "warning", "note")
 MISREAD = ("units", "order", "sign", "numbering", "axes", "size")
 _WIDTH = 96
@@ -112,12 +114,9 @@ class LogReport:
 
     def to_dict(self) -> dict[str, object]:
         """Return the report as numbers, text and lists, for JSON."""
-        record = asdict(self)
+        record = plain(asdict(self))
         for finding in record["findings"]:
             finding["n_rows"] = len(finding["rows"])
-            finding["rows"] = finding["rows"].tolist()
-        record["q_range"] = self.q_range.tolist()
-        record["x_range"] = self.x_range.tolist()
         record["duration_s"] = record.pop("duration")
         record["ok"] = self.ok
         return record

@@ -92,11 +92,12 @@ class _Made:
         self.programs = programs
         self.core: Core | None = None
         self.reason = ""
-        for model in settings.task.models:
-            if program_of(model) is None:
+        compiled = []
+        for model, program in zip(settings.task.models, programs, strict=True):
+            if program is None:
                 self.reason = backend(model).removeprefix("torch: ")
                 return
-        compiled = [program for program in programs if program is not None]
+            compiled.append(program)
         try:
             self.core = Core(settings, compiled)
         except (NoKernel, TypeError) as error:

@@ -154,12 +154,16 @@ def looks_of(names: Iterable[str]) -> list[dict[str, Any]]:
     return looks
 
 
+def small_legend(ax: Axes, **place: Any) -> None:
+    """Add a small legend without a frame; `place` are arguments of ``Axes.legend``."""
+    ax.legend(frameon=False, fontsize="small", **place)
+
+
 def legend_below(ax: Axes, n_columns: int = 1) -> None:
     """Put the legend under the axis' name, off the data."""
     down = ScaledTranslation(0.0, -0.5, ax.figure.dpi_scale_trans)
-    ax.legend(
-        frameon=False,
-        fontsize="small",
+    small_legend(
+        ax,
         loc="upper center",
         bbox_to_anchor=(0.5, 0.0),
         bbox_transform=ax.transAxes + down,

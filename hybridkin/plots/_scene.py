@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
-from hybridkin.plots._canvas import COLORS, Space, label_space
+from hybridkin.plots._canvas import COLORS, Space, label_space, small_legend
 
 
 class Line(NamedTuple):
@@ -66,12 +66,7 @@ class Stage:
         for line in scene.moving:
             artists = ax.plot([], [], [], label=line.label or None, **line.look())
             self.artists += artists
-        ax.legend(
-            frameon=False,
-            fontsize="small",
-            loc="upper left",
-            bbox_to_anchor=(-0.25, 1.0),
-        )
+        small_legend(ax, loc="upper left", bbox_to_anchor=(-0.25, 1.0))
         self.cursor = None
         if error_ax is not None and scene.error is not None:
             error_ax.plot(scene.steps, scene.error, color=COLORS[0], linewidth=1.5)

@@ -21,6 +21,7 @@ from hybridkin.plots._canvas import (
     Space,
     label_space,
     scale_of,
+    small_legend,
     space_or_new,
 )
 from hybridkin.plots._scene import Line
@@ -115,13 +116,7 @@ class WorkspaceDisplay(Display):
         if self.row is not None:
             self._draw_row(space, scale, self.row)
         if self.backbone is not None or self.row is not None:
-            space.legend(
-                frameon=False,
-                fontsize="small",
-                loc="upper center",
-                bbox_to_anchor=(0.5, 0.03),
-                ncols=3,
-            )
+            small_legend(space, loc="upper center", bbox_to_anchor=(0.5, 0.03), ncols=3)
         label_space(space, unit)
         return self._drawn(space)
 
@@ -317,7 +312,7 @@ class BackboneDisplay(Display):
         elif len(drawn):
             self._draw_body(space, scale)
         if space.get_legend_handles_labels()[1]:
-            space.legend(frameon=False, loc="upper left", fontsize="small")
+            small_legend(space, loc="upper left")
         label_space(space, unit)
         return self._drawn(space)
 

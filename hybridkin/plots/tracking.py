@@ -30,6 +30,7 @@ from hybridkin.plots._canvas import (
     legend_below,
     looks_of,
     scale_of,
+    small_legend,
     steps_of,
 )
 
@@ -373,16 +374,10 @@ class ActuatorDisplay:
             ax.set(ylabel=f"segment {k + 1} [{unit}]")
         if self.names:
             for ax in axes:
-                ax.legend(
-                    frameon=False,
-                    fontsize="small",
-                    loc="center left",
-                    bbox_to_anchor=(1.0, 0.5),
-                )
+                small_legend(ax, loc="center left", bbox_to_anchor=(1.0, 0.5))
         else:
-            axes[0].legend(
-                frameon=False,
-                fontsize="small",
+            small_legend(
+                axes[0],
                 loc="lower center",
                 bbox_to_anchor=(0.5, 1.0),
                 ncols=len(self.paths),
