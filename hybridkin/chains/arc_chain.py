@@ -409,6 +409,24 @@ class ArcChain(MarkedChain):
         start = self.base[:3, 3].to(points).expand(*q.shape[:-1], 1, 3)
         return torch.cat([start, points], dim=-2)
 
+    def frames(self, q: Tensor, n_points: int) -> Tensor:
+        """Return frames along all segments, shape (..., S, P, 4, 4), without the rigid offsets.
+
+        They are `n_points` + 1 on every arc, from its start to its end.
+        """
+        length, bending = self.arcs(q)
+        poses = self._poses(length, bending, self.arc_offsets, q)
+        if self.stage is not None:  # in the frames that turn with the stage
+            turned = poses[..., 0, :3, :3].mT @ poses[..., 1, :3, :3]
+            bending = bending @ turned[..., :2, :2]
+        # A part of an arc is an arc of that part of its length and of its bending.
+        part = torch.linspace(0.0, 1.0, n_points + 1, dtype=q.dtype, device=q.device)
+        lengths = part * length[..., None]
+        bendings = part[:, None] * bending[..., None, :]
+        steps = transforms(lengths, bendings, torch.zeros_like(part))
+        frames = poses[..., :-1, None, :, :] @ steps
+        return frames.unflatten(-4, (self.n_segments, -1)).flatten(-4, -3)
+
     def extra_repr(self) -> str:
         """Return the summary shown by repr()."""
         words = [f"{self.n_segments} segments", f"{self.n_actuators} actuators"]

@@ -8,7 +8,6 @@ from typing import Protocol, TypeAlias, TypedDict, runtime_checkable
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 from typing_extensions import Required
 
 from hybridkin._core.commands import Commands
@@ -108,7 +107,7 @@ def body_of(
         if isinstance(chain, ArcChain):
             arcs = _Arcs(chain, rows, n_points)
             body: Body = {
-                "points": spread(arcs.backbone),
+                "points": spread(chain.backbone(rows, n_points)),
                 "actuators": [*map(spread, arcs.actuators())],
                 "segments": arcs.segments,
                 "disks": spread(arcs.disks()),
@@ -171,42 +170,19 @@ class _Arcs:
         self.radii = plain(chain.radii)
         counts = chain.actuators_per_segment
         self.segments = np.repeat(range(chain.n_segments), counts).tolist()
-        frames = plain(chain.poses(q))
-        turns = frames[..., :3, :3]
-        bending = plain(chain.arcs(q)[1])
-        if chain.stage is not None:  # in the frames that turn with the stage
-            turned = turns[:, 0].swapaxes(1, 2) @ turns[:, 1]
-            bending = bending @ turned[:, :2, :2]
-        self.backbone = plain(chain.backbone(q, n_points))
-        offsets = plain(chain.offsets)
-        along = np.linspace(0.0, 1.0, n_points + 1)[:, None]
-        self.centres = []  # (K, P, 3) of each segment
-        self.turns = []  # (K, P, 3, 3)
-        for s in range(chain.n_segments):
-            start = s * n_points
-            centre = self.backbone[:, start : start + n_points + 1].copy()
-            # The backbone includes the rigid offset, the actuators do not.
-            centre[:, -1] -= offsets[s] * frames[:, s + 1, :3, 2]
-            self.centres.append(centre)
-
-            # An arc turns evenly about the normal of its bending direction.
-            normal = np.zeros((len(q), 1, 3))
-            normal[:, 0, 0] = -bending[:, s, 1]
-            normal[:, 0, 1] = bending[:, s, 0]
-            rotation_vectors = along * normal
-            arc = Rotation.from_rotvec(rotation_vectors.reshape(-1, 3)).as_matrix()
-            arc = arc.reshape(*rotation_vectors.shape, 3)
-            self.turns.append(turns[:, s, None] @ arc)
+        of_arc = max(2, n_points // chain.arcs_per_segment)
+        frames = plain(chain.frames(q, of_arc))  # (K, S, P, 4, 4)
+        self.centres = frames[..., :3, 3]
+        self.turns = frames[..., :3, :3]
 
     def actuators(self) -> list[NDArray]:
         """Return the points of every actuator, each (K, P_i, 3)."""
         paths = []
         for s, angle in zip(self.segments, plain(self.chain.angles), strict=True):
             place = self.radii[s] * np.array([np.cos(angle), np.sin(angle), 0.0])
-            path = []
-            for k in range(self.chain.starts[s], s + 1):
-                path.append(self.centres[k] + self.turns[k] @ place)
-            paths.append(np.concatenate(path, axis=1))
+            passed = slice(self.chain.starts[s], s + 1)
+            points = self.centres[:, passed] + self.turns[:, passed] @ place
+            paths.append(points.reshape(len(points), -1, 3))
         return paths
 
     def disks(self) -> NDArray:
@@ -221,5 +197,5 @@ class _Arcs:
     def _disk(self, s: int, point: int, radius: float) -> NDArray:
         corner = np.linspace(0.0, 2.0 * np.pi, _CORNERS)
         circle = np.stack([np.cos(corner), np.sin(corner), 0.0 * corner])
-        rim = self.turns[s][:, point] @ (_RIM * radius * circle)
-        return self.centres[s][:, point, None] + rim.swapaxes(-1, -2)
+        rim = self.turns[:, s, point] @ (_RIM * radius * circle)
+        return self.centres[:, s, point, None] + rim.swapaxes(-1, -2)

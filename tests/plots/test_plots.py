@@ -11,6 +11,7 @@ from sklearn.base import BaseEstimator, RegressorMixin
 from hybridkin import (
     ConstantCurvatureChain,
     ElasticTendonChain,
+    ForceTendonChain,
     HybridForwardModel,
     InverseKinematics,
     datasets,
@@ -100,6 +101,17 @@ def test_tendons_on_stages_are_drawn_as_long_as_they_are():
     drawn = [np.linalg.norm(np.diff(path[0], axis=0), axis=1).sum() for path in actuators]
     straight = np.repeat([0.0, 0.0, 0.1, 0.22], chain.actuators_per_segment)
     np.testing.assert_allclose(drawn[2:], (straight + q[0])[2:], rtol=1e-5)
+
+
+def test_tendons_of_a_heavy_body_are_drawn_as_long_as_they_are():
+    chain = ForceTendonChain([0.02, 0.015], [0.2, 0.15], [0.05, 0.02], [90.0, 60.0], weight=1.5)
+    q = np.array([[0.9, 0.1, 0.0, 0.3, 0.0, 0.2]])
+    actuators = body_of(chain, q, 300)["actuators"]
+    drawn = [np.linalg.norm(np.diff(path[0], axis=0), axis=1).sum() for path in actuators]
+    with torch.no_grad():
+        arcs = chain._arcs_of_rows(torch.from_numpy(q))[:, 0]
+        lengths = chain._statics().readings @ arcs
+    np.testing.assert_allclose(drawn, lengths, rtol=1e-5)
 
 
 # Learning curves
