@@ -55,7 +55,8 @@ class HysteresisOperator(ABC):
         q : array or Tensor of shape (T, n)
             Commanded tendon length changes in order of time [m].
         state : array or Tensor of shape (R, n), optional
-            State at the end of the previous motion. None: start without hysteresis, y_0 = q_0.
+            State at the end of the previous motion [unit of q]. None: start without hysteresis,
+            y_0 = q_0.
         dt : float or array-like of shape (T,), optional
             Time since the row before, of every row [s]. Creep needs it; without `state` the first
             one has no effect.
@@ -65,7 +66,7 @@ class HysteresisOperator(ABC):
         y : array or Tensor of shape (T, n)
             Effective changes [m], the input of the robot's model.
         state : array or Tensor of shape (R, n)
-            State for the rows that follow.
+            State for the rows that follow [unit of q].
 
         Raises
         ------
@@ -86,7 +87,8 @@ class HysteresisOperator(ABC):
         y : array or Tensor of shape (T, n)
             Desired effective changes in order of time [m].
         state : array or Tensor of shape (R, n), optional
-            State at the end of the previous motion. None: start without hysteresis, q_0 = y_0.
+            State at the end of the previous motion [unit of q]. None: start without hysteresis,
+            q_0 = y_0.
         dt : float or array-like of shape (T,), optional
             Time since the row before, of every row, as in `apply` [s].
 
@@ -95,7 +97,7 @@ class HysteresisOperator(ABC):
         q : array or Tensor of shape (T, n)
             Commands to send [m]. They jump by up to `width` when an actuator reverses.
         state : array or Tensor of shape (R, n)
-            State for the rows that follow.
+            State for the rows that follow [unit of q].
 
         Raises
         ------

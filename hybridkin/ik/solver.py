@@ -514,7 +514,8 @@ class InverseKinematics:
         progress : callable, optional
             Called as ``progress(i, T)`` before point i.
         state : array of shape (R, n), optional
-            State of the hysteresis at one start, see `Tracker.reset`. Default: without hysteresis.
+            State of the hysteresis at one start, see `Tracker.reset` [unit of q]. Default: without
+            hysteresis.
 
         Returns
         -------

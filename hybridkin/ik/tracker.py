@@ -49,7 +49,7 @@ class Tracker(Portable):
     effective : array of shape (n,)
         What the actuators do, where the model is evaluated [unit of q]: `q` without hysteresis.
     state : array of shape (R, n) or None
-        State of the hysteresis after that command, for `reset`; None without hysteresis.
+        State of the hysteresis after that command, for `reset` [unit of q]; None without.
     x : array of shape (3,)
         The model's tip at the start of the last step [m], in the shape of the task.
     error : float
@@ -185,8 +185,8 @@ class Tracker(Portable):
         q : array-like of shape (n,)
             Command, in the unit of q. From outside the limits it returns at `dq_max`.
         state : array of shape (R, n), optional
-            State of the hysteresis: `state` of a tracker, or as from `apply` of the model's `play_`
-            with the commands until now. Default: without hysteresis at q.
+            State of the hysteresis [unit of q]: `state` of a tracker, or as from `apply` of the
+            model's `play_` with the commands until now. Default: without hysteresis at q.
         """
         start = as_tensor(q, "q", self._settings.task.device)
         n = self._settings.n_actuators
