@@ -495,7 +495,7 @@ def examined(case: Case, fit: bool | None = None) -> Outcome:
     messages = fitted.messages
     kinds += ("calibration",) * bool(messages)
     with torch.no_grad():
-        tips = fitted.hybrid.module(torch.from_numpy(case.test.q)).numpy()
+        tips = fitted.module(torch.from_numpy(case.test.q)).numpy()
     error = float(np.linalg.norm(tips - case.test.x, axis=1).mean())
     return Outcome(kinds, " ".join([advice, *messages]), error)
 

@@ -98,14 +98,14 @@ def _module(rows: Rows, spec: Spec, weighted: Weighted) -> HybridModule | WithPo
     return HybridModule(spec.mechanical, corrections, weights, None, tested, plane)
 
 
-def few_rows(rows: Rows, spec: Spec, coverage: float | None) -> list[str]:
+def few_rows(rows: Rows, spec: Spec) -> list[str]:
     """Return warnings for rows that are too few or alike; raise an error below the least number.
 
     The rms of 20 held-out errors has a relative standard error of about one sixth.
     """
     n_rows, n = rows.X.shape
     learned = spec.error_model.learns
-    least = 1 + bool(learned or spec.calibrate) + (coverage is not None)
+    least = 1 + bool(learned or spec.calibrate) + (spec.coverage is not None)
     if n_rows < least:
         raise ValueError(
             f"`X` must hold at least {least} different rows of positive weight, got "

@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from hybridkin._core.model import as_forward_model
 from hybridkin.calibration.hysteresis_fit import HysteresisLog, which_count
@@ -29,20 +29,17 @@ class Past(NamedTuple):
 _PLAIN: dict[str, Any] = {"relevance_rounds": 0, "max_hidden": 0, "random_state": 0}
 
 
-def play_of(
-    play: ArrayLike | HysteresisOperator | str | None, spec: Spec, rows: Rows
-) -> tuple[HysteresisOperator | None, list[str]]:
-    """Return the hysteresis for the setting `play` of a HybridForwardModel, and warnings about it.
+def play_of(spec: Spec, rows: Rows) -> tuple[HysteresisOperator | None, list[str]]:
+    """Return the hysteresis for the setting `play`, and warnings about it.
 
     Parameters
     ----------
-    play : None, "auto", float, array-like of shape (n,) or HysteresisOperator
-        The setting.
     spec : Spec
-        The mechanical model, and its parameters to calibrate first.
+        The setting, the mechanical model, and its parameters to calibrate first.
     rows : Rows
         The log, with the rows of each run in order of time.
     """
+    play = spec.play
     if play is None:
         return None, []
     ranges = np.ptp(rows.X, axis=0)
@@ -107,17 +104,12 @@ def choose_hysteresis(spec: Spec, rows: Rows) -> HysteresisOperator | None:
     )
 
 
-def moved_without(
-    play: ArrayLike | HysteresisOperator | str | None,
-    spec: Spec,
-    log: Rows,
-    held_out: NDArray,
-) -> Rows:
+def moved_without(spec: Spec, log: Rows, held_out: NDArray) -> Rows:
     """Return the measured rows with what the actuators do, by the hysteresis of the others.
 
     Parameters
     ----------
-    play, spec, log
+    spec, log
         As for `play_of`; rows of weight zero move the actuators.
     held_out : ndarray of int
         Places of measured rows that do not count.
@@ -125,7 +117,7 @@ def moved_without(
     measured = np.flatnonzero(log.counts > 0.0)
     weights = log.counts.copy()
     weights[measured[held_out]] = 0.0
-    operator, _ = play_of(play, spec, replace(log, weights=weights).in_runs())
+    operator, _ = play_of(spec, replace(log, weights=weights).in_runs())
     moved = log if operator is None else log.effective(operator)
     return moved.take(measured)
 

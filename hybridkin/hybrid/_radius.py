@@ -44,12 +44,9 @@ class Radius(NamedTuple):
 
 
 def conformal_radius(
-    spec: Spec,
-    rows: Rows,
-    coverage: float,
-    moved: Callable[[NDArray], Rows] | None = None,
-) -> tuple[Radius, list[str]]:
-    """Return the radius that covers a share `coverage` of held-out tips, and warnings.
+    spec: Spec, rows: Rows, moved: Callable[[NDArray], Rows] | None = None
+) -> tuple[Radius | None, list[str]]:
+    """Return the radius that covers the share of held-out tips, and warnings; None without one.
 
     Whole groups are held out in five folds, and everything, calibration included, is fitted again
     without them. Without groups every row is a group. The errors in the domain of these fits give
@@ -58,11 +55,9 @@ def conformal_radius(
     Parameters
     ----------
     spec : Spec
-        Settings of the fits.
+        Settings of the fits, and the share of the tips, its `coverage`.
     rows : Rows
         The measured rows.
-    coverage : float
-        Share of the tips.
     moved : callable, optional
         Returns the rows with the motion of the actuators, by hysteresis that was found without
         some of them, given as places. Default: the rows themselves.
@@ -72,6 +67,9 @@ def conformal_radius(
     Lee, Barber & Willett, Distribution-free inference with hierarchical data (2023), the rank by
     groups; Vovk, Annals of Mathematics and AI 74 (2015), the pooling over folds.
     """
+    coverage = spec.coverage
+    if coverage is None:
+        return None, []
     spec = replace(spec, held_out=False, progress=None)
     y = rows.tips
     groups = rows.groups

@@ -10,7 +10,7 @@ from typing import NamedTuple, cast
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 from typing_extensions import Self
 
@@ -18,9 +18,10 @@ from hybridkin._core.arrays import countable
 from hybridkin._core.directions import Directions
 from hybridkin._core.model import ForwardModel
 from hybridkin.calibration.calibrate import CalibrationResult, fit_geometry, refitted
-from hybridkin.calibration.choice import GeometryChoice, Start, choose_geometry
+from hybridkin.calibration.choice import GeometryChoice, choose_geometry
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
+from hybridkin.chains.hysteresis import HysteresisOperator
 from hybridkin.hybrid._drift import too_far
 from hybridkin.hybrid._module import Hybrid, TipCorrection
 from hybridkin.hybrid._rows import Rows
@@ -29,6 +30,7 @@ from hybridkin.hybrid.cv_results import CvResults
 from hybridkin.hybrid.held_out import Predictions
 
 Seed = int | np.random.RandomState | None
+Play = ArrayLike | HysteresisOperator | str | None
 Weighted = list[tuple[float, TipCorrection]]  # weights and corrections, without guards
 
 
@@ -120,6 +122,13 @@ class FittedError:
         return Learned(name, self.rejected, self.held_out)
 
 
+class FitStart(NamedTuple):
+    """Where the choices of a fit to a part of a log start: those of the fit to the whole log."""
+
+    error_model: ErrorModel
+    geometry: GeometryChoice | None
+
+
 @dataclass(frozen=True)
 class Spec:
     """Specification of a fit: the resolved settings of a HybridForwardModel."""
@@ -129,7 +138,11 @@ class Spec:
     calibrate: tuple[str, ...] | str = ()  # geometry to calibrate, or "auto"
     guard: str | None = "leverage"
     output: str = "position"
-    starts: tuple[Start | None, ...] = ()  # of that choice: those of all rows of a log
+    play: Play = None
+    coverage: float | None = None
+    near: GeometryChoice | None = (
+        None  # that of the whole log, where that choice starts
+    )
     geometry: GeometryChoice | None = None  # how `calibrate` was chosen
     calibration: CalibrationResult | None = None  # how `mechanical` was calibrated
     messages: tuple[str, ...] = ()  # warnings of that choice and calibration
@@ -138,6 +151,19 @@ class Spec:
     # Of the commands, with backlash between them and the rows.
     commanded: Directions | None = None
     progress: Callable[[int, int], None] | None = None  # gets (done, total)
+
+    def starting_at(self, start: FitStart) -> Spec:
+        """Return the specification of a fit to a part of a log, with starts of its choices.
+
+        Errors on held-out rows that predictions do not need are then not computed. "auto" fits only
+        its candidates.
+        """
+        return replace(
+            self,
+            error_model=self.error_model.starting_at(start.error_model),
+            near=start.geometry,
+            held_out=False,
+        )
 
     def with_geometry_chosen(
         self,
@@ -160,7 +186,7 @@ class Spec:
                 weights=rows.weights,
                 outside=self.error_model.learns,
                 parameters=None if automatic else self.calibrate,
-                starts=self.starts,
+                starts=() if self.near is None else self.near.starts,
             )
         return replace(
             self,

@@ -39,7 +39,7 @@ from hybridkin.hybrid._drift import Drift
 from hybridkin.hybrid._module import Hybrid
 from hybridkin.hybrid._radius import Radius
 from hybridkin.hybrid._range import TrainingRange
-from hybridkin.hybrid._spec import Learned
+from hybridkin.hybrid._spec import FitStart, Learned
 from hybridkin.hybrid._wrapped import WithPose, in_columns
 from hybridkin.hybrid.cv_results import CvResults
 from hybridkin.hybrid.estimator import HybridForwardModel
@@ -90,13 +90,13 @@ def stored_hybrid(model: HybridForwardModel) -> Stored:
             },
             **model.change_._asdict(),
             "training_range": fit.training_range,
-            **_stored_play(fit.play),
+            **_stored_play(model.play_),
             "state_range": fit.state_range,
-            "radius": fit.radius,
+            "radius": model.radius_,
             "fitted_rows": fit.fitted_rows,
         },
         {
-            "module": fit.module.stored(),
+            "module": model.fitted_module_.stored(),
             "nominal": None if nominal is None else as_forward_model(nominal).stored(),
         },
         params=params,
@@ -167,7 +167,7 @@ def hybrid_of(stored: Stored, training: object) -> HybridForwardModel:
     model.error_model = stored.value("error_model", (str, dict, None))
     if isinstance(model.error_model, dict):
         model.error_model = _estimator(model.error_model)
-    model._checked_error_model()
+    start = FitStart(model._checked_error_model(), None)
     restore_columns(model, stored, n)
     module: Hybrid = restorer()(stored.part("module"))
     if isinstance(module, WithPose) != (model.output == "pose"):
@@ -180,7 +180,8 @@ def hybrid_of(stored: Stored, training: object) -> HybridForwardModel:
         with torch.no_grad():
             m = in_columns(module, model.output)(q).shape[1]
         drift = _restored_drift(stored, Drift.of_range(q, m))
-        model._take(_restored_fit(stored, training, module, drift.emptied()))
+        fit = _restored_fit(stored, training, module, drift.emptied(), start)
+        model._take(fit)
         shift = stored.array("shift", (n,))
         model.change_ = Change(shift, stored.array("motion", (4, 4)))
         model._drift = drift
@@ -197,7 +198,11 @@ def hybrid_of(stored: Stored, training: object) -> HybridForwardModel:
 
 
 def _restored_fit(
-    stored: Stored, training: object, module: Hybrid, no_drift: Drift
+    stored: Stored,
+    training: object,
+    module: Hybrid,
+    no_drift: Drift,
+    start: FitStart,
 ) -> HybridFit:
     """Return what the fit of a described hybrid found, without what files do not contain."""
     n = stored.value("n_features_in", int)
@@ -225,6 +230,7 @@ def _restored_fit(
         single_output=stored.value("single_output", bool),
         training_range=TrainingRange(*stored.array("training_range", (2, n))),
         no_drift=no_drift,
+        start=start,
         comparison=comparison,
         play=_play_of(stored, n),
         state_range=states,

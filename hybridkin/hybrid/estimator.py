@@ -36,7 +36,7 @@ from hybridkin.hybrid._predictor import HybridPredictor
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._settings import CONSTRAINTS, error_model_of
 from hybridkin.hybrid._spec import ErrorModel, Spec, residuals
-from hybridkin.hybrid.log_fit import HybridFit, Settings, fit_to_log
+from hybridkin.hybrid.log_fit import HybridFit, fit_to_log
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.hidden_layer import check_rows
 
@@ -246,10 +246,9 @@ class HybridForwardModel(HybridPredictor):
             `calibrate`.
         """
         fitted = fit_to_log(*prepared(self, X, y, groups, sample_weight))
-        self._take(fitted.hybrid)
         for message in fitted.messages:
             warnings.warn(message, stacklevel=2)
-        return self
+        return with_fit(self, fitted)
 
     def partial_fit(
         self,
@@ -475,9 +474,9 @@ class HybridForwardModel(HybridPredictor):
 
     def _spec(self, error_model: ErrorModel, rows: Rows) -> Spec:
         """Return the settings as a specification, with a copy of the mechanical model."""
-        if self.mechanical_model is None:
-            return Spec(None, error_model, (), self.guard, self.output)
-        mechanical = as_forward_model(copy.deepcopy(self.mechanical_model))
+        mechanical = self.mechanical_model
+        if mechanical is not None:
+            mechanical = as_forward_model(copy.deepcopy(mechanical))
         names = ()
         if isinstance(mechanical, Chain):
             check_unscaled("X", rows.X, "actuator vectors [m or rad]")
@@ -492,7 +491,15 @@ class HybridForwardModel(HybridPredictor):
                 names = mechanical.default_parameters
             elif not isinstance(names, str):
                 names = tuple(names)
-        return Spec(mechanical, error_model, names, self.guard, self.output)
+        return Spec(
+            mechanical,
+            error_model,
+            names,
+            self.guard,
+            self.output,
+            self.play,
+            self.coverage,
+        )
 
 
 def _check_positive(name: str, value: object, high: float) -> None:
@@ -506,11 +513,11 @@ def prepared(
     y: object,
     groups: ArrayLike | None = None,
     sample_weight: ArrayLike | None = None,
-) -> tuple[Settings, Rows]:
+) -> tuple[Spec, Rows]:
     """Return the checked settings of a model and the rows of a log, for `fit_to_log`."""
     error_model = model._checked_error_model()
     log = model._checked_rows(X, y, sample_weight, groups)
-    return Settings(model._spec(error_model, log), model.play, model.coverage), log
+    return model._spec(error_model, log), log
 
 
 def with_fit(model: HybridForwardModel, fit: HybridFit) -> HybridForwardModel:

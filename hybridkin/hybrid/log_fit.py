@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from typing_extensions import Self
 
 from hybridkin._core.digests import row_digests
@@ -21,45 +20,14 @@ from hybridkin.hybrid._module import Hybrid
 from hybridkin.hybrid._radius import Radius, conformal_radius
 from hybridkin.hybrid._range import TrainingRange, state_range
 from hybridkin.hybrid._rows import Rows
-from hybridkin.hybrid._spec import ErrorModel, Learned, Spec
+from hybridkin.hybrid._spec import FitStart, Learned, Spec
 from hybridkin.hybrid.cv_results import CvResults
 from hybridkin.hybrid.held_out import MEAN_LENGTH, Predictions
 
 
-class Start(NamedTuple):
-    """Where the choices of a fit to a part of a log start: those of the fit to the whole log."""
-
-    error_model: ErrorModel
-    geometry: GeometryChoice | None
-
-
-@dataclass(frozen=True)
-class Settings:
-    """The checked settings of a HybridForwardModel."""
-
-    spec: Spec
-    play: ArrayLike | HysteresisOperator | str | None
-    coverage: float | None
-
-    def starting_at(self, start: Start) -> Self:
-        """Return the settings of a fit to a part of the log, whose choices start at those of all.
-
-        Errors on held-out rows that predictions do not need are then not computed. "auto" fits only
-        its candidates.
-        """
-        error_model = self.spec.error_model.starting_at(start.error_model)
-        starts = ()
-        if start.geometry is not None:
-            starts = start.geometry.starts
-        spec = replace(
-            self.spec, error_model=error_model, held_out=False, starts=starts
-        )
-        return replace(self, spec=spec)
-
-
 @dataclass(frozen=True, eq=False)
 class HybridFit:
-    """What a fit found, and a `HybridForwardModel` keeps.
+    """What a fit found, and a `HybridForwardModel` keeps; files do not contain all of it.
 
     Attributes
     ----------
@@ -73,8 +41,14 @@ class HybridFit:
         Of what the actuators did, and of the states of hysteresis.
     no_drift : Drift
         The drift before any measurement.
+    start : FitStart
+        For fits to parts of the log.
     calibration, comparison, candidates, play, radius
         The attributes of the model; the comparison is its ``cv_results_``.
+    outside : Predictions or None
+        With such a start: of the candidates of "auto".
+    messages : tuple of str
+        Warnings, which were not issued.
     """
 
     module: Hybrid
@@ -84,6 +58,7 @@ class HybridFit:
     single_output: bool
     training_range: TrainingRange
     no_drift: Drift
+    start: FitStart
     error_model: object = None
     calibration: CalibrationResult | None = None
     comparison: CvResults | None = None
@@ -91,6 +66,8 @@ class HybridFit:
     play: HysteresisOperator | None = None
     state_range: TrainingRange | None = None
     radius: Radius | None = None
+    outside: Predictions | None = None
+    messages: tuple[str, ...] = ()
 
     def expecting(self, distance: float) -> Self:
         """Return the same with the mean error of a comparison, which "auto" expects [m]."""
@@ -104,56 +81,42 @@ class HybridFit:
         return replace(self, fitted_rows=np.unique(row_digests(q, x)))
 
 
-class LogFit(NamedTuple):
-    """A fit to a log, and what fits to parts of the log need."""
-
-    hybrid: HybridFit
-    messages: list[str]  # warnings, which were not issued
-    start: Start
-    outside: Predictions | None  # with a start: of the candidates of "auto"
-
-
 def fit_to_log(
-    settings: Settings, log: Rows, geometry: GeometryChoice | None = None
-) -> LogFit:
+    spec: Spec, log: Rows, geometry: GeometryChoice | None = None
+) -> HybridFit:
     """Return what a fit finds; it changes no argument.
 
     Parameters
     ----------
-    settings : Settings
+    spec : Spec
         The settings.
     log : Rows
         The rows as they were measured.
     geometry : GeometryChoice, optional
         What to calibrate. Default: chosen on the rows.
     """
-    spec = settings.spec
     rows = log.distinct()
     digests = rows.digests()
-    messages = few_rows(rows, spec, settings.coverage)
+    messages = few_rows(rows, spec)
     chosen = spec.with_geometry_chosen(rows, geometry)
-    play, of_play = play_of(settings.play, chosen, log.in_runs())
+    play, of_play = play_of(chosen, log.in_runs())
+    measured = rows
     states = None
+    moved = None
     if play is not None:
         commanded = rows.directions
         spec = replace(spec, commanded=commanded)
         chosen = replace(chosen, commanded=commanded)
         states = state_range(play.inner_states(log.X, log.run_of_rows, log.time), log)
+        measured = log.take(np.flatnonzero(log.counts > 0.0))
+        moved = partial(moved_without, chosen, log)
         rows = log.effective(play).distinct()
     fitted = fit_hybrid(chosen, rows)
     fitted.take_low_rank(rows.q)
-    radius = None
-    of_radius = []
-    if settings.coverage is not None:
-        measured = rows
-        moved = None
-        if play is not None:
-            measured = log.take(np.flatnonzero(log.counts > 0.0))
-            moved = partial(moved_without, settings.play, chosen, log)
-        radius, of_radius = conformal_radius(spec, measured, settings.coverage, moved)
+    radius, of_radius = conformal_radius(spec, measured, moved)
     messages += [*of_play, *of_radius, *fit_messages(fitted.spec, rows)]
     error = fitted.error
-    hybrid = HybridFit(
+    return HybridFit(
         module=fitted.module,
         learned=error.learned,
         noise=error.noise,
@@ -168,6 +131,7 @@ def fit_to_log(
         play=play,
         state_range=states,
         radius=radius,
+        start=FitStart(error.settled, chosen.geometry),
+        outside=error.outside,
+        messages=tuple(dict.fromkeys(messages)),
     )
-    start = Start(error.settled, chosen.geometry)
-    return LogFit(hybrid, [*dict.fromkeys(messages)], start, error.outside)

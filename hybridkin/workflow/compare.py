@@ -26,7 +26,7 @@ from hybridkin.chains.robots import RobotDescription
 from hybridkin.hybrid.estimator import HybridForwardModel, prepared, with_fit
 from hybridkin.hybrid.held_out import HeldOut, Predictions, chosen_blend
 from hybridkin.hybrid.log_distance import held_out_distances
-from hybridkin.hybrid.log_fit import LogFit, Start, fit_to_log
+from hybridkin.hybrid.log_fit import FitStart, HybridFit, fit_to_log
 from hybridkin.learning.elm_cv import growing_network
 from hybridkin.learning.regressor_modules import error_module
 from hybridkin.native.library import evaluate
@@ -270,7 +270,7 @@ def with_play_detected(
     if mechanical.start is not None and settings.auto and in_order:
         model = HybridForwardModel(mechanical.model, "drop", play="auto")
         fitted = fit_to_log(*prepared(model, rows.commands, rows.x, rows.motions))
-        play = None if fitted.hybrid.play is None else "auto"
+        play = None if fitted.play is None else "auto"
     return replace(settings, play=play)
 
 
@@ -279,7 +279,7 @@ class FittedModels(NamedTuple):
 
     mechanical: Mechanical
     models: dict[str, HybridForwardModel]
-    fits: dict[str, LogFit]
+    fits: dict[str, HybridFit]
 
 
 def fit_to_all(
@@ -307,9 +307,9 @@ def fit_to_all(
         progress_of_fit(0, 1)
         if name == AUTO:  # it will be saved
             model.set_params(coverage=settings.coverage)
-        checked, log = prepared(model, rows.commands, rows.x, rows.motions)
-        spec = replace(checked.spec, progress=progress_of_fit, compared=True)
-        fits[name] = fit_to_log(replace(checked, spec=spec), log, mechanical.geometry)
+        spec, log = prepared(model, rows.commands, rows.x, rows.motions)
+        spec = replace(spec, progress=progress_of_fit, compared=True)
+        fits[name] = fit_to_log(spec, log, mechanical.geometry)
     return FittedModels(mechanical, models, fits)
 
 
@@ -425,7 +425,7 @@ def _one_fold(
     train: MeasuredLog,
     test: MeasuredLog,
     of_all: Mechanical,
-    starts: dict[str, Start],
+    starts: dict[str, FitStart],
 ) -> _FoldResult:
     """Return the predictions of every model for test rows after a fit to training rows."""
     mechanical = Mechanical.of(robot, train, settings.loss, of_all)
@@ -436,20 +436,21 @@ def _one_fold(
     choices = {}
     auto = None
     for name, model in models_to_save(robot, mechanical, settings).items():
-        checked, log = prepared(model, train.commands, train.x, train.motions)
-        near_all = checked.starting_at(starts[name])
-        fitted = fit_to_log(near_all, log, mechanical.geometry)
-        model = with_fit(model, fitted.hybrid)
-        if fitted.outside is None or model.candidates_ is None:
+        spec, log = prepared(model, train.commands, train.x, train.motions)
+        spec = spec.starting_at(starts[name])
+        fitted = fit_to_log(spec, log, mechanical.geometry)
+        model = with_fit(model, fitted)
+        candidates = fitted.candidates
+        if fitted.outside is None or candidates is None:
             tips[name] = evaluate(model.module_, test.q)[0]
             if name in (DATA_ELM, HYBRID_ELM):
                 choices[name] = choice_in_words(model)
             continue
         q = model.effective(test.commands)
-        for candidate, module in model.candidates_.items():
+        for candidate, module in candidates.items():
             tips[_in_table(candidate)] = evaluate(module, q)[0]
         auto = _AutoOfFold(
-            [*model.candidates_],
+            [*candidates],
             fitted.outside,
             fitted.start.geometry,
             memory_in_words(model),
@@ -483,7 +484,7 @@ def _blended(
         held_out = Predictions(
             predicted[:, others], rows.x[others], counts, rows.motions[others]
         )
-        outer = labels[first[np.searchsorted(motions, auto.outside.groups)]]
+        outer = labels[first[np.searchsorted(motions, np.asarray(auto.outside.groups))]]
         both = HeldOut.of(held_out, auto.outside, np.append(labels[others], outer))
         weights, results = chosen_blend(auto.names, both, auto.geometry)
         blend[~others] = np.tensordot(weights, predicted[:, ~others], 1)

@@ -113,8 +113,8 @@ def fit_log(
     if settings.coverage is not None and not settings.auto:
         model.set_params(coverage=settings.coverage)
         fit = fit_to_log(*prepared(model, rows.commands, rows.x, rows.motions))
-    hybrid = fit.hybrid.of_all_rows(complete.q, complete.x)
-    model = with_fit(model, hybrid.expecting(float(compared.errors[saved].mean())))
+    fit = fit.of_all_rows(complete.q, complete.x)
+    model = with_fit(model, fit.expecting(float(compared.errors[saved].mean())))
     progress("writing the report", 0, 1)
     held_out = {}
     for name, errors in compared.errors.items():

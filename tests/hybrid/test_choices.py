@@ -119,7 +119,7 @@ class Recorded(NoCorrection):
 
 def test_the_radius_chooses_the_error_model_without_the_held_out_rows():
     model = Recorded()
-    found, messages = _radius.conformal_radius(Spec(CHAIN, model), Rows(*log(30)), 0.5)
+    found, messages = _radius.conformal_radius(Spec(CHAIN, model, coverage=0.5), Rows(*log(30)))
     assert model.lengths == [24] * 5
     assert messages == []
     assert 0.0 < found.inside < inf

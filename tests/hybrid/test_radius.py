@@ -40,7 +40,7 @@ def few(n, coverage, groups=True, error_model="drop"):
     q, x, motion = motions(0, n, 4)
     model = HybridForwardModel(robots.bionic_handling_assistant(), error_model, coverage=coverage)
     fitted = fit_to_log(*prepared(model, q, x, motion if groups else None))
-    return with_fit(model, fitted.hybrid), fitted.messages, q
+    return with_fit(model, fitted), fitted.messages, q
 
 
 @pytest.mark.parametrize(("n", "finite"), [(8, False), (9, True)])
@@ -113,6 +113,6 @@ def test_a_radius_of_two_motions_holds_out_one_and_then_rows(n, error_model):
     )
     fitted = fit_to_log(*prepared(model, q, x, motion))
     told = any("`coverage`" in text for text in fitted.messages)
-    assert (fitted.hybrid.radius.inside < 0.2) == (not told)
+    assert (fitted.radius.inside < 0.2) == (not told)
     with pytest.raises(ValueError, match="`groups` must hold at least two motions"):
         model.fit(q[:12], x[:12], groups=motion[:12])

@@ -108,10 +108,10 @@ def test_a_fit_near_another_one_chooses_as_from_nothing():
     robot, rows = measured(6)
     for error_model in ("linear", "quadratic"):
         model = HybridForwardModel(robot.chain, error_model, coupling="serial")
-        settings, log = prepared(model, rows.q, rows.x, rows.motions)
-        fitted = fit_to_log(settings, log)
-        near = fit_to_log(settings.starting_at(fitted.start), log)
-        assert near.hybrid.error_model.alphas == fitted.hybrid.error_model.alphas
-        x = with_fit(model, fitted.hybrid).predict(rows.q)
-        x_near = with_fit(model, near.hybrid).predict(rows.q)
+        spec, log = prepared(model, rows.q, rows.x, rows.motions)
+        fitted = fit_to_log(spec, log)
+        near = fit_to_log(spec.starting_at(fitted.start), log)
+        assert near.error_model.alphas == fitted.error_model.alphas
+        x = with_fit(model, fitted).predict(rows.q)
+        x_near = with_fit(model, near).predict(rows.q)
         assert_allclose(x_near, x, rtol=0.0, atol=1e-7)
