@@ -185,24 +185,23 @@ def _rotated(turns: Tensor, vectors: Tensor) -> Tensor:
 def _rotations(segments: Segments) -> tuple[Tensor, Tensor]:
     """Return the rotations (3, 3, A, ...) from start and end frames of arcs to the base frame."""
     _, x, y, c, f, g, *_ = segments
-    xy = -g * x * y
-    entries = [
-        1.0 - g * x * x,
-        xy,
-        f * x,
-        xy,
-        1.0 - g * y * y,
-        f * y,
-        -f * x,
-        -f * y,
-        c,
-    ]
-    steps = _vectors(entries)
+    x_row, y_row, z_row = _rotation(x, y, c, f, g)
+    steps = _vectors([*x_row, *y_row, *z_row])
     ends = [steps[:, :, 0]]
     for step in steps.unbind(2)[1:]:
         ends.append(_rotated(ends[-1][:, :, None], step))
     base = identity(3, x).reshape(3, 3, *[1] * (x.ndim - 1)).expand_as(ends[0])
     return torch.stack([base, *ends[:-1]], dim=2), torch.stack(ends, dim=2)
+
+
+def _rotation(
+    x: Tensor, y: Tensor, c: Tensor, f: Tensor, g: Tensor
+) -> tuple[list[Tensor], list[Tensor], list[Tensor]]:
+    """Return the rows of the rotation from the end frame of an arc to its start frame."""
+    xy = -g * x * y
+    x_row = [1.0 - g * x * x, xy, f * x]
+    y_row = [xy, 1.0 - g * y * y, f * y]
+    return x_row, y_row, [-f * x, -f * y, c]
 
 
 def _second_derivatives(
@@ -326,12 +325,9 @@ def transforms(length: Tensor, bending: Tensor, offsets: Tensor) -> Tensor:
     zero = torch.zeros_like(x)
     across = length * g + offsets * f
     along = length * f + offsets * c
-    xy = -g * x * y
-    x_row = [1.0 - g * x * x, xy, f * x, across * x]
-    y_row = [xy, 1.0 - g * y * y, f * y, across * y]
-    z_row = [-f * x, -f * y, c, along]
-    last_row = [zero, zero, zero, torch.ones_like(x)]
-    entries = [*x_row, *y_row, *z_row, *last_row]
+    x_row, y_row, z_row = _rotation(x, y, c, f, g)
+    entries = [*x_row, across * x, *y_row, across * y, *z_row, along]
+    entries += [zero, zero, zero, torch.ones_like(x)]
     return torch.stack(entries, dim=-1).unflatten(-1, (4, 4))
 
 

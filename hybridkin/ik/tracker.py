@@ -125,12 +125,12 @@ class Tracker(Portable):
     @property
     def x(self) -> NDArray | Tensor:
         """The model's tip before the last step [m], in the shape of the task."""
-        return self._given_back(self._last().x)
+        return _given_back(self._last().x, self._as_numpy)
 
     @property
     def saturated(self) -> NDArray | Tensor:
         """Actuators that the last step held at a limit, bool (n,)."""
-        return self._given_back(self._last().step.saturated)
+        return _given_back(self._last().step.saturated, self._as_numpy)
 
     @property
     def error(self) -> float:
@@ -150,9 +150,6 @@ class Tracker(Portable):
     def _last(self) -> Tick:
         with self._lock:
             return self._robot.last()
-
-    def _given_back(self, rows: Tensor) -> NDArray | Tensor:
-        return as_array(rows[0]).copy() if self._as_numpy else rows[0].clone()
 
     @property
     def status(self) -> IKStatus:
@@ -434,11 +431,13 @@ class _InTorch:
 
     def command(self) -> NDArray | Tensor:
         """Return the present command (n,)."""
-        return self._given_back(self._command)
+        return _given_back(self._command, self._as_numpy)
 
     def effective(self) -> NDArray | Tensor:
         """Return what the actuators do (n,)."""
-        return self._given_back(self._q)
+        return _given_back(self._q, self._as_numpy)
 
-    def _given_back(self, rows: Tensor) -> NDArray | Tensor:
-        return as_array(rows[0]).copy() if self._as_numpy else rows[0].clone()
+
+def _given_back(rows: Tensor, as_numpy: bool) -> NDArray | Tensor:
+    """Return a copy of a single row (1, ...) in the type of the caller's arrays."""
+    return as_array(rows[0]).copy() if as_numpy else rows[0].clone()

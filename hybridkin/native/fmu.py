@@ -12,7 +12,7 @@ import tempfile
 import zipfile
 from pathlib import Path
 from typing import NamedTuple
-from xml.etree import ElementTree
+from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 import numpy as np
 from numpy.typing import NDArray
@@ -226,7 +226,7 @@ def _entries(variables: list[Variable]) -> dict[str, str]:
 def _description(project: CProject, variables: list[Variable], token: str) -> bytes:
     """Return modelDescription.xml."""
     name = str(project.entries["NAME"])
-    root = ElementTree.Element(
+    root = Element(
         "fmiModelDescription",
         fmiVersion="3.0",
         modelName=name,
@@ -234,7 +234,7 @@ def _description(project: CProject, variables: list[Variable], token: str) -> by
         description=f"{project.entries['TITLE']}. {project.entries['ABOUT_Q']}",
         generationTool=f"hybridkin {__version__}",
     )
-    unit = ElementTree.SubElement(
+    unit = SubElement(
         root,
         "CoSimulation",
         modelIdentifier=name,
@@ -243,9 +243,9 @@ def _description(project: CProject, variables: list[Variable], token: str) -> by
     )
     if project.controller is not None:
         unit.set("fixedInternalStepSize", repr(project.gains[2]))
-    listed = ElementTree.SubElement(root, "ModelVariables")
-    structure = ElementTree.SubElement(root, "ModelStructure")
-    ElementTree.SubElement(
+    listed = SubElement(root, "ModelVariables")
+    structure = SubElement(root, "ModelStructure")
+    SubElement(
         listed,
         "Float64",
         name="time",
@@ -254,7 +254,7 @@ def _description(project: CProject, variables: list[Variable], token: str) -> by
         variability="continuous",
     )
     for reference, variable in enumerate(variables, start=1):
-        entry = ElementTree.SubElement(
+        entry = SubElement(
             listed,
             "Float64",
             name=variable.name,
@@ -268,22 +268,22 @@ def _description(project: CProject, variables: list[Variable], token: str) -> by
             numbers = (repr(float(number)) for number in np.ravel(variable.start))
             entry.set("start", " ".join(numbers).replace("nan", "NaN"))
         for size in variable.shape:
-            ElementTree.SubElement(entry, "Dimension", start=str(size))
+            SubElement(entry, "Dimension", start=str(size))
     for kind in ("Output", "InitialUnknown"):
         for reference, variable in enumerate(variables, start=1):
             if variable.causality == "output":
-                ElementTree.SubElement(structure, kind, valueReference=str(reference))
-    ElementTree.indent(root)
-    return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
+                SubElement(structure, kind, valueReference=str(reference))
+    indent(root)
+    return tostring(root, encoding="utf-8", xml_declaration=True)
 
 
 def _build_description(name: str) -> bytes:
     """Return sources/buildDescription.xml, from which importers compile the unit."""
-    root = ElementTree.Element("fmiBuildDescription", fmiVersion="3.0")
-    build = ElementTree.SubElement(root, "BuildConfiguration", modelIdentifier=name)
-    files = ElementTree.SubElement(build, "SourceFileSet", language="C99")
-    ElementTree.SubElement(files, "SourceFile", name="fmu.c")
-    return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
+    root = Element("fmiBuildDescription", fmiVersion="3.0")
+    build = SubElement(root, "BuildConfiguration", modelIdentifier=name)
+    files = SubElement(build, "SourceFileSet", language="C99")
+    SubElement(files, "SourceFile", name="fmu.c")
+    return tostring(root, encoding="utf-8", xml_declaration=True)
 
 
 def _platform() -> str:
