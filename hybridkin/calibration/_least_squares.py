@@ -173,9 +173,10 @@ def solve(
         chain = searched.chain_at(np.frombuffer(key).copy())
         return chain, rows.residual(chain)
 
-    def jacobian(theta: NDArray) -> NDArray:
-        chain, _ = chain_and_residual(theta.tobytes())
-        return rows.jacobian(problem, theta, chain)
+    @lru_cache(1)  # a round starts where the last one ended
+    def jacobian(key: bytes) -> NDArray:
+        chain, _ = chain_and_residual(key)
+        return rows.jacobian(problem, np.frombuffer(key).copy(), chain)
 
     def noise(theta: NDArray) -> float:
         _, residual = chain_and_residual(theta.tobytes())
@@ -188,7 +189,7 @@ def solve(
 
     def slope(theta: NDArray, sigma: float) -> NDArray:
         of_prior = np.diag(1.0 / problem.prior_std)
-        return np.vstack([jacobian(theta) / sigma, of_prior])
+        return np.vstack([jacobian(theta.tobytes()) / sigma, of_prior])
 
     functions: dict[str, Any] = {"jac": slope}
     if robust:

@@ -258,13 +258,16 @@ class HysteresisProblem:
         residual = np.where(self.roots > 0.0, self.measured - tips.numpy(), 0.0)
 
         # Columns of all unknowns, then the target: what they have to explain.
-        by_correction = by_z.numpy()[..., None] * inputs[:, None, None]
-        by_free = by_y.numpy()[:, :, None] * by_weights[:, None, prior.free]
-        n_unknowns = correction.size + len(prior.mean)
-        columns = np.empty((*residual.shape, n_unknowns + 1))
-        columns[..., : correction.size] = by_correction.reshape(*residual.shape, -1)
-        columns[..., correction.size : -1] = by_free.reshape(*residual.shape, -1)
+        n_correction = correction.size
         unknowns = np.append(correction, weights[prior.free])
+        columns = np.empty((*residual.shape, len(unknowns) + 1))
+        in_columns = columns[..., :n_correction].reshape(*by_z.shape, -1)
+        np.multiply(by_z.numpy()[..., None], inputs[:, None, None], out=in_columns)
+        in_columns = columns[..., n_correction:-1].reshape(
+            *residual.shape, -1, y.shape[1]
+        )
+        by_free = by_weights[:, None, prior.free]
+        np.multiply(by_y.numpy()[:, :, None], by_free, out=in_columns)
         columns[..., -1] = residual + columns[..., :-1] @ unknowns
         columns *= self.roots[..., None]
 
