@@ -95,18 +95,17 @@ def fit_to_log(
     geometry : GeometryChoice, optional
         What to calibrate. Default: chosen on the rows.
     """
-    rows = log.distinct()
-    digests = rows.digests()
-    messages = few_rows(rows, spec)
-    chosen = spec.with_geometry_chosen(rows, geometry)
+    commands = log.distinct()
+    messages = few_rows(commands, spec)
+    chosen = spec.with_geometry_chosen(commands, geometry)
     play, of_play = play_of(chosen, log.in_runs())
-    measured = rows
+    rows = commands
+    measured = commands
     states = None
     moved = None
     if play is not None:
-        commanded = rows.directions
-        spec = replace(spec, commanded=commanded)
-        chosen = replace(chosen, commanded=commanded)
+        spec = replace(spec, commanded=commands.directions)
+        chosen = replace(chosen, commanded=commands.directions)
         states = state_range(play.inner_states(log.X, log.run_of_rows, log.time), log)
         measured = log.take(np.flatnonzero(log.counts > 0.0))
         moved = partial(moved_without, chosen, log)
@@ -120,7 +119,7 @@ def fit_to_log(
         module=fitted.module,
         learned=error.learned,
         noise=error.noise,
-        fitted_rows=digests,
+        fitted_rows=commands.digests(),
         single_output=log.y.ndim == 1,
         training_range=TrainingRange.of(rows.X),
         no_drift=Drift.of_range(rows.q, rows.tips.shape[1]),

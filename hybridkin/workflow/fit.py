@@ -213,11 +213,9 @@ def _add_model(
 ) -> None:
     """Add the model and the description of its robot to the files of a report."""
     training = training_notes(report.record)
-    report.file("model.safetensors", partial(_save, model=model, training=training))
+    report.file(
+        "model.safetensors", lambda path: save_model(model, path, training=training)
+    )
     report.text("The model: `hybridkin.load_model('model.safetensors')`.")
     if robot.path is not None:  # the description it was made from
         report.file("robot.toml", partial(shutil.copyfile, robot.path))
-
-
-def _save(path: Path, model: HybridForwardModel, training: dict[str, object]) -> None:
-    save_model(model, path, training=training)
