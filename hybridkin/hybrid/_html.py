@@ -63,10 +63,10 @@ def _error_model(model: HybridPredictor) -> str:
             if weight > 0.0:
                 parts.append(f"{weight:.2f} {name}")
         return f'{" + ".join(parts)} (chosen by "auto")'
-    name = model._fitted.learned.kind
+    name = model._fitted.kind
     if isinstance(model.error_model, str):
         name = f'"{model.error_model}"'
-    if model._fitted.learned.rejected:
+    if model._fitted.error.rejected:
         return f"{name}, {model.coupling}, rejected by the held-out error"
     return f"{name}, {model.coupling}"
 
@@ -80,8 +80,8 @@ def _error(model: HybridPredictor) -> dict[str, str]:
         error_of_first = _mm(results["mean_distance"][0])
         words = f"mean {mean}, {first} model alone {error_of_first}"
         return {"held-out error": words}
-    words = f"standard deviation of a coordinate {_mm(model._fitted.noise)}"
-    if model._fitted.learned.held_out:
+    words = f"standard deviation of a coordinate {_mm(model._fitted.error.noise)}"
+    if model._fitted.error.held_out:
         return {"held-out error": words}
     return {"training error": words}
 

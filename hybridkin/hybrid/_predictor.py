@@ -282,10 +282,10 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """Become the model of a fit; the robot has not changed since."""
         self._fitted = fit
         self.fitted_module_ = fit.module
-        self.error_model_ = fit.error_model
+        self.error_model_ = fit.error.result
         self.calibration_ = fit.calibration
-        self.cv_results_ = fit.comparison
-        self.candidates_ = fit.candidates
+        self.cv_results_ = fit.error.comparison
+        self.candidates_ = fit.error.candidates
         self.play_ = fit.play
         self.radius_ = fit.radius
         self.change_ = Change.none(self.n_features_in_)

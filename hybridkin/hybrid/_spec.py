@@ -65,15 +65,6 @@ class ErrorModel(ABC):
         """
 
 
-class Learned(NamedTuple):
-    """What a description says of a fitted error model."""
-
-    kind: str | None  # class of the fitted error model, None without one
-    rejected: bool = False  # whether held-out errors were least without a correction
-    # Whether the noise is that of held-out rows, not of the training rows.
-    held_out: bool = True
-
-
 @dataclass(frozen=True)
 class FittedError:
     """A fitted error model.
@@ -111,15 +102,12 @@ class FittedError:
     outside: Predictions | None = None
 
     @property
-    def learned(self) -> Learned:
-        """What a description says of it."""
+    def kind(self) -> str | None:
+        """Class of the fitted error model, for files; None without one."""
         result = self.result
         if type(result) is tuple:
             result = result[0]
-        name = None
-        if result is not None:
-            name = type(result).__name__
-        return Learned(name, self.rejected, self.held_out)
+        return None if result is None else type(result).__name__
 
 
 class FitStart(NamedTuple):

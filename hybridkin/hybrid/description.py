@@ -39,7 +39,7 @@ from hybridkin.hybrid._drift import Drift
 from hybridkin.hybrid._module import Hybrid
 from hybridkin.hybrid._radius import Radius
 from hybridkin.hybrid._range import TrainingRange
-from hybridkin.hybrid._spec import FitStart, Learned
+from hybridkin.hybrid._spec import ErrorModel, FittedError
 from hybridkin.hybrid._wrapped import WithPose, in_columns
 from hybridkin.hybrid.cv_results import CvResults
 from hybridkin.hybrid.estimator import HybridForwardModel
@@ -104,10 +104,10 @@ def stored_hybrid(model: HybridForwardModel) -> Stored:
         n_features_in=model.n_features_in_,
         feature_names_in=vars(model).get("feature_names_in_", []),
         single_output=fit.single_output,
-        noise=fit.noise,
-        learned=fit.learned.kind,
-        rejected=fit.learned.rejected,
-        held_out=fit.learned.held_out,
+        noise=fit.error.noise,
+        learned=fit.kind,
+        rejected=fit.error.rejected,
+        held_out=fit.error.held_out,
     )
 
 
@@ -167,7 +167,7 @@ def hybrid_of(stored: Stored, training: object) -> HybridForwardModel:
     model.error_model = stored.value("error_model", (str, dict, None))
     if isinstance(model.error_model, dict):
         model.error_model = _estimator(model.error_model)
-    start = FitStart(model._checked_error_model(), None)
+    error_model = model._checked_error_model()
     restore_columns(model, stored, n)
     module: Hybrid = restorer()(stored.part("module"))
     if isinstance(module, WithPose) != (model.output == "pose"):
@@ -180,7 +180,7 @@ def hybrid_of(stored: Stored, training: object) -> HybridForwardModel:
         with torch.no_grad():
             m = in_columns(module, model.output)(q).shape[1]
         drift = _restored_drift(stored, Drift.of_range(q, m))
-        fit = _restored_fit(stored, training, module, drift.emptied(), start)
+        fit = _restored_fit(stored, training, module, drift.emptied(), error_model)
         model._take(fit)
         shift = stored.array("shift", (n,))
         model.change_ = Change(shift, stored.array("motion", (4, 4)))
@@ -202,7 +202,7 @@ def _restored_fit(
     training: object,
     module: Hybrid,
     no_drift: Drift,
-    start: FitStart,
+    error_model: ErrorModel,
 ) -> HybridFit:
     """Return what the fit of a described hybrid found, without what files do not contain."""
     n = stored.value("n_features_in", int)
@@ -222,16 +222,25 @@ def _restored_fit(
     if isinstance(training, dict) and training.get("cv_results"):
         results = training["cv_results"].items()
         comparison = cast(CvResults, {key: _array(value) for key, value in results})
+    kind = None
+    rejected = False
+    held_out = True
+    if "learned" in stored.settings:
+        kind = stored.value("learned", (str, None))
+        rejected = stored.value("rejected", bool)
+        held_out = stored.value("held_out", bool)
+    elif "error_model" in stored.parts:  # of a first file of this format
+        kind = stored.part("error_model").kind
+    noise = stored.value("noise", float)
+    error = FittedError(None, [], error_model, noise, rejected, held_out, comparison)
     return HybridFit(
         module=module,
-        learned=_learned(stored),
-        noise=stored.value("noise", float),
+        error=error,
+        kind=kind,
         fitted_rows=stored.array("fitted_rows", "N"),
         single_output=stored.value("single_output", bool),
         training_range=TrainingRange(*stored.array("training_range", (2, n))),
         no_drift=no_drift,
-        start=start,
-        comparison=comparison,
         play=_play_of(stored, n),
         state_range=states,
         radius=radius,
@@ -265,17 +274,6 @@ def training_of(model: HybridForwardModel) -> dict[str, object]:
     if model.cv_results_ is not None:
         results["cv_results"] = model.cv_results_
     return plain(results)
-
-
-def _learned(stored: Stored) -> Learned:
-    if "learned" not in stored.settings:  # of a first file of this format
-        part = stored.parts.get("error_model")
-        return Learned(None if part is None else part.kind)
-    return Learned(
-        stored.value("learned", (str, None)),
-        stored.value("rejected", bool),
-        stored.value("held_out", bool),
-    )
 
 
 def _setting(error_model: object) -> str | dict[str, object] | None:

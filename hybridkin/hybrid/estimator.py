@@ -306,7 +306,7 @@ class HybridForwardModel(HybridPredictor):
         residual = error.reshape(rows.tips.shape) - learned
         drift = self._drift.learned(rows.q.numpy(), residual, rows.counts, decay)
         if alpha is None:
-            alpha = drift.likeliest_alpha(self._fitted.noise)
+            alpha = drift.likeliest_alpha(self._fitted.error.noise)
         self._drift = drift._replace(alpha=float(alpha))
         self._follow_robot()
         return self
@@ -376,7 +376,7 @@ class HybridForwardModel(HybridPredictor):
         self.change_, message = likeliest_change(
             self.fitted_module_,
             rows,
-            self._fitted.noise,
+            self._fitted.error.noise,
             self._drift.scale,
             parameters,
         )

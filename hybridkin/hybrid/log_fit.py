@@ -20,9 +20,9 @@ from hybridkin.hybrid._module import Hybrid
 from hybridkin.hybrid._radius import Radius, conformal_radius
 from hybridkin.hybrid._range import TrainingRange, state_range
 from hybridkin.hybrid._rows import Rows
-from hybridkin.hybrid._spec import FitStart, Learned, Spec
+from hybridkin.hybrid._spec import FitStart, FittedError, Spec
 from hybridkin.hybrid.cv_results import CvResults
-from hybridkin.hybrid.held_out import MEAN_LENGTH, Predictions
+from hybridkin.hybrid.held_out import MEAN_LENGTH
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,8 +31,10 @@ class HybridFit:
 
     Attributes
     ----------
-    module, learned, noise, error_model
-        As in `FittedHybrid` and `FittedError`.
+    module, error
+        As in `FittedHybrid`.
+    kind : str or None
+        Class of the fitted error model.
     fitted_rows : ndarray of shape (N,)
         Their digests.
     single_output : bool
@@ -41,40 +43,43 @@ class HybridFit:
         Of what the actuators did, and of the states of hysteresis.
     no_drift : Drift
         The drift before any measurement.
-    start : FitStart
-        For fits to parts of the log.
-    calibration, comparison, candidates, play, radius
-        The attributes of the model; the comparison is its ``cv_results_``.
-    outside : Predictions or None
-        With such a start: of the candidates of "auto".
+    calibration, play, radius
+        The attributes of the model.
+    geometry : GeometryChoice or None
+        How the parameters to calibrate were chosen.
     messages : tuple of str
         Warnings, which were not issued.
     """
 
     module: Hybrid
-    learned: Learned
-    noise: float
+    error: FittedError
+    kind: str | None
     fitted_rows: NDArray
     single_output: bool
     training_range: TrainingRange
     no_drift: Drift
-    start: FitStart
-    error_model: object = None
     calibration: CalibrationResult | None = None
-    comparison: CvResults | None = None
-    candidates: dict[str, Hybrid] | None = None
+    geometry: GeometryChoice | None = None
     play: HysteresisOperator | None = None
     state_range: TrainingRange | None = None
     radius: Radius | None = None
-    outside: Predictions | None = None
     messages: tuple[str, ...] = ()
+
+    @property
+    def start(self) -> FitStart:
+        """Where the choices of fits to parts of the log start."""
+        return FitStart(self.error.settled, self.geometry)
 
     def expecting(self, distance: float) -> Self:
         """Return the same with the mean error of a comparison, which "auto" expects [m]."""
-        if self.comparison is None:
+        comparison = self.error.comparison
+        if comparison is None:
             return self
-        comparison: CvResults = {**self.comparison, "expected_distance": distance}
-        return replace(self, comparison=comparison, noise=distance / MEAN_LENGTH)
+        expected: CvResults = {**comparison, "expected_distance": distance}
+        noise = distance / MEAN_LENGTH
+        return replace(
+            self, error=replace(self.error, comparison=expected, noise=noise)
+        )
 
     def of_all_rows(self, q: NDArray, x: NDArray) -> Self:
         """Return the same for a log of more rows, all of which count as fitted."""
@@ -114,23 +119,18 @@ def fit_to_log(
     fitted.take_low_rank(rows.q)
     radius, of_radius = conformal_radius(spec, measured, moved)
     messages += [*of_play, *of_radius, *fit_messages(fitted.spec, rows)]
-    error = fitted.error
     return HybridFit(
         module=fitted.module,
-        learned=error.learned,
-        noise=error.noise,
+        error=fitted.error,
+        kind=fitted.error.kind,
         fitted_rows=commands.digests(),
         single_output=log.y.ndim == 1,
         training_range=TrainingRange.of(rows.X),
         no_drift=Drift.of_range(rows.q, rows.tips.shape[1]),
-        error_model=error.result,
         calibration=fitted.spec.calibration,
-        comparison=error.comparison,
-        candidates=error.candidates,
+        geometry=chosen.geometry,
         play=play,
         state_range=states,
         radius=radius,
-        start=FitStart(error.settled, chosen.geometry),
-        outside=error.outside,
         messages=tuple(dict.fromkeys(messages)),
     )

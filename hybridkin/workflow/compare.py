@@ -440,8 +440,9 @@ def _one_fold(
         spec = spec.starting_at(starts[name])
         fitted = fit_to_log(spec, log, mechanical.geometry)
         model = with_fit(model, fitted)
-        candidates = fitted.candidates
-        if fitted.outside is None or candidates is None:
+        candidates = fitted.error.candidates
+        outside = fitted.error.outside
+        if outside is None or candidates is None:
             tips[name] = evaluate(model.module_, test.q)[0]
             if name in (DATA_ELM, HYBRID_ELM):
                 choices[name] = choice_in_words(model)
@@ -451,8 +452,8 @@ def _one_fold(
             tips[_in_table(candidate)] = evaluate(module, q)[0]
         auto = _AutoOfFold(
             [*candidates],
-            fitted.outside,
-            fitted.start.geometry,
+            outside,
+            fitted.geometry,
             memory_in_words(model),
         )
     distance = held_out_distances(train.q, train.motions, test.q)

@@ -299,11 +299,7 @@ class Domain:
         configuration. Without a guard it is the `preferred` configuration.
         """
         hybrid = self.loaded.hybrid
-        if (
-            hybrid is None
-            or hybrid.guard is None
-            or hybrid._fitted.learned.kind is None
-        ):
+        if hybrid is None or hybrid.guard is None or hybrid._fitted.kind is None:
             return self.preferred
         module = self.loaded.module
         home = torch.from_numpy(self.preferred)

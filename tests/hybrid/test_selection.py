@@ -76,7 +76,7 @@ def test_it_says_what_it_chose(chosen):
     assert results["mean_distance"][-1] < 1.01 * results["mean_distance"].min()
     # Penalties chosen on 50 motions hardly suit one of them more than new ones.
     assert results["expected_distance"] == results["mean_distance"][-1]
-    assert chosen._fitted.noise == pytest.approx(results["expected_distance"] / 1.596)
+    assert chosen._fitted.error.noise == pytest.approx(results["expected_distance"] / 1.596)
 
 
 @pytest.mark.slow

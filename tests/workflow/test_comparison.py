@@ -111,7 +111,7 @@ def test_a_fit_near_another_one_chooses_as_from_nothing():
         spec, log = prepared(model, rows.q, rows.x, rows.motions)
         fitted = fit_to_log(spec, log)
         near = fit_to_log(spec.starting_at(fitted.start), log)
-        assert near.error_model.alphas == fitted.error_model.alphas
+        assert near.error.result.alphas == fitted.error.result.alphas
         x = with_fit(model, fitted).predict(rows.q)
         x_near = with_fit(model, near).predict(rows.q)
         assert_allclose(x_near, x, rtol=0.0, atol=1e-7)
