@@ -318,7 +318,7 @@ def read_description(path: str | Path) -> RobotDescription:
             group_suffix = "_hold"          # rows of motion "a_hold" belong to motion "a"
             runs = "session"                # column with the run of each row: motions that follow
                                             # each other without a break; optional
-            time = "t"                      # column of the time stamp [s], optional
+            time = "t"                      # column of the time stamp [s], optional; for creep
 
             [limits]                        # of the actuators, optional; one number or one each
             q_min = -0.010                  # with the chain's sign: shortening < 0 [m]

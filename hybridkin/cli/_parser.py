@@ -228,7 +228,8 @@ def _fit(command: argparse.ArgumentParser) -> None:
 
     The fit looks for backlash (also called play), smooth friction and creep: the tip then depends
     on where the tendons came from. They are kept only if they lower the errors on held-out motions.
-    Motions must have names, and their rows must be in the order of time. --play 0: none of these.
+    Motions must have names, and their rows must be in the order of time; creep also needs --time.
+    --play 0: none of these.
     """
     add = command.add_argument
     add("log", type=Path, metavar="LOG", help="CSV, npz or parquet file")
