@@ -320,7 +320,7 @@ class StepSettings(Portable):
             weights = np.broadcast_to(as_array(self.weights), n)
         vectors = [self.q_min, self.q_max, self.dq_max, self.ddq_max, posture]
         numbers = [np.broadcast_to(as_array(vector), n) for vector in vectors]
-        numbers += [weights**-0.5, self._kernel_rates(), scale]
+        numbers += [weights**-0.5, self.kernel_rates(), scale]
         for vector in (self.periods, self.pulls):
             numbers.append(np.broadcast_to(as_array(vector), n))
 
@@ -353,7 +353,7 @@ class StepSettings(Portable):
         entries = [model, flags, n_normals, n_spaces, *stages]
         return plan.node("ik", n, len(scale), numbers, *entries)
 
-    def _kernel_rates(self) -> list[float]:
+    def kernel_rates(self) -> list[float]:
         """Return gain (negative: 1 / period), beta, period and damping (negative: adaptive)."""
         gain = -1.0 if self.gain is None else self.gain
         # Steps of more than a second end at the posture.

@@ -78,6 +78,7 @@ class _Settings(Protocol):
     @property
     def task(self) -> _Task: ...
     def write_plan(self, plan: Plan) -> int: ...
+    def kernel_rates(self) -> list[float]: ...
 
 
 class _Tracker(Protocol):
@@ -191,13 +192,6 @@ class CProject(NamedTuple):
     def limits(self) -> NDArray:
         """Limits q_min, q_max, dq_max and ddq_max of a step, shape (4, n)."""
         return _limits(self.plan)[0]
-
-    @property
-    def gains(self) -> tuple[float, float, float]:
-        """Gain (negative: 1 / period), beta [1/s] and period [s] of a step."""
-        rates = self.plan.begin(self.plan.root) + 6 * self.plan.n_inputs
-        gain, beta, dt = self.plan.data[rates : rates + 3]
-        return float(gain), float(beta), float(dt)
 
 
 def c_project(

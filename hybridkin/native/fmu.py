@@ -165,7 +165,7 @@ def _variables(project: CProject) -> list[Variable]:
     target = np.ravel(project.controller.tracker(project.home).x)
     width = target.shape
     rows = (plan.n_outputs,)
-    (gain, beta, _) = project.gains
+    gain, beta, *_ = project.controller.settings.kernel_rates()
     number = np.array
     variables = [
         Variable(
@@ -242,7 +242,8 @@ def _description(project: CProject, variables: list[Variable], token: str) -> by
         canHandleVariableCommunicationStepSize="true",
     )
     if project.controller is not None:
-        unit.set("fixedInternalStepSize", repr(project.gains[2]))
+        _, _, dt, _ = project.controller.settings.kernel_rates()
+        unit.set("fixedInternalStepSize", repr(dt))
     listed = SubElement(root, "ModelVariables")
     structure = SubElement(root, "ModelStructure")
     SubElement(
