@@ -61,6 +61,19 @@ _ABOUT_POSES = (
 _ABOUT_SPACES = (
     " For the half-spaces of the tip it solves at most 11 times, usually once."
 )
+# Operations of a node with `a` numbers, n inputs and m outputs, in a model with S segments.
+_OPERATIONS = {
+    "arcs": lambda a, n, m, S: 8 * a + 210 * S + 25 * S * S,
+    "elastic": lambda a, n, m, S: (
+        (8 + 2 ** min(n, 12)) * (200 * S + 40 * n) + 25 * (S + 14) * S
+    ),
+    "rigid": lambda a, n, m, S: 10 * (a - 9) + 15 * n,  # the tip does not turn
+    "hybrid": lambda a, n, m, S: (
+        a * (25 * (S + 12) * S + 18 * S * n + 10 * m * (n + 2))
+    ),
+}
+
+
 Entries: TypeAlias = dict[str, object]  # what templates are filled with
 
 
@@ -303,6 +316,7 @@ def _code(plan: Plan, controller: _Controller | None, dtype: str) -> Entries:
         "MODEL": model,
         "ROOT": plan.root,
         "BYTES": data.nbytes + 4 * len(plan.code),
+        "OPERATIONS": f"{_operations(plan):,}",
         **step,
     }
 
@@ -318,6 +332,7 @@ def _step_code(plan: Plan, task: _Task, n_spaces: int) -> Entries:
         "TASK": m,
         "WIDTH": math.prod(task.shape),
         "NORMALS": plan.entry(plan.root, 2),
+        "NEWTON": f"{10 * n**2 + (20 + 7 * m * m) * n:,}",
         "ABOUT_TARGET": _ABOUT_POSES if task.has_rotation else "desired x now [m];",
         "SPACES": _ABOUT_SPACES if n_spaces else "",
         "LEAD": n * plan.entry(plan.root, IK_STATE_ROWS),
@@ -351,6 +366,21 @@ def _check_stack(plan: Plan, dtype: str) -> None:
         raise NoKernel(
             "its sizes need more than 64 KiB of stack, too much for a controller"
         )
+
+
+def _operations(plan: Plan) -> int:
+    """Return the approximate largest number of operations for x and J."""
+    ends = [plan.begin(place) for place in plan.places[1:]]
+    work = 0
+    for place, end in zip(plan.places, [*ends, len(plan.data)], strict=True):
+        n, m = plan.lengths(place)
+        count = end - plan.begin(place)
+        kind = plan.kind(place)
+        if kind in _OPERATIONS:
+            work += _OPERATIONS[kind](count, n, m, plan.largest["segments"])
+        else:  # learned parts use each number once for x, and at most m times for J
+            work += 2 * (m + 1) * count
+    return work
 
 
 def _limits(plan: Plan) -> tuple[NDArray, float]:
