@@ -5,7 +5,11 @@ from __future__ import annotations
 import copy
 import math
 import re
+import shutil
+import subprocess
+import tempfile
 from collections.abc import Mapping
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple, Protocol, TypeAlias, runtime_checkable
@@ -165,15 +169,16 @@ def export_c(
     ['trunk.h', 'trunk.c', 'trunk_test.c', 'CMakeLists.txt', 'README.md']
     """
     project = c_project(model, name=name, dtype=dtype, about_q=about_q)
-    paths = [Path(folder) / file for file in project.texts]
+    texts = dict(project.texts)
+    paths = [Path(folder) / file for file in (*texts, "README.md")]
     for path in paths:
         if path.exists() and "hybridkin" not in path.read_text(errors="replace"):
             raise FileExistsError(
                 f"`folder` has a {path.name} of another origin; use another."
             )
-    writers = {}
-    for file, text in project.texts.items():
-        writers[file] = partial(Path.write_text, data=text)
+    measured = _measured(f"{name}.c", texts)
+    texts["README.md"] = filled("README.md", {**project.entries, "MEASURED": measured})
+    writers = {file: partial(Path.write_text, data=t) for file, t in texts.items()}
     write_files(folder, writers)
     return paths
 
@@ -192,7 +197,7 @@ class CProject(NamedTuple):
     entries : dict
         What templates are filled with.
     texts : dict
-        Header, source, test, CMakeLists.txt and README.md by the name of the file.
+        Header, source, test and CMakeLists.txt by the name of the file.
     """
 
     controller: _Controller | None
@@ -240,8 +245,7 @@ def c_project(
         f"{name}.c": "model.c",
         f"{name}_test.c": "check.c",
     }
-    for file in ("CMakeLists.txt", "README.md"):
-        sources[file] = file
+    sources["CMakeLists.txt"] = "CMakeLists.txt"
     entries: Entries = {
         "NAME": name,
         "GUARD": name.upper(),
@@ -535,3 +539,26 @@ def _beside(task: _Task, x: Tensor, size: NDArray, rng: np.random.Generator) -> 
     turns = torch.from_numpy(0.1 * change / max(np.abs(change).max(), 1e-9))
     beside[..., :3, :3] = rotation(turns)[0].numpy() @ beside[..., :3, :3]
     return beside
+
+
+def _measured(source: str, texts: dict[str, str]) -> str:
+    """Return the size of the code and of its stack, measured by the compiler of this machine."""
+    if shutil.which("cc") and shutil.which("size"):
+        with (
+            suppress(OSError),  # the disk may be full
+            tempfile.TemporaryDirectory() as home,
+        ):
+            for name, text in texts.items():
+                Path(home, name).write_text(text)
+            built = Path(home) / "a.o"
+            usage = Path(home) / "a.su"
+            compiler = "cc -std=c99 -Os -fstack-usage -c -o".split()
+            command = [*compiler, built, Path(home, source)]
+            done = subprocess.run(command, capture_output=True)
+            if done.returncode == 0 and usage.exists():
+                lines = usage.read_text().splitlines()
+                stack = sum(int(line.split("\t")[1]) for line in lines)
+                sizes = subprocess.check_output(["size", built], text=True)
+                code = sizes.split()[6]
+                return f"{code} and {stack} bytes on the machine of the export, with `cc -Os`"
+    return "not measured: the machine of the export had no C compiler"
