@@ -179,7 +179,7 @@ def _next(command: argparse.ArgumentParser) -> None:
     """
     add = command.add_argument
     _add_model(command)
-    add("--out", type=Path, required=True, metavar="DIR", help="folder for next.csv")
+    _add_out(command, "folder for next.csv", required=True)
     add("-n", type=count, default=50, help="number of configurations (50)")
     add(
         "--measured",
@@ -240,13 +240,7 @@ def _fit(command: argparse.ArgumentParser) -> None:
         metavar="ROBOT.toml",
         help="robot description",
     )
-    add(
-        "--out",
-        type=Path,
-        required=True,
-        metavar="DIR",
-        help="folder for model and report",
-    )
+    _add_out(command, "folder for model and report", required=True)
     _add_log(command)
     add(
         "--loss",
@@ -298,7 +292,7 @@ def _evaluate(command: argparse.ArgumentParser) -> None:
     add = command.add_argument
     _add_model(command)
     add("log", type=Path, metavar="LOG", help="CSV, npz or parquet file")
-    add("--out", type=Path, metavar="DIR", help="folder for report and figures (none)")
+    _add_out(command, "folder for report and figures (none)")
     add(
         "--fail-above",
         type=float,
@@ -371,13 +365,7 @@ def _track(command: argparse.ArgumentParser) -> None:
     add = command.add_argument
     _add_model(command)
     add("path", type=Path, nargs="?", metavar="PATH.csv", help="file of points")
-    add(
-        "--out",
-        type=Path,
-        required=True,
-        metavar="DIR",
-        help="folder for commands and figure",
-    )
+    _add_out(command, "folder for commands and figure", required=True)
     add(
         "--shape",
         choices=("figure-eight", "spiral", "line"),
@@ -453,7 +441,7 @@ def _verify(command: argparse.ArgumentParser) -> None:
     _add_model(command)
     add("track", type=Path, metavar="TRACK", help="track.csv or its folder")
     add("log", type=Path, metavar="MEASURED", help="commands and measured tips")
-    add("--out", type=Path, metavar="DIR", help="folder for the report (none)")
+    _add_out(command, "folder for the report (none)")
     _add_log(command)
 
 
@@ -545,6 +533,13 @@ def _describe(command: argparse.ArgumentParser) -> None:
         command, "log", "MODEL|ROBOT.toml|LOG", "model, robot description or log"
     )
     _add_log(command)
+
+
+def _add_out(
+    command: argparse.ArgumentParser, text: str, required: bool = False
+) -> None:
+    add = command.add_argument
+    add("--out", type=Path, required=required, metavar="DIR", help=text)
 
 
 def _add_path(command: argparse.ArgumentParser, text: str) -> None:
