@@ -325,10 +325,13 @@ class QuadraticLeverage(LeverageModule):
 
     def leverage(self, q: Tensor) -> Tensor:
         """Return phi^T (Phi^T Phi + alpha 1)^-1 phi, shape (...)."""
+        phi = self(q)
+        upper = self.factor.to(q).mT
+        # One solve for all rows, not one for each.
         white = torch.linalg.solve_triangular(
-            self.factor.to(q), self(q)[..., None], upper=False
+            upper, torch.atleast_2d(phi), upper=True, left=False
         )
-        return white.square().sum((-2, -1))
+        return white.square().sum(-1).view(phi.shape[:-1])
 
 
 def fit_guard(
