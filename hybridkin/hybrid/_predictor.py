@@ -63,9 +63,8 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     _past: Past | None
     _drift: Drift
     _plausible_rows: PlausibleRows | None = None
-    _plain_rows: PlausibleRows | None = (
-        None  # which need no other check, nor hysteresis
-    )
+    # Those that need no other check, and do not change by hysteresis.
+    _plain_rows: PlausibleRows | None = None
 
     def predict(
         self,
