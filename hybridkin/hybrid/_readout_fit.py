@@ -163,21 +163,22 @@ def fit_readout(
             weights = problem.weights_of(start)
             problem_in_noise = problem.in_noise(noise_ratio)
             if near:
-                fit, _ = _chosen(problem_in_noise, members, alphas, weights, rounds=1)
+                fit = _chosen(problem_in_noise, members, alphas, weights, rounds=1)
             else:
-                fit, _ = _fitted(problem_in_noise, members, alphas, weights)
+                fit = _fitted(problem_in_noise, members, alphas, weights)
     rmse = problem.mean_distance(fit.residual, 2) ** 0.5
     return fit._replace(residual=rows.as_given(fit.residual), rmse=rmse)
 
 
 def _chosen_with_noise(problem: _Problem, members: list[Tensor] | None) -> ReadoutFit:
     """Return the fit with chosen penalties, in metres or in units of the actuators' noise."""
-    fit, weights = _chosen(problem, members, None, problem.nothing)
+    fit = _chosen(problem, members, None, problem.nothing)
     noise_ratio = problem.likeliest_ratio(torch.from_numpy(fit.residual))
     if noise_ratio == inf:
         return fit
-    problem_in_noise = problem.in_noise(noise_ratio)
-    in_noise, _ = _chosen(problem_in_noise, members, fit.alphas, weights, rounds=1)
+    in_noise = _chosen(
+        problem.in_noise(noise_ratio), members, fit.alphas, problem.nothing
+    )
     if problem.mean_distance(in_noise.residual) < problem.mean_distance(fit.residual):
         return in_noise
     return fit
@@ -189,8 +190,8 @@ def _chosen(
     alphas: Pair | None,
     weights: Tensor,
     rounds: int = 2,
-) -> tuple[ReadoutFit, Tensor]:
-    """Return the fit with the penalties of least held-out error, and its weights (C, K)."""
+) -> ReadoutFit:
+    """Return the fit with the penalties of least held-out error, from a start of the search."""
     scores = {}
     for _ in range(rounds):
         # Linearised first about the start, then about the correction found.
@@ -198,12 +199,13 @@ def _chosen(
         alphas, scores = _linearised.choose(score, alphas)
         weights, _ = problem.minimum(weights, problem.penalty(alphas), _FACTORS)
     assert alphas is not None
-    fit, weights = _fitted(problem, members, alphas, weights)
+    fit = _fitted(problem, members, alphas, weights)._replace(scores=scores)
     without = problem.mean_distance(problem.rest.numpy(force=True), 2)
     if problem.mean_distance(fit.residual, 2) > without:
         # The improvement of the linearised problem is not there in the exact one.
-        fit, weights = _fitted(problem, members, (inf, inf), problem.nothing)
-    return fit._replace(scores=scores), weights
+        nothing = _fitted(problem, members, (inf, inf), problem.nothing)
+        return nothing._replace(scores=scores)
+    return fit
 
 
 def _fitted(
@@ -211,11 +213,8 @@ def _fitted(
     members: list[Tensor] | None,
     alphas: Pair,
     weights: Tensor,
-) -> tuple[ReadoutFit, Tensor]:
-    """Return the fit with given penalties, from a start, and its weights (C, K).
-
-    Its residuals hold out `members`.
-    """
+) -> ReadoutFit:
+    """Return the fit with given penalties, from a start; its residuals hold out `members`."""
     penalty = problem.penalty(alphas)
     weights, gradient = problem.minimum(weights, penalty)
     left_out = problem.x * nan
@@ -224,9 +223,8 @@ def _fitted(
             problem.linearised(weights).left_out(penalty, members)
         )
     readout = problem.readout(weights)
-    residual = left_out.numpy(force=True)
-    fit = ReadoutFit(readout, alphas, residual, {}, gradient, problem.noise_ratio)
-    return fit, weights
+    ratio = problem.noise_ratio
+    return ReadoutFit(readout, alphas, left_out.numpy(force=True), {}, gradient, ratio)
 
 
 class _Problem:
