@@ -15,7 +15,7 @@ from torch import Tensor
 from hybridkin._core.arrays import Numbers, as_tensor, labels, one_of
 from hybridkin._core.directions import in_terms, moved_directions
 from hybridkin._core.model import ForwardModel
-from hybridkin.calibration._least_squares import LOSSES, ROUGH, Rows, solve
+from hybridkin.calibration._least_squares import COMPARED, LOSSES, ROUGH, Rows, solve
 from hybridkin.calibration._search import Start, search, widened
 from hybridkin.calibration.calibrate import check_data
 from hybridkin.calibration.measured import evenly_spaced, folds, inner_and_outer
@@ -359,7 +359,7 @@ def _mean_distance(
         chain = candidate.chain
         if start is not None:
             fitted = rows.take(split.fitted)
-            chain = solve(start.problem, fitted, start.theta, loss, ROUGH).chain()
+            chain = solve(start.problem, fitted, start.theta, loss, COMPARED).chain()
         predicted = rows.take(split.predicted)
         weights = predicted.weights
         total += weights @ np.linalg.norm(predicted.residual(chain), axis=1)
