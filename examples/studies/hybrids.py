@@ -440,7 +440,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--test-rows", type=int, default=1000, help="default: 1000")
     parser.add_argument(
-        "--models", nargs="+", help="names as in the report; default: all"
+        "--models",
+        nargs="+",
+        help="names as in the report, besides the two mechanical models; default: all",
     )
     parser.add_argument("--jobs", type=int, default=1, help="processes; default: 1")
     parser.add_argument(
@@ -460,7 +462,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     def shown(what: str, done: int, total: int) -> None:
         print(f"{done}/{total} {what}", file=sys.stderr)
 
-    common = {"models": given.models, "data_home": given.data, "n_jobs": given.jobs}
+    models = given.models
+    if models is not None:  # the figures compare with the mechanical models
+        models = [NOMINAL, CALIBRATED, *models]
+    common = {"models": models, "data_home": given.data, "n_jobs": given.jobs}
     common["progress"] = shown
     trunks = {"n_test": given.test_rows, "folder": given.rows, **common}
     curves = learning_curves(given.sizes, given.draws, **trunks)
