@@ -749,9 +749,9 @@ static HK_NOINLINE void ik_lead(const ik_settings *ik, const ik_state *now, cons
         low[j] = now->q[j] + limits.lower[j], high[j] = now->q[j] + limits.upper[j];
         goal[j] = wanted[j];
         if (change < R(INFINITY) && way > R(0.0))
-            goal[j] = now->q[j] + most, high[j] = ik_clip(goal[j], low[j], high[j]);
+            high[j] = ik_clip(now->q[j] + most, low[j], high[j]);
         else if (change < R(INFINITY) && way < R(0.0))
-            goal[j] = now->q[j] - most, low[j] = ik_clip(goal[j], low[j], high[j]);
+            low[j] = ik_clip(now->q[j] - most, low[j], high[j]);
         beyond |= !(wanted[j] >= low[j] && wanted[j] <= high[j]);
     }
     if (beyond) {
