@@ -16,7 +16,10 @@ _POINT = 1e-6  # of the largest value: the range of rows of a single configurati
 _COUNTS = 1e-4  # of a step: numbers this close to multiples of a step are whole counts
 _AS_ROUNDED = 2.0  # variances of rounding: what moves less is not distinguished from it
 _INSIDE = 0.05  # part of a unit vector outside a span that counts as zero
+_FAIR = 0.49  # of the largest part: one with more can be named first; a half is decided
 _MENTIONED = 0.05  # of the largest part of a direction
+_EARLIER = 1e-4  # of roots of places, the cost of later entries: of equal sums the first count
+_DIGITS = 6  # of lengths; those that differ by rounding are equal
 
 
 class Directions(NamedTuple):
@@ -84,12 +87,14 @@ def few_terms(directions: NDArray) -> NDArray:
     """Return a sparse basis (K, P) of the span of orthonormal rows (K, P).
 
     For each entry, fixed to 1, minimise the sum of absolute entries; take the shortest independent.
+    Of equally short ones the first entries count, so that the result depends on the span alone, not
+    on the axes that an eigenvalue problem gives it.
     """
     (K, P) = directions.shape
     if K < 2:
         return directions
     # Unknowns: coefficients (K,) of the directions, and bounds (P,) of the absolute entries.
-    cost = np.repeat([0.0, 1.0], [K, P])
+    cost = np.concatenate([np.zeros(K), 1.0 + _EARLIER * np.sqrt(np.arange(P))])
     entries = np.hstack([directions.T, np.zeros((P, P))])
     bounds = np.hstack([np.zeros((P, K)), np.eye(P)])
     above = np.vstack([entries - bounds, -entries - bounds])
@@ -107,11 +112,11 @@ def few_terms(directions: NDArray) -> NDArray:
 
     def length(coefficients: NDArray) -> float:
         sizes = np.abs(coefficients @ directions)
-        return sizes.sum() / sizes.max()
+        return round(sizes.sum() / sizes.max(), _DIGITS)
 
     determined = np.linalg.norm(directions, axis=0) > _INSIDE
     candidates = [shortest(entry) for entry in directions.T[determined]]
-    candidates.sort(key=length)
+    candidates.sort(key=length)  # of equal ones the first stay first
     chosen = np.empty((0, K))
     while len(chosen) < K:
         remaining = np.linalg.svd(chosen)[2][len(chosen) :]
@@ -124,13 +129,18 @@ def few_terms(directions: NDArray) -> NDArray:
     return chosen @ directions
 
 
+def leading_part(sizes: NDArray) -> int:
+    """Return which part of a direction is named first: the first of fair size."""
+    return int(np.argmax(sizes > _FAIR * sizes.max()))
+
+
 def in_terms(directions: NDArray, names: Sequence[str]) -> str:
     """Return directions of q (n, k) in words, each by few of the named actuators."""
     sentences = []
     for move in few_terms(directions.T):
         sizes = np.abs(move)
-        lead = np.argmax(sizes > 0.5 * sizes.max())
-        parts = move / move[lead]
+        lead = leading_part(sizes)
+        parts = np.round(move / move[lead], _DIGITS)
         words = []
         for name, part in zip(names, parts, strict=True):
             if abs(part) > _MENTIONED:

@@ -7,12 +7,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridkin._core.directions import few_terms
+from hybridkin._core.directions import few_terms, leading_part
 from hybridkin.calibration._least_squares import Fit
 from hybridkin.calibration._parameters import Problem
 
 _N_TERMS = 6  # parameters in a sentence
-_FAIR = 0.5  # of the largest entry: a parameter with more can be named first
+_DIGITS = 9  # of changes, in steps
 _SMALL = 0.05  # of a step, or of the motion of the tips: not mentioned
 _SLIGHT = 0.01  # of the largest motion of the tips by one parameter alone
 _ALIKE = 0.02
@@ -49,9 +49,9 @@ def sentences(
     texts = []
     for direction in few_terms(directions):
         # The first parameter with a fair part is named first and changes by one step.
-        lead = int(np.argmax(np.abs(direction) > _FAIR * np.abs(direction).max()))
+        lead = leading_part(np.abs(direction))
         direction = direction / (direction[lead] * to_steps[lead])
-        change = direction * to_steps
+        change = np.round(direction * to_steps, _DIGITS)  # equal changes are equal numbers
         tips = float(np.linalg.norm(columns @ direction))
         effect = "does not move the tips"
         if tips >= _STILL:
