@@ -8,10 +8,12 @@ from hypothesis import HealthCheck, settings
 from hybridkin import ForwardModel
 from hybridkin.native import available, backend
 
-torch.set_num_threads(1)
+torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
 # The suite takes the same few examples each time; the examination as many as it says, by its seed.
 _SLOW = [HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.filter_too_much]
 settings.register_profile("suite", max_examples=10, derandomize=True, database=None, deadline=None)
+# Other examples, by the seed that `make portable` gives.
+settings.register_profile("portable", max_examples=10, database=None, deadline=None)
 settings.register_profile(
     "examination",
     max_examples=int(os.environ.get("EXAMPLES", "500")),

@@ -18,7 +18,8 @@ _AS_ROUNDED = 2.0  # variances of rounding: what moves less is not distinguished
 _INSIDE = 0.05  # part of a unit vector outside a span that counts as zero
 _FAIR = 0.49  # of the largest part: one with more can be named first; a half is decided
 _MENTIONED = 0.05  # of the largest part of a direction
-_EARLIER = 1e-4  # of roots of places, the cost of later entries: of equal sums the first count
+# Later entries cost more, by this part of the root of their place: of equal sums the first count.
+_EARLIER = 1e-4
 _DIGITS = 6  # of lengths; those that differ by rounding are equal
 
 

@@ -51,7 +51,9 @@ def sentences(
         # The first parameter with a fair part is named first and changes by one step.
         lead = leading_part(np.abs(direction))
         direction = direction / (direction[lead] * to_steps[lead])
-        change = np.round(direction * to_steps, _DIGITS)  # equal changes are equal numbers
+        change = np.round(
+            direction * to_steps, _DIGITS
+        )  # equal changes are equal numbers
         tips = float(np.linalg.norm(columns @ direction))
         effect = "does not move the tips"
         if tips >= _STILL:
