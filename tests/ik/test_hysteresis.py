@@ -87,6 +87,7 @@ def put_where(reference, core):
     robot._last = robot._last._replace(step=step)
 
 
+@pytest.mark.needs_core
 @KINDS
 @pytest.mark.parametrize("limits", LIMITS)
 def test_the_core_commands_what_torch_does(kind, limits):
@@ -106,6 +107,7 @@ def test_the_core_commands_what_torch_does(kind, limits):
         assert core.status == reference.status
 
 
+@pytest.mark.needs_core
 @KINDS
 def test_the_core_follows_a_path_as_torch_does(kind):
     ik = ik_of(OPERATORS[kind], dq_max=0.5)
