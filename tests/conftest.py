@@ -24,14 +24,35 @@ settings.register_profile(
 )
 settings.load_profile("suite")
 collect_ignore = ["examination"]  # `make examine` runs it
+# What `make everything` cannot install; CONTRIBUTING.md has the table of what tests need.
+_ABSENT = ("needs the recordings of real robots", "needs another processor", "needs a GPU")
 
 
 def pytest_collection_modifyitems(items):
     if not available():
-        why = f"needs the compiled core; {backend(ForwardModel())}"
+        skip = pytest.mark.skip(f"needs the compiled core; {backend(ForwardModel())}")
         for item in items:
             if item.get_closest_marker("needs_core"):
-                item.add_marker(pytest.mark.skip(why))
+                item.add_marker(skip)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport():
+    return _failed_if_skipped((yield))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report():
+    return _failed_if_skipped((yield))
+
+
+def _failed_if_skipped(report):
+    """Return the report; with HYBRIDKIN_MUST_RUN a skip is a failure, except what is absent."""
+    if report.skipped and os.environ.get("HYBRIDKIN_MUST_RUN"):
+        _, _, reason = report.longrepr
+        if not reason.removeprefix("Skipped: ").startswith(_ABSENT):
+            report.outcome, report.longrepr = "failed", f"{reason}, and everything must run"
+    return report
 
 
 @pytest.fixture

@@ -81,6 +81,43 @@ def imports_of(tree, everywhere):
     return found - {*sys.stdlib_module_names, "hybridkin"}
 
 
+@pytest.mark.slow
+def test_what_a_test_may_need_is_named():
+    """Each skip says "needs ..." with a word of the table, or imports a module of the table."""
+    page = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    rows = re.search(r"\| tests need \|.*?\n((?:\|.*\n)+)", page)[1].splitlines()[1:]
+    named = {what.strip(" `") for row in rows for what in row.split("|")[1].split(",")}
+    used = set()
+    for path in (ROOT / "tests").rglob("*.py"):
+        for call in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            kind = getattr(call.func, "attr", "") if isinstance(call, ast.Call) else ""
+            if kind == "importorskip":
+                used.add(call.args[0].value.partition(".")[0])
+            elif kind in ("skip", "skipif"):
+                reason = {k.arg: k.value for k in call.keywords}.get("reason", call.args[0])
+                text = reason.values[0] if isinstance(reason, ast.JoinedStr) else reason
+                assert text.value.startswith("needs "), f"{path}:{call.lineno}"
+                used.add(re.split("[:;]", text.value.removeprefix("needs "))[0])
+    assert {"pandas", "a C compiler"} <= used <= named
+
+
+@pytest.mark.slow
+def test_a_skipped_test_fails_where_everything_must_run(tmp_path):
+    shutil.copy(ROOT / "tests" / "conftest.py", tmp_path)
+    (tmp_path / "test_one.py").write_text(
+        "import pytest\n"
+        "def test_gpu(): pytest.skip('needs a GPU')\n"
+        "@pytest.mark.skipif(True, reason='needs Octave')\n"
+        "def test_octave(): pass\n"
+    )
+    (tmp_path / "test_other.py").write_text("import pytest\npytest.importorskip('absent_peer')")
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", tmp_path]
+    command.append("--continue-on-collection-errors")
+    environment = {**os.environ, "HYBRIDKIN_MUST_RUN": "1"}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert "1 skipped, 2 errors" in done.stdout, done.stdout
+
+
 def test_versions_agree():
     citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
     assert f"\nversion: {hybridkin.__version__}\n" in citation
@@ -146,7 +183,7 @@ def test_the_wheel_holds_kernels_for_this_platform(built, hatch_build, tmp_path)
     assert said.stdout.startswith(str(tmp_path)), said.stderr
 
 
-@pytest.mark.skipif(os.name == "nt", reason="the compiler is a shell script")
+@pytest.mark.skipif(os.name == "nt", reason="needs POSIX: shell scripts")
 def test_only_what_has_changed_is_compiled_again(hatch_build, tmp_path, monkeypatch):
     compiler = tmp_path / "cc"
     compiler.write_text("""#!/bin/sh

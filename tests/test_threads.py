@@ -66,7 +66,7 @@ def test_threads_change_filters_in_turn(changes, model):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system cannot fork")
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs POSIX: fork")
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 def test_a_child_computes_after_a_fork():
     """Many rows in two threads of torch; another thread has a lock."""
@@ -114,7 +114,7 @@ def in_child(work):
         return pipe.read()
 
 
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system cannot fork")
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs POSIX: fork")
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 def test_a_child_keeps_its_number_of_threads():
     """Until it computes; a number that the child chooses itself stays."""

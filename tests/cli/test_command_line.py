@@ -98,7 +98,7 @@ def by_an_import(*_, **__):
         raise ImportError("could not import datetime") from None
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="needs signals of POSIX")
+@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX: signals")
 @pytest.mark.parametrize(
     ("fit_log", "code"), [(by_keyboard, 130), (by_terminate, 143), (by_an_import, 130)]
 )

@@ -8,9 +8,7 @@ from torch.testing import assert_close
 from hybridkin import ElasticTendonChain, HybridForwardModel, InverseKinematics
 from hybridkin.hybrid._wrapped import Shifted
 from hybridkin.ik.results import IKStatus
-from hybridkin.native import available
 
-needs_core = pytest.mark.skipif(not available(), reason="no compiled core")
 LIMITS = {"q_min": -0.01, "q_max": 0.01, "dt": 0.02}
 FAST = {"dq_max": 0.05}
 WAYS = {
@@ -41,7 +39,7 @@ def keeps_limits(ik, commands):
     return abs(commands).max() <= 0.01 and fast and sudden
 
 
-@needs_core
+@pytest.mark.needs_core
 @pytest.mark.parametrize("start", [0.0, 0.005])  # straight; all tendons slack
 @pytest.mark.parametrize("way", WAYS)
 def test_static_targets_are_reached_within_the_limits(way, start):

@@ -64,15 +64,13 @@ def test_kernels_stay_within_their_arrays(tmp_path, compiled, lanes):
     command = [compiler, *FLAGS, *lanes.split(), *source]
     made = subprocess.run(command, capture_output=True, text=True)
     if any(word in made.stderr for word in ("lasan", "unrecognized", "unsupported")):
-        pytest.skip("this compiler has no sanitizers, or is for another processor")
+        pytest.skip("needs a C compiler with sanitizers")
     assert made.returncode == 0, made.stderr
     for name, module, program in compiled:
         q, code, data = rows_of(name), program.plan.code, program.plan.data
         head = np.array([len(code), len(data), program.plan.root, len(q)], dtype=np.int32)
         plan.write_bytes(b"".join(a.tobytes() for a in (head, code, data, q)))
         said = subprocess.run([tester, plan], capture_output=True, text=True)
-        if said.returncode == -4:
-            pytest.skip("this processor cannot run these lanes")
         assert said.returncode == 0, f"{name}: {said.stderr[-2000:]}"
         assert max(map(float, said.stdout.split())) < 1e-11, f"{name}: {said.stdout}"
         with torch.no_grad():

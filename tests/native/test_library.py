@@ -80,7 +80,7 @@ def test_variants_agree(reopened, variant):
     library._opened.cache_clear()
     reopened.setenv("HYBRIDKIN_NATIVE", variant)
     if not available():
-        pytest.skip(f"this processor has no {variant}, or it is not compiled")
+        pytest.skip(f"needs another processor: this one has no {variant}")
     assert variant in library.library()._name
     agree(library.program_of(chain()).evaluate(ROWS[:9], jacobian=True)[:2], right)
 
@@ -169,7 +169,7 @@ def compute(model):
 
 
 @pytest.mark.needs_core
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system cannot fork")
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs POSIX: fork")
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 def test_models_work_after_a_fork():
     model = chain()

@@ -25,7 +25,7 @@ from hybridkin.native import library
 from hybridkin.native.library import program_of
 
 SEGMENTS, ACTUATORS = MOST["segments"], MOST["actuators"]
-needs_cc = pytest.mark.skipif(CC is None, reason="no C compiler `cc`")
+needs_cc = pytest.mark.skipif(CC is None, reason="needs a C compiler")
 
 
 def arcs():
@@ -91,7 +91,7 @@ def write_plan(path, plan, q):
 @needs_cc
 @pytest.mark.slow
 @pytest.mark.needs_core
-@pytest.mark.skipif(sys.platform == "win32", reason="threads of POSIX")
+@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX: threads")
 @pytest.mark.parametrize("kind", KINDS)
 def test_functions_of_the_library_take_little_stack(tmp_path, kind):
     model, q = largest(kind)

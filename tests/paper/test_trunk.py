@@ -9,7 +9,7 @@ from hybridkin.datasets import load_trunk
 from paper import NotSettledError, TrunkPlant, make_trunk, trunk_data
 from paper.mjcf import RADII
 
-pytest.importorskip("mujoco", reason="the simulated trunk needs hybridkin[sim]")
+pytest.importorskip("mujoco", reason='needs MuJoCo: pip install "hybridkin[sim]"')
 IDEAL = {"gravity": 0.0, "base_error": np.zeros(6)}
 TURN = Rotation.from_euler("z", 120, degrees=True)
 

@@ -168,8 +168,13 @@ def test_devices(tmp_path, kind, fitted):
     assert_allclose(predictions(twin, q)["x"], predictions(model, q)["x"], rtol=1e-12)
     with pytest.raises(RuntimeError, match="`device` must name a device"):
         load_model(tmp_path / "model", device="cuda:99")
-    if not torch.cuda.is_available():
-        return
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.parametrize("kind", ["chain", "parallel_elm", "serial_pose", "elm"])
+def test_a_model_is_loaded_onto_the_gpu(tmp_path, kind, fitted):
+    model, q = fitted[kind]
+    save_model(model, tmp_path / "model")
     twin = load_model(tmp_path / "model", device="cuda")
     module = getattr(twin, "module_", twin)
     assert {buffer.device.type for buffer in module.buffers()} == {"cuda"}

@@ -13,7 +13,7 @@ from hybridkin import load_model, save_model
 from hybridkin._core.files import write_files
 
 HERE = Path(__file__).parent
-posix = pytest.mark.skipif(sys.platform == "win32", reason="needs links, modes and locks of POSIX")
+posix = pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX: links, modes, locks")
 # What a fit of every kind saves, and its hash, one line each.
 FITS = """
 import hashlib, sys

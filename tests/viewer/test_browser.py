@@ -12,7 +12,7 @@ import hybridkin
 from hybridkin import plots, robots
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
-sync_api = pytest.importorskip("playwright.sync_api", reason="`make view-test` installs it")
+sync_api = pytest.importorskip("playwright.sync_api", reason="needs playwright: `make view-test`")
 pytest.importorskip("viser", reason='needs viser: pip install "hybridkin[view]"')
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 OPTIONS = [
