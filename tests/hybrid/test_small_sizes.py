@@ -55,7 +55,8 @@ def test_a_single_coordinate_or_output(coupling, name, n, m, options):
     model = HybridForwardModel(Bent(n, m), MODELS[name], coupling=coupling, **options).fit(q, y)
     mechanical = Bent(n, m)(torch.from_numpy(q)).numpy().reshape(y.shape)
     if name != "drop":
-        assert np.std(model.predict(q) - y) < 0.95 * np.std(mechanical - y)
+        most = 0.95 if name == "linear" else 0.65  # of tips that bend
+        assert np.std(model.predict(q) - y) < most * np.std(mechanical - y)
     assert model.predict(q).shape == y.shape
     module, rows = model.module_, torch.from_numpy(0.5 * q[:5])
     expected = torch.func.vmap(torch.func.jacrev(module))(rows)
