@@ -28,4 +28,9 @@ def test_a_posture_may_be_a_function():
     ik = InverseKinematics(TRUNK, q_min=0.1, q_max=0.4, q_pref=lambda q: 0.9 * q + 0.02)
     q = HOME + 0.02 * draw.standard_normal(9)
     target = [0.1, 0.0, 0.7]
-    np.testing.assert_array_equal(ik.tracker(q).step(target), q + ik.step(q, target).dq)
+    step = ik.step(q, target)
+    np.testing.assert_array_equal(ik.tracker(q).step(target), q + step.dq)
+    at_q = InverseKinematics(TRUNK, q_min=0.1, q_max=0.4, q_pref=0.9 * q + 0.02)
+    np.testing.assert_allclose(step.dq, at_q.step(q, target).dq, rtol=0, atol=1e-12)
+    without = InverseKinematics(TRUNK, q_min=0.1, q_max=0.4, beta=0.0)
+    assert np.abs(step.dq - without.step(q, target).dq).max() > 1e-6

@@ -206,10 +206,14 @@ class Unguided(ForwardModel):
 
 
 def test_rows_that_have_not_converged_get_no_derivatives():
-    far = torch.tensor([[0.0, 0.0, 9.0]], dtype=torch.float64, requires_grad=True)
-    solution = InverseKinematics(CHAIN, **LIMITS).solve(far, differentiable=True)
-    (slope,) = torch.autograd.grad(solution.q.sum(), far)
-    assert (slope == 0.0).all()
+    """Out of reach every actuator is at its limit; a search that stops early leaves them free."""
+    x = torch.tensor([[0.0, 0.0, 9.0], [0.1, 0.05, 0.7]], dtype=torch.float64, requires_grad=True)
+    ik = InverseKinematics(CHAIN, **LIMITS)
+    for max_iter, converged in ((1, [False, False]), (100, [False, True])):
+        solution = ik.solve(x, differentiable=True, max_iter=max_iter, restarts=0)
+        assert solution.converged.tolist() == converged
+        (slope,) = torch.autograd.grad(solution.q.square().sum(), x)
+        assert (slope != 0.0).any(dim=1).tolist() == converged
     with pytest.raises(ValueError, match="torch tensor"):
         InverseKinematics(CHAIN, **LIMITS).solve(np.zeros(3), differentiable=True)
 
