@@ -54,11 +54,8 @@ def tested(
     settings: dict[str, str], seed: int, *arguments: str
 ) -> subprocess.CompletedProcess[str]:
     """Run pytest with settings and examples of its own."""
-    inherited = {
-        name: value
-        for name, value in os.environ.items()
-        if name not in settings and not name.startswith("PYTEST")
-    }
+    outer = (*settings, "PYTEST", "HYBRIDKIN_MUST_RUN")  # without the core some tests are skipped
+    inherited = {k: value for k, value in os.environ.items() if not k.startswith(outer)}
     command = [sys.executable, "-m", "pytest", "-q", "--no-header"]
     command += ["--hypothesis-profile=portable", f"--hypothesis-seed={seed}", *arguments]
     changed = {name: value for name, value in settings.items() if value}
