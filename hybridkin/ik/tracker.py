@@ -352,7 +352,9 @@ class _InTorch:
     @property
     def hysteresis(self) -> Any:
         """State of the hysteresis, None without."""
-        return self._lead.state if self._lead else None
+        if self._lead is None:
+            return None
+        return _given_back(self._lead.state[None], self._as_numpy)
 
     @torch.no_grad()
     def start(self, q: Tensor, dq: Tensor, hysteresis: Any) -> None:

@@ -94,6 +94,7 @@ def test_corrections_are_constant_where_no_row_moves(coupling, error_model, kind
         assert model.in_domain(q + 1e-6 * normal).all()
 
 
+@pytest.mark.needs_core
 @pytest.mark.parametrize("kind", ["posture", "line", "rest"])
 @pytest.mark.parametrize("groups", [None, np.arange(40) // 5])
 def test_one_domain_in_torch_and_compiled(kind, groups):

@@ -47,6 +47,7 @@ def test_the_plane_is_that_of_balanced_tendons(model):
     assert np.abs(pulls - normals @ (normals.T @ pulls)).max() < 1e-3
 
 
+@pytest.mark.needs_core
 @pytest.mark.parametrize("options", [{}, {"weights": [1.0, 2, 3, 4, 5, 6]}, {"ddq_max": 0.3}])
 def test_ticks_arrive_in_the_plane_at_the_limits_too(model, targets, options):
     ik = solver(model, **options)
