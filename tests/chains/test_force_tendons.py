@@ -51,6 +51,35 @@ def test_a_light_beam_sags_like_a_cantilever():
     assert_close(x, x.new_tensor([0.0, 0.0, 0.3 + 0.3**2 / 100.0]))
 
 
+@pytest.mark.parametrize("lengths", [[0.3], [0.1, 0.12, 0.08]])
+@pytest.mark.parametrize("taper", [0.0, 0.5])
+def test_a_tapered_beam_sags_stretches_and_bends_as_beams_do(lengths, taper):
+    """Linear beam theory with weight and E A of the area, and E I of the fourth power of radius."""
+    S, n = len(lengths), 2000
+    weight, bending, axial = [0.1, 0.07, 0.05][:S], [2.0, 1.5, 0.9][:S], [50.0, 40.0, 30.0][:S]
+
+    def beam(gravity, axial=axial, weight=weight):
+        options = {"routing": "segment", "taper": taper, "gravity": gravity, "arcs": 20}
+        return ForceTendonChain([0.01] * S, lengths, bending, axial, weight=weight, **options)
+
+    # Midpoint sums: the curvature at s moves the tip by L - s, and a weight at u acts by u - s.
+    outer = np.tile(1.0 - taper * (np.arange(n) + 0.5) / n, S)
+    ds, L = np.repeat(lengths, n) / n, sum(lengths)
+    s = np.cumsum(ds) - 0.5 * ds
+    weights = np.repeat(weight, n) * outer**2 * ds
+    softness = ds / (np.repeat(bending, n) * outer**4)
+    by_unit_load = s * np.cumsum((L - s) * softness) - np.cumsum(s * (L - s) * softness)
+    stretch = np.cumsum(ds / (np.repeat(axial, n) * outer**2))
+    q = torch.zeros(3 * S, dtype=torch.float64)
+    # Constant along an arc: an error of 1 / arcs^2, times some units for the fourth power.
+    close = {"rtol": 3e-3, "atol": 0.0}
+    assert_close(beam([1, 0, 0], 1e6)(q)[0], q.new_tensor(weights @ by_unit_load), **close)
+    assert_close(beam([0, 0, 1])(q)[2] - L, q.new_tensor(weights @ stretch), **close)
+    q[::3] = 2.0
+    bends = beam([0, 0, 1], 1e6, 0.0).arcs(q)[1][:, 0].reshape(S, -1).sum(1)
+    assert_close(bends, q.new_tensor(0.01 * 2.0 * softness.reshape(S, n).sum(1)), **close)
+
+
 def test_the_shape_has_least_energy():
     body = chain()
     statics = body._statics()
