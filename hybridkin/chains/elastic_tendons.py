@@ -244,7 +244,8 @@ class ElasticTendonChain(ArcChain):
         Parameters
         ----------
         chain : ConstantCurvatureChain
-            A chain with `lengths`. Its `actuator_zeros` times the gains become `tendon_zeros`.
+            A chain with `lengths`. Its `actuator_zeros` times the gains, less what its rest bends
+            change in the tendon paths, become `tendon_zeros`: both chains rest in the same shape.
         **options
             Further arguments, for example `bending_stiffness`.
 
@@ -267,7 +268,9 @@ class ElasticTendonChain(ArcChain):
             )
         geometry = chain.geometry()
         counts = chain.actuators_per_segment
-        geometry["tendon_zeros"] = geometry.pop("actuator_zeros") * chain.gains
+        rest = torch.cat([torch.zeros_like(chain.radii), *chain.rest_bends.T])
+        zeros = geometry.pop("actuator_zeros") * chain.gains
+        geometry["tendon_zeros"] = zeros - chain._readings() @ rest
         angles = [part.tolist() for part in geometry["angles"].split(counts)]
         arguments: dict[str, Any] = {
             **geometry,
