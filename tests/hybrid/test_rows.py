@@ -1,0 +1,45 @@
+"""Measured rows of a log: which are merged, and what goes along with them."""
+
+import numpy as np
+from numpy.testing import assert_array_equal
+
+from hybridkin import PlayOperator
+from hybridkin.hybrid._rows import Rows
+
+Q = np.array([0.0, 1.0, 1.0, 0.0, 1.0, 0.0])[:, None]
+RUNS = np.array(["b", "b", "b", "b", "a", "a"])
+TIME = np.array([0.0, 1.0, 2.0, 3.0, 0.0, 1.0])
+WEIGHTS = np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
+
+
+def test_equal_rows_of_two_runs_or_groups_stay_apart():
+    """What the actuators did before is another past in each run."""
+    for named in ({"runs": RUNS}, {"groups": RUNS}):
+        rows = Rows(Q, 2.0 * Q, WEIGHTS, **named)
+        merged = rows.distinct()
+        assert_array_equal(merged.X[:, 0], [0.0, 1.0, 1.0, 0.0])
+        assert_array_equal(merged.run_of_rows, ["b", "b", "a", "a"])
+        assert_array_equal(merged.counts, [5.0, 5.0, 5.0, 6.0])
+        assert_array_equal(merged.as_given(merged.X), Q)
+    assert_array_equal(Rows(Q, 2.0 * Q, WEIGHTS).distinct().counts, [11.0, 10.0])
+
+
+def test_rows_in_runs_merge_only_with_the_row_before():
+    rows = Rows(Q, 2.0 * Q, WEIGHTS, groups=np.zeros(6), runs=RUNS, time=TIME)
+    merged = rows.in_runs()
+    assert_array_equal(merged.X[:, 0], [0.0, 1.0, 0.0, 1.0, 0.0])
+    assert_array_equal(merged.counts, [1.0, 5.0, 4.0, 5.0, 6.0])
+    assert_array_equal(merged.run_of_rows, ["b", "b", "b", "a", "a"])
+    assert_array_equal(merged.time, [0.0, 1.0, 3.0, 0.0, 1.0])
+
+
+def test_what_the_actuators_do_follows_each_run():
+    rows = Rows(Q, 2.0 * Q, WEIGHTS, groups=np.zeros(6), runs=RUNS, time=TIME)
+    moved = rows.effective(PlayOperator(0.5)).X[:, 0]
+    assert_array_equal(moved, [0.0, 0.75, 0.75, 0.25, 1.0, 0.25])
+    some = rows.take(np.array([4, 1]))
+    assert_array_equal(some.runs, ["a", "b"])
+    assert_array_equal(some.time, [0.0, 1.0])
+    assert_array_equal(some.counts, [5.0, 2.0])
+    assert_array_equal(rows.repeated().X[:, 0], np.repeat(Q[:, 0], WEIGHTS.astype(int)))
+    assert_array_equal(rows.repeated().runs, np.repeat(RUNS, WEIGHTS.astype(int)))
