@@ -14,6 +14,7 @@ from torch import Tensor
 
 from hybridkin._core.arrays import Numbers, as_tensor, labels, one_of
 from hybridkin._core.directions import in_terms, moved_directions
+from hybridkin._core.distinct import distinct_rows
 from hybridkin._core.model import ForwardModel
 from hybridkin.calibration._least_squares import COMPARED, LOSSES, ROUGH, Rows, solve
 from hybridkin.calibration._search import Start, search, widened
@@ -157,7 +158,7 @@ def choose_geometry(
     groups : array-like of shape (N,), optional
         Motion of every row. Parts of a single motion are held out; without groups, rows.
     weights : array-like of shape (N,), optional
-        How often each row counts.
+        How often each row counts. Equal rows are held out together.
     loss : str, default="linear"
         As in `calibrate`.
     outside : bool, default=True
@@ -176,14 +177,19 @@ def choose_geometry(
     nominal = chain
     chain = copy.deepcopy(chain).cpu()
     q, x, _ = check_data(chain, q, x)
-    order = np.arange(len(q))
     if groups is not None:
         groups = labels(groups, len(q))
+    if weights is not None:
+        weights = as_tensor(weights, "weights").to(q)
+    first, counts, _ = distinct_rows(q, x, weights, groups)
+    if counts is None:
+        counts = np.ones(len(first))
+    order = np.arange(len(first))
+    if groups is not None:
+        groups = groups[first]
         order = np.argsort(groups, kind="stable")
-    if weights is None:
-        weights = q.new_ones(len(q))
-    chosen = np.sort(order[evenly_spaced(len(q), _MOST)])
-    rows = Rows(q, x, as_tensor(weights, "weights").to(q)).take(chosen)
+    chosen = np.sort(order[evenly_spaced(len(first), _MOST)])
+    rows = Rows(q[first], x[first], torch.from_numpy(counts).to(q)).take(chosen)
     with torch.no_grad():
         candidates = _candidates(chain, q, parameters)
         messages = () if parameters is not None else unmoved(chain, q)

@@ -9,12 +9,12 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.model_selection import GroupKFold, KFold
 
 from hybridkin._core.arrays import countable
+from hybridkin._core.directions import moved_directions
 from hybridkin._core.turns import TURNS
 
 # fractions of rows by distance: end of the inner, start of the outer
 _INNER = 0.4
 _BEYOND = 0.65
-_EXCITED = 0.01  # of the largest spread
 
 
 def check_finite(**arrays: ArrayLike) -> None:
@@ -117,11 +117,12 @@ def inner_and_outer(X: NDArray) -> tuple[NDArray, NDArray]:
     """Return the inner 40 % and the outer 35 % of rows by Mahalanobis distance from the mean.
 
     The rows between are left out, so that predictions of the outer rows are extrapolation.
-    Directions that are not excited are ignored.
+    Directions that do not move are ignored, whatever the units of the columns.
     """
-    axes, spread, _ = np.linalg.svd(X - X.mean(axis=0), full_matrices=False)
-    excited = spread > _EXCITED * spread.max(initial=0.0)
-    distance_from_mean = np.linalg.norm(axes[:, excited], axis=1)
+    directions = moved_directions(X)
+    scaled = (X - directions.mean) / directions.scale
+    axes, _, _ = np.linalg.svd(scaled @ directions.moved, full_matrices=False)
+    distance_from_mean = np.linalg.norm(axes, axis=1)
     order = np.argsort(distance_from_mean, kind="stable")
     n_inner = max(1, int(_INNER * len(X)))
     first_outer = int(_BEYOND * len(X))

@@ -4,9 +4,16 @@ import numpy as np
 import pytest
 import torch
 
-from hybridkin import ConstantCurvatureChain, ElasticTendonChain, HybridForwardModel
+from hybridkin import (
+    ConstantCurvatureChain,
+    ElasticTendonChain,
+    HybridForwardModel,
+    RigidChain,
+    calibrate,
+)
 from hybridkin.calibration.calibrate import refitted
 from hybridkin.calibration.choice import choose_geometry
+from hybridkin.calibration.measured import folds, inner_and_outer
 
 NOISE = 5e-4
 
@@ -46,6 +53,111 @@ def test_a_log_gets_the_smallest_set_that_explains_it():
         assert choice.errors[name].io < 3 * NOISE
         assert not choice.messages
     assert list(choice.errors)[:4] == ["nothing", *truths]
+
+
+PLANAR = RigidChain(
+    np.stack([np.eye(4), *2 * [[[1, 0, 0, 0.2], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]]]),
+    [[0, 0, 1], [0, 1, 0], [0, 1, 0]],
+    tool=[0.1, 0.0, 0.0],
+)
+
+
+def log_of_motions(n=30):
+    """Rows of an arm with a moved base in three motions, each with an error of its own."""
+    rng = np.random.default_rng(0)
+    q = rng.uniform(-1.0, 1.0, (n, 3))
+    groups = np.arange(n) % 3
+    x = PLANAR.with_geometry(base=moved_base())(torch.from_numpy(q)).numpy()
+    x = x + 0.02 * rng.standard_normal((3, 3))[groups] + 1e-3 * rng.standard_normal((n, 3))
+    return q, x, groups, np.arange(n) // 3 % 3
+
+
+def test_each_set_is_scored_on_whole_motions_with_the_weights_of_rows():
+    """Against calibrations to the other two motions."""
+    q, x, groups, weights = log_of_motions()
+    own = {"groups": groups, "weights": weights, "outside": False}
+    errors = choose_geometry(PLANAR, q, x, **own).errors
+    assert [*errors] == ["nothing", "base"]
+    rows = torch.from_numpy(q)
+    for name, found in errors.items():
+        total = 0.0
+        for motion in range(3):
+            chain = PLANAR
+            kept = groups != motion
+            if name == "base":
+                own = {"sample_weight": weights[kept]}
+                chain = calibrate(PLANAR, q[kept], x[kept], ("base",), **own).chain
+            distance = np.linalg.norm(chain(rows).numpy() - x, axis=1)
+            total += weights[~kept] @ distance[~kept]
+        # The fits that are compared end at steps of 1e-4.
+        assert found.cv == pytest.approx(total / weights.sum(), rel=1e-3)
+
+
+@pytest.mark.parametrize("loss", ["linear", "soft_l1"])
+def test_weights_are_repetitions_and_names_and_order_do_not_matter(loss):
+    q, x, groups, weights = log_of_motions()
+    own = {"outside": False, "loss": loss}
+    weighted = choose_geometry(PLANAR, q, x, groups=groups, weights=weights, **own)
+    repeated = np.random.default_rng(1).permutation(np.repeat(np.arange(len(q)), weights))
+    names = np.array(["b", "c", "a"])[(groups + 1) % 3]
+    many = x[repeated] + 1e-9 * np.arange(len(repeated))[:, None]  # or equal rows are merged
+    expanded = choose_geometry(PLANAR, q[repeated], many, groups=names[repeated], **own)
+    for name, found in weighted.errors.items():  # fits end at steps of 1e-4
+        assert found.cv == pytest.approx(expanded.errors[name].cv, rel=1e-3)
+    for name, value in weighted.start.problem.chain_at(weighted.start.theta).geometry().items():
+        there = expanded.start.problem.chain_at(expanded.start.theta).geometry()[name]
+        torch.testing.assert_close(value, there, rtol=1e-3, atol=1e-4)
+
+
+def test_equal_rows_are_one_row_that_counts_as_often():
+    q, x, _, _ = log_of_motions(45)
+    weights = 1 + np.arange(45) % 3
+    repeated = np.repeat(np.arange(45), weights)
+    weighted = choose_geometry(PLANAR, q, x, weights=weights)
+    expanded = choose_geometry(PLANAR, q[repeated], x[repeated])
+    assert np.isfinite(weighted.errors["base"].io)
+    for name, found in weighted.errors.items():
+        np.testing.assert_allclose(found, expanded.errors[name], rtol=1e-9)
+
+
+def test_groups_choose_another_set_than_rows():
+    """Motions with an error each: among rows of all motions the base seems to be known."""
+    rng = np.random.default_rng(0)
+    q = rng.uniform(-1.0, 1.0, (60, 3))[np.arange(60) // 20]
+    q = q + 0.01 * rng.standard_normal(q.shape)
+    groups = np.arange(60) // 20
+    exact = PLANAR(torch.from_numpy(q)).numpy()
+    x = exact + 0.05 * rng.standard_normal((3, 3))[groups]
+    choices = [choose_geometry(PLANAR, q, x, groups=g, outside=False) for g in (None, groups)]
+    assert [choice.name for choice in choices] == ["base", "nothing"]
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1e3])
+def test_inner_and_outer_rows_do_not_depend_on_the_units_of_columns(unit):
+    X = np.random.default_rng(0).standard_normal((50, 3)) * [1.0, 0.3, 2.0] + 5.0
+    inner, outer = inner_and_outer(X)
+    away = X - X.mean(axis=0)
+    distance = np.einsum("ni,ij,nj->n", away, np.linalg.inv(away.T @ away), away)
+    assert distance[inner].max() < np.delete(distance, inner).min()
+    assert distance[outer].min() > np.delete(distance, outer).max()
+    assert (len(inner), len(outer)) == (20, 18)
+    scaled = inner_and_outer(X * [1.0, unit, 1.0])
+    np.testing.assert_array_equal(scaled[0], inner)
+    np.testing.assert_array_equal(scaled[1], outer)
+    still = inner_and_outer(np.insert(X, 1, 0.2 + 3e-17 * (np.arange(50) % 2), axis=1))
+    np.testing.assert_array_equal(still[1], outer)
+
+
+@pytest.mark.parametrize("names", [np.arange(5), np.array([*"dbaec"])])
+def test_folds_hold_out_whole_groups(names):
+    groups = names[np.random.default_rng(0).permutation(np.arange(40) % 5)]
+    for shuffle in (False, True):
+        splits = folds(groups, groups, most=3, shuffle=shuffle)
+        assert len(splits) == 3
+        for train, test in splits:
+            assert not set(groups[train]) & set(groups[test])
+            assert sorted([*train, *test]) == [*range(40)]
+        assert sorted(np.concatenate([test for _, test in splits])) == [*range(40)]
 
 
 @pytest.mark.slow
