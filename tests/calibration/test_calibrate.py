@@ -9,8 +9,11 @@ from scipy.spatial.transform import Rotation
 from torch.testing import assert_close
 
 from hybridkin import ConstantCurvatureChain, RigidChain, calibrate
-from hybridkin.calibration._least_squares import LOSSES
-from hybridkin.calibration.calibrate import fit_geometry
+from hybridkin.calibration._initial_guesses import aligned
+from hybridkin.calibration._least_squares import LOSSES, Rows
+from hybridkin.calibration._parameters import Problem
+from hybridkin.calibration._search import Start
+from hybridkin.calibration.calibrate import fit_geometry, refitted
 
 # The plain chain makes most tips itself here: tendons pulled at random mean no slack.
 pytestmark = pytest.mark.filterwarnings("ignore:.* pull the tendons of a segment together")
@@ -220,21 +223,88 @@ def test_robust_loss_forgets_outliers(rng):
 
 
 @pytest.mark.parametrize("loss", LOSSES)
-def test_weights_are_repetitions(loss, rng):
+@pytest.mark.parametrize(("names", "apart"), [(("radii",), 0.0), (("radii", "base"), 1e-12)])
+def test_weights_are_repetitions(loss, names, apart, rng):
+    """Equal rows are merged; rows that differ by 1e-12 m are not, and count as often."""
     q = chambers(rng, 40)
     x = ConstantCurvatureChain(RADII)(q) + 0.01 * torch.randn(40, 3, generator=rng).double()
     x[1:4] += 0.2
     weights, motions = torch.arange(40) % 3, np.arange(40) // 20
     repeated = torch.arange(40).repeat_interleave(weights)
-    nominal, names = ConstantCurvatureChain([0.09, 0.09, 0.09]), ("radii",)
+    many = x[repeated] + apart * torch.arange(len(repeated))[:, None]
+    nominal = ConstantCurvatureChain([0.09, 0.09, 0.09])
     own = {"loss": loss, "groups": motions, "sample_weight": weights}
     weighted = calibrate(nominal, q, x, names, **own)
     own = {"loss": loss, "groups": motions[repeated]}
-    expanded = calibrate(nominal, q[repeated], x[repeated], names, **own)
-    assert_close(weighted.chain.radii, expanded.chain.radii, rtol=1e-9, atol=0)
-    assert_close(weighted.std_errors["radii"], expanded.std_errors["radii"], rtol=1e-9, atol=0)
-    assert weighted.rmse == pytest.approx(expanded.rmse, rel=1e-9)
-    assert weighted.cv_rmse == pytest.approx(expanded.cv_rmse, rel=1e-9)
+    expanded = calibrate(nominal, q[repeated], many, names, **own)
+    # 40 rows that are up to 4e-11 m apart move the result by less, but the search ends elsewhere.
+    rtol = 1e-9 if apart == 0.0 else 1e-6
+    for name in names:
+        assert_close(weighted.values[name], expanded.values[name], rtol=rtol, atol=rtol)
+        found, expected = weighted.std_errors[name], expanded.std_errors[name]
+        assert_close(found, expected, rtol=10 * rtol, atol=0)
+    assert weighted.rmse == pytest.approx(expanded.rmse, rel=rtol)
+    assert weighted.cv_rmse == pytest.approx(expanded.cv_rmse, rel=rtol)
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_order_of_rows_and_names_of_motions_do_not_matter(loss, rng):
+    q = chambers(rng, 40)
+    x = ConstantCurvatureChain(RADII)(q) + 0.01 * torch.randn(40, 3, generator=rng).double()
+    motions, order = np.arange(40) // 10, torch.randperm(40, generator=rng).numpy()
+    weights = np.arange(40) % 3
+    names = np.array(["d", "a", "c", "b"])[motions]
+    nominal = ConstantCurvatureChain([0.09, 0.09, 0.09])
+    own = {"loss": loss, "groups": motions, "sample_weight": weights}
+    as_given = calibrate(nominal, q, x, ("radii",), **own)
+    own = {"loss": loss, "groups": names[order], "sample_weight": weights[order]}
+    mixed = calibrate(nominal, q[order], x[order], ("radii",), **own)
+    assert_close(mixed.values["radii"], as_given.values["radii"], rtol=1e-8, atol=0)
+    assert mixed.cv_rmse == pytest.approx(as_given.cv_rmse, rel=1e-8)
+
+
+@pytest.mark.parametrize("loss", ["linear", "soft_l1"])
+def test_motions_are_held_out_as_a_whole_with_their_weights(loss, rng):
+    """The error on a motion is that of a calibration without it; its rows count by weight."""
+    q = chambers(rng, 40)
+    truth = ConstantCurvatureChain(RADII)
+    motions = np.arange(40) % 4  # each with an error of its own
+    x = truth(q) + 0.02 * torch.randn(4, 3, generator=rng).double()[motions]
+    weights = np.arange(40) // 4 % 3
+    nominal = ConstantCurvatureChain([0.09, 0.09, 0.09])
+    own = {"loss": loss, "groups": motions, "sample_weight": weights}
+    found = calibrate(nominal, q, x, ("radii",), **own).cv_rmse
+    squares = 0.0
+    for motion in range(4):
+        kept = motions != motion
+        own = {"loss": loss, "sample_weight": weights[kept]}
+        chain = calibrate(nominal, q[kept], x[kept], ("radii",), **own).chain
+        apart = (chain(q) - x)[~kept].square().sum(1)
+        squares += weights[~kept] @ apart.numpy()
+    # Held-out fits end at steps of 1e-6.
+    assert found == pytest.approx((squares / weights.sum()) ** 0.5, rel=1e-4)
+
+
+def test_the_guess_of_the_base_ignores_rows_of_no_weight(rng):
+    truth = trunk(base=planted_base())
+    q = chambers(rng, 20)
+    x = truth(q)
+    x[::2] += gauss(rng, 10, 3)
+    weights = (torch.arange(20) % 2).double()
+    base = aligned(trunk(), Rows(q, x, weights)).geometry()["base"]
+    assert_close(base, planted_base(), rtol=0, atol=1e-9)
+
+
+def test_held_out_fits_count_rows_as_often_as_their_weights(rng):
+    q = chambers(rng, 40)
+    x = ConstantCurvatureChain(RADII)(q) + 0.01 * torch.randn(40, 3, generator=rng).double()
+    weights = torch.arange(40) % 3
+    repeated = torch.arange(40).repeat_interleave(weights)
+    problem = Problem.of(ConstantCurvatureChain([0.09, 0.09, 0.09]), ("radii",))
+    start = Start(problem, problem.start(1.0))
+    weighted = refitted(start, q, x, weights).radii
+    expanded = refitted(start, q[repeated], x[repeated], torch.ones(len(repeated))).radii
+    assert_close(weighted, expanded, rtol=1e-6, atol=0)
 
 
 def test_leaving_what_is_physical_warns(rng):
