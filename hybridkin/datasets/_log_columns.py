@@ -69,6 +69,14 @@ class LogRows:
             return np.ones(len(self.log.q) - 1, dtype=bool)
         return groups[1:] == groups[:-1]
 
+    @property
+    def same_run(self) -> NDArray:
+        """Whether each row and the next follow without a break, shape (N - 1,)."""
+        runs = self.log.runs
+        if runs is None:
+            return self.same_motion
+        return runs[1:] == runs[:-1]
+
 
 def frozen_tip(rows: LogRows) -> Iterator[LogFinding]:
     """Yield rows in which the tip, or a coordinate of it, is still while actuators move."""
@@ -244,7 +252,9 @@ def same_commands(rows: LogRows) -> Iterator[LogFinding]:
 
 def jumps(rows: LogRows) -> Iterator[LogFinding]:
     """Yield rows at which the tip moves much farther than the actuators explain."""
-    dq = np.linalg.norm(np.diff(rows.log.q, axis=0), axis=1)
+    ranges = np.ptp(rows.log.q, axis=0)
+    unit = np.where(ranges > 0, ranges, 1.0)
+    dq = np.linalg.norm(np.diff(rows.log.q / unit, axis=0), axis=1)
     dx = np.linalg.norm(np.diff(rows.log.x, axis=0), axis=1)
     n_rows = len(rows.log.q)
     if n_rows < _FEW_ROWS or not dx.any():
@@ -267,11 +277,11 @@ def jumps(rows: LogRows) -> Iterator[LogFinding]:
 
 
 def times(rows: LogRows) -> Iterator[LogFinding]:
-    """Yield rows whose time does not increase, and gaps in time within a motion."""
+    """Yield rows whose time does not increase, and gaps in time, within a motion or run."""
     if rows.log.time is None:
         return
     step = np.diff(rows.log.time)
-    late = np.flatnonzero(step <= 0) + 1
+    late = np.flatnonzero((rows.same_motion | rows.same_run) & (step <= 0)) + 1
     if len(late):
         message = f"times do not increase at {len(late)} rows ({rows.named(late)})."
         advice = "sort the rows by time in each motion; backlash and lag depend on the order."

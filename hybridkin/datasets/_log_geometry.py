@@ -297,15 +297,14 @@ def _wrong_units(comparison: _Comparison) -> Iterator[LogFinding]:
 
 
 def _longest_stroke(comparison: _Comparison) -> tuple[float, float]:
-    """Return the stroke of the tendon that bends most, and the radius that it has there [m].
+    """Return the stroke of the tendon that bends most, and its radius times its segments [m].
 
     A tendon bends its own segment and, with routing "base", all segments before it.
     """
     chain = comparison.chain
-    radii = comparison.radii
-    if chain.routing == "base":
-        radii = np.cumsum(radii)
-    radii = np.repeat(radii, chain.actuators_per_segment)[comparison.pulled]
+    n_bent = 1 + np.arange(chain.n_segments) - np.array(chain.starts)
+    radii = np.repeat(n_bent * comparison.radii, chain.actuators_per_segment)
+    radii = radii[comparison.pulled]
     strokes = np.abs(comparison.log.q).max(axis=0)[comparison.pulled]
     longest = int(np.argmax(strokes / radii))
     return strokes[longest], radii[longest]

@@ -270,6 +270,7 @@ def test_motions_are_held_out_as_a_whole_with_their_weights(loss, rng):
     truth = ConstantCurvatureChain(RADII)
     motions = np.arange(40) % 4  # each with an error of its own
     x = truth(q) + 0.02 * torch.randn(4, 3, generator=rng).double()[motions]
+    q[5], x[5] = q[4], x[4]  # a row of two motions
     weights = np.arange(40) // 4 % 3
     nominal = ConstantCurvatureChain([0.09, 0.09, 0.09])
     own = {"loss": loss, "groups": motions, "sample_weight": weights}

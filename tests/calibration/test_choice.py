@@ -69,6 +69,7 @@ def log_of_motions(n=30):
     groups = np.arange(n) % 3
     x = PLANAR.with_geometry(base=moved_base())(torch.from_numpy(q)).numpy()
     x = x + 0.02 * rng.standard_normal((3, 3))[groups] + 1e-3 * rng.standard_normal((n, 3))
+    q[4], x[4] = q[3], x[3]  # a row of two motions
     return q, x, groups, np.arange(n) // 3 % 3
 
 

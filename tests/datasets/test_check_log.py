@@ -86,7 +86,13 @@ OF_COLUMNS = {
     "duplicates": (copied(0.0), "warning", range(200, 220), "20 of them in another motion"),
     "same command": (copied([3e-4, 0, 0]), "note", None, "40 rows have the same"),
     "jumps": (with_rows("x", [110], [0.3, 0.0, 0.0]), "warning", [110, 111], "soft_l1"),
-    "time": (measured(time=0.1 * np.arange(240) * (np.arange(240) != 100)), "warning", [100], ""),
+    "time": (measured(time=0.1 * np.arange(240) * (np.arange(240) != 105)), "warning", [105], ""),
+    "time, run": (
+        measured(time=0.1 * np.arange(240) * (np.arange(240) != 100), runs=np.zeros(240)),
+        "warning",
+        [100],
+        "",
+    ),
     "time, gap": (
         measured(time=0.1 * np.arange(240) + 5.0 * (np.arange(240) > 104)),
         "warning",
@@ -111,6 +117,75 @@ def test_mistakes_in_columns(case):
     assert finding.severity == severity
     if rows is not None:
         assert finding.rows.tolist() == [*rows]
+
+
+def kinds_and_rows(log):
+    """What a check without a chain finds, without the words."""
+    found = datasets.check_log(log).findings
+    return [(f.kind, f.severity, f.rows.tolist()) for f in found if f.kind != "no motion"]
+
+
+def renamed(log):
+    if log.groups is None:
+        return log
+    return replace(log, groups=np.array([f"motion {chr(110 - g % 13)}{g}" for g in log.groups]))
+
+
+ELSEWHERE = {
+    "names of motions, clock": lambda log: replace(renamed(log), time=1e3 * log.time + 1e6),
+    "zeros and origin": lambda log: replace(log, q=log.q + 0.05, x=log.x - 2.0),
+    "unit of an actuator": lambda log: replace(log, q=log.q * np.where(np.arange(9) == 4, 57.0, 1)),
+}
+
+
+@pytest.mark.parametrize("change", ELSEWHERE)
+@pytest.mark.parametrize("case", [case for case in OF_COLUMNS if "coordinate" not in case])
+def test_what_is_found_does_not_depend_on_names_zeros_and_units(case, change):
+    log = OF_COLUMNS[case][0]
+    assert kinds_and_rows(ELSEWHERE[change](log)) == kinds_and_rows(log)
+
+
+def test_pauses_between_motions_are_no_gaps():
+    """Also where each motion has a clock of its own."""
+    within = 0.1 * np.tile(np.arange(20), 12)
+    pauses = within + 60.0 * (np.arange(240) // 20)
+    for time in (pauses, within):
+        assert not [f for f in findings(measured(time=time), None) if f.kind == "time"]
+    one_run = measured(time=within, runs=np.zeros(240))
+    (late,) = (f for f in findings(one_run, None) if f.kind == "time")
+    assert late.rows.tolist() == [*range(20, 240, 20)]
+    # Pauses do not change what a usual step is: 0.1 s in motions of two rows.
+    short = measured(time=0.1 * np.arange(240) + 60.0 * (np.arange(240) // 2))
+    short = replace(short, groups=np.arange(240) // 2)
+    assert not [f for f in findings(short, None) if f.kind == "time"]
+    short.time[101:] += 2.0
+    (gap,) = (f for f in findings(short, None) if f.kind == "time")
+    assert gap.rows.tolist() == [101]
+    assert "up to 2.1 s; the usual step is 0.1 s" in gap.message
+
+
+def test_a_lag_is_one_within_motions():
+    """Each tip is that of the command three rows before, and exactly linear in it."""
+    rng = np.random.default_rng(0)
+    q = rng.standard_normal((12, 23, 4)).cumsum(axis=1)
+    x = q[:, :-3] @ rng.standard_normal((4, 3))
+    log = Log(q[:, 3:].reshape(-1, 4), x.reshape(-1, 3), np.repeat(np.arange(12), 20))
+    (finding,) = (f for f in datasets.check_log(log).findings if f.kind == "lag")
+    assert "3 rows behind q" in finding.message
+    assert float(re.search(r"is (\S+) mm with this lag", finding.message)[1]) < 1e-9
+
+
+@pytest.mark.parametrize(("routing", "ratio", "radius"), [("segment", 600, 6), ("base", 500, 18)])
+def test_strokes_are_compared_with_the_radii_that_they_bend(routing, ratio, radius):
+    """From the base the last tendon bends all segments: its radius counts three times."""
+    chain = ConstantCurvatureChain([0.004, 0.005, 0.006], lengths=[0.06] * 3, routing=routing)
+    bends = np.outer(np.sin(np.linspace(0.3, 0.5 * np.pi, 40)), [0.4, 0.5, 0.6])
+    q = np.hstack([0.0 * bends, bends, 0.0 * bends]) @ chain._readings().numpy().T
+    x = chain(torch.from_numpy(q)).numpy()
+    assert not datasets.check_log(Log(q, x), chain=chain).errors
+    (finding,) = datasets.check_log(Log(1e3 * q, x), chain=chain).errors
+    text = f"stroke is {ratio * radius} mm, {ratio} times the radii ({radius} mm)"
+    assert text in finding.message
 
 
 def turned(order):
