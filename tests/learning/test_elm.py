@@ -131,10 +131,13 @@ def test_input_scalings():
     assert_array_equal(raw.input_scale_, np.ones(9))
 
 
-@pytest.mark.parametrize("unit", [1e-150, 1e3])
-def test_units_of_the_data_do_not_matter(unit):
+@pytest.mark.parametrize("input_scaling", ["minmax", "standard"])
+@pytest.mark.parametrize("unit", [1e-150, 1e3, np.logspace(-3, 3, 9)])
+def test_units_of_the_data_do_not_matter(unit, input_scaling):
+    """Nor those of single columns."""
     X, Y = trunk()
-    base, other = elm().fit(X, Y), elm().fit(unit * X, 3 * Y)
+    params = {"input_scaling": input_scaling}
+    base, other = elm(**params).fit(X, Y), elm(**params).fit(unit * X, 3 * Y)
     assert_allclose(other.predict(unit * X), 3 * base.predict(X), rtol=1e-8)
     assert_allclose(other.jacobian(unit * X) * unit, 3 * base.jacobian(X), rtol=1e-7, atol=1e-7)
 
@@ -183,6 +186,19 @@ def test_sample_weight_is_repetition(fit_intercept, input_scaling):
     Z = X[2:]
     assert_allclose(weighted.leverage(Z), repeated.leverage(Z), rtol=1e-7)
     assert weighted.n_samples_seen_ == w.sum()
+
+
+@pytest.mark.parametrize("fit_intercept", [False, True])
+def test_all_weights_and_the_penalty_times_a_number_are_the_same_model(fit_intercept):
+    X, Y = trunk(120)
+    w = np.random.default_rng(2).uniform(0.5, 2.0, 120)
+    order = np.random.default_rng(3).permutation(120)
+    params = {"fit_intercept": fit_intercept, "input_scaling": "standard"}
+    one = elm(**params).fit(X, Y, sample_weight=w)
+    tenfold = elm(alpha=1.0, **params).fit(X[order], Y[order], sample_weight=10.0 * w[order])
+    # The condition of the readout is below 1e6.
+    assert_allclose(tenfold.predict(X), one.predict(X), rtol=0, atol=1e-9)
+    assert_allclose(tenfold.leverage(X), 0.1 * one.leverage(X), rtol=1e-7)
 
 
 # Derivatives

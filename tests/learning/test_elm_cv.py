@@ -142,6 +142,44 @@ def test_weights_are_repetitions_that_are_left_out_together(n):
     assert_array_equal(np.isnan(weighed.left_out_errors_).any(axis=1), weights == 0)
 
 
+@pytest.mark.parametrize("scaling", ["minmax", "standard"])
+@pytest.mark.parametrize("n", [12, 60])
+def test_weights_are_repetitions_that_stay_apart(n, scaling):
+    """Targets that differ by 1e-9 are not merged; held out together, they are one row."""
+    X, y = data(n)
+    weights = np.random.default_rng(0).integers(0, 4, n)
+    repeated = np.repeat(np.arange(n), weights)
+    params = {"relevance_rounds": 2, "max_hidden": 40, "input_scaling": scaling}
+    weighed = quick(**params).fit(X, y, sample_weight=weights)
+    many = y[repeated] + 1e-9 * np.arange(len(repeated))[:, None]
+    by_row = quick(**params).fit(X[repeated], many, groups=repeated)
+    # Targets up to 1e-7 apart change squared errors of 1e-3 by 1e-5 of them at most.
+    for name in ("mean_squared_error", "relevance", "n_hidden", "weight_scale"):
+        assert_allclose(by_row.cv_results_[name], weighed.cv_results_[name], rtol=1e-5)
+    assert by_row.alpha_ == weighed.alpha_
+    assert_allclose(by_row.predict(X), weighed.predict(X), rtol=0, atol=1e-6)
+    assert_allclose(by_row.noise_variance_, weighed.noise_variance_, rtol=1e-5)
+    left_out = np.repeat(weighed.left_out_errors_, weights, axis=0)
+    assert_allclose(by_row.left_out_errors_, left_out, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("cv", [None, 3])
+def test_names_of_groups_units_and_order_do_not_matter(cv):
+    X, y = data(60)
+    groups = np.random.default_rng(0).integers(0, 6, 60)
+    weights = np.random.default_rng(1).uniform(0.5, 2.0, 60)
+    params = {"relevance_rounds": 1, "cv": cv}
+    model = quick(**params).fit(X, y, weights, groups)
+    order = np.random.default_rng(2).permutation(60)
+    names = np.array([*"abcdef"])[groups]  # in the same order: GroupKFold follows it in ties
+    unit = np.array([1e-3, 1.0, 30.0])
+    other = quick(**params).fit(unit * X[order], 3 * y[order], weights[order], names[order])
+    errors = model.cv_results_["mean_squared_error"]
+    assert_allclose(other.cv_results_["mean_squared_error"], 9 * errors, rtol=1e-7)
+    assert other.alpha_ == model.alpha_
+    assert_allclose(other.left_out_errors_, 3 * model.left_out_errors_[order], rtol=0, atol=1e-7)
+
+
 # Choices
 
 
