@@ -157,9 +157,10 @@ class HysteresisProblem:
         self.start = np.outer(one_backlash, np.ones(n))
 
         self.measured = log.x[log.rows]
-        roots = np.sqrt(log.counts[log.rows])[:, None]
+        counts = log.counts[log.rows]
+        roots = np.sqrt(counts)[:, None]
         self.roots = np.where(np.isnan(self.measured), 0.0, roots)
-        self.center = log.q.mean(axis=0)
+        self.center = np.average(log.q[log.rows], axis=0, weights=counts)
         ranges = np.ptp(log.q, axis=0)
         self.scale = np.where(ranges > 0.0, ranges, 1.0)
 

@@ -108,6 +108,89 @@ def test_shares_of_creep_and_the_width_before_it_are_found():
         np.testing.assert_allclose(gains[near], share, atol=0.05)
 
 
+def changed(log, **columns):
+    """A log with other columns, or only some of its rows."""
+    names = ("model", "q", "x", "counts", "groups", "runs", "time")
+    return HysteresisLog(**{name: columns.get(name, getattr(log, name)) for name in names})
+
+
+def taken(log, rows):
+    """A log of rows in another order, or of repeated ones that count once."""
+    columns = {n: getattr(log, n)[rows] for n in ("q", "x", "counts", "groups", "runs", "time")}
+    return changed(log, **columns)
+
+
+def found(log, unit=1.0):
+    """Weights of friction about a backlash of 0.3 and of creep, and the errors on held-out rows."""
+    problem = HysteresisProblem(log, 0.3 * unit, creep=True)
+    fit = problem.fitted(0.2, 0.2)
+    return {
+        "slopes": fit.slopes,
+        "gains": fit.gains,
+        "groups": np.sort(log.by_group(fit.distances)),
+        "mean": np.average(fit.distances, weights=log.counts[log.rows]),
+    }
+
+
+FRICTION = HysteresisSeries([PlayOperator(0.3), CreepOperator([0.2], [4.0])])
+WHOLE = log_of(FRICTION, groups=5, rows=24)
+COUNTS = np.random.default_rng(1).integers(0, 4, len(WHOLE.q)).astype(float)
+COUNTED = changed(WHOLE, counts=COUNTS)
+MIXED = np.argsort((np.arange(len(WHOLE.q)) % 24) * 7 + WHOLE.groups * 3, kind="stable")
+
+
+def repetitions():
+    """Every row as often as it counts; those of no count as rows whose tip was not measured."""
+    rows = np.repeat(np.arange(len(COUNTS)), np.maximum(COUNTS, 1).astype(int))
+    x = np.where(COUNTS[:, None] > 0, WHOLE.x, np.nan)
+    return taken(changed(WHOLE, x=x), rows)
+
+
+def in_another_unit():
+    unit = 1e3
+    model = as_forward_model(lambda q: q @ torch.from_numpy(M.T / unit))
+    return changed(COUNTED, model=model, q=unit * WHOLE.q)
+
+
+INVARIANT = {
+    "repetitions": repetitions,
+    "order": lambda: taken(COUNTED, MIXED),
+    "names": lambda: changed(
+        COUNTED, groups=np.array([*"dabec"])[WHOLE.groups], runs=9.5 - WHOLE.runs
+    ),
+    "clock": lambda: changed(COUNTED, time=WHOLE.time + 1000.0 * WHOLE.runs),
+    "unit of q": in_another_unit,
+}
+
+
+@pytest.mark.parametrize("change", INVARIANT)
+def test_hysteresis_does_not_depend_on(change):
+    """Counts are repetitions, of a row that stays, in which no creep goes on without time."""
+    expected = found(COUNTED)
+    assert expected["gains"].max() > 0.05
+    after = found(INVARIANT[change](), 1e3 if change == "unit of q" else 1.0)
+    for name, value in expected.items():  # sums in another order, conditions of 1e5
+        np.testing.assert_allclose(after[name], value, rtol=1e-6, atol=1e-8)
+
+
+def test_runs_and_not_groups_are_where_hysteresis_starts():
+    """Parts of one motion are held out, but the play goes on from part to part."""
+    q = np.random.default_rng(0).uniform(-1.0, 1.0, (120, 3)).cumsum(axis=0)
+    play = PlayOperator(0.8)
+    groups, runs, time = np.arange(120) // 10, np.zeros(120), np.arange(120.0)
+    x = play.apply_by_group(q, runs) @ M.T
+    model = as_forward_model(lambda q: q @ torch.from_numpy(M.T))
+    log = HysteresisLog(model, q, x, np.ones(120), groups, runs, time)
+    exact = HysteresisProblem(log, 0.8, creep=False).fitted(0.0, 0.0).distances
+    assert exact.max() < 1e-9
+    restarted = changed(log, runs=groups)
+    assert HysteresisProblem(restarted, 0.8, creep=False).fitted(0.0, 0.0).distances.max() > 0.05
+    np.testing.assert_allclose(log.times[[0, -1]], [1.0, 119.0])
+    np.testing.assert_allclose(restarted.times[[0, -1]], [1.0, 9.0])
+    for train, test in log.folds:
+        assert not set(groups[train]) & set(groups[test])
+
+
 def test_a_gain_must_be_above_its_error_and_above_one_percent():
     def gain_of(errors):
         before = np.array([1.0, 1.1, 0.9, 1.0])
