@@ -100,6 +100,41 @@ def test_each_motion_starts_at_rest_and_has_its_times():
         close(y[rows], operator.apply(q[rows], dt=steps)[0])
 
 
+@pytest.mark.parametrize(
+    "operator",
+    [
+        PlayOperator([0.3, 0.5]),
+        PrandtlIshlinskiiOperator([0.0, 0.3, 0.8], [0.3, 1.2]),
+        CreepOperator([[0.3, 0.1], [0.2, 0.4]], [3.0, 20.0]),
+        HysteresisSeries([PlayOperator(0.3), CreepOperator([0.4], [3.0])]),
+    ],
+    ids=lambda operator: operator.kind,
+)
+def test_motions_may_be_renamed_mixed_and_have_clocks_in_any_unit(operator):
+    rng = np.random.default_rng(0)
+    q = rng.normal(size=(30, 2))
+    groups = np.arange(30) // 10
+    time = np.cumsum(rng.uniform(0.1, 5.0, 30))
+    y = operator.apply_by_group(q, groups, time)
+    inner = operator.inner_states(q, groups, time)
+    for name in range(3):  # the state is the last command, what is inside, and the result
+        rows = groups == name
+        _, state = operator.apply(q[rows], dt=np.diff(time[rows], prepend=time[rows][0]))
+        close(y[rows][-1], state[-1])
+        if len(inner[0]):
+            close(inner[rows][-1], state[-1 - len(inner[0]) : -1])
+    order = np.argsort(np.arange(30) % 10 + 0.1 * (2 - groups))
+    names = np.array(["b", "c", "a"])[groups[order]]
+    clock = time[order] + 1e3 * groups[order]
+    close(operator.apply_by_group(q[order], names, clock), y[order], atol=1e-12)
+    close(operator.inner_states(q[order], names, clock), inner[order], atol=1e-12)
+    if isinstance(operator, CreepOperator):
+        slower = CreepOperator(operator.gains, 60.0 * operator.times)
+        close(slower.apply_by_group(q, groups, 60.0 * time), y)
+    with pytest.raises(ValueError, match="`time` must not decrease within a motion, but does in"):
+        operator.apply_by_group(q, groups, -time)
+
+
 def test_commands_of_a_target_that_stays_do_not_jump_by_the_backlash():
     # In rounding the inverse of creep goes to and fro; a backlash must not follow it.
     series = HysteresisSeries([PlayOperator(0.5), CreepOperator([0.2, 0.7], [2.0, 9.0])])

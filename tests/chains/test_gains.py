@@ -5,8 +5,9 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from hybridkin import ConstantCurvatureChain, ElasticTendonChain
+from hybridkin import ConstantCurvatureChain, ElasticTendonChain, ForceTendonChain
 from hybridkin.chains.chain import Chain
+from hybridkin.native.library import evaluate
 
 COUNTS = torch.tensor([2e-5, -3e-5, 2.5e-5, 1e-5, 4e-5, -2e-5], dtype=torch.float64)
 ZEROS = torch.tensor([500.0, -200.0, 0.0, 30.0, 1000.0, 2048.0], dtype=torch.float64)
@@ -14,6 +15,16 @@ KINDS = {
     "extensible": (ConstantCurvatureChain, {}),
     "tendons": (ConstantCurvatureChain, {"lengths": [0.1, 0.08], "routing": "base"}),
     "elastic": (ElasticTendonChain, {"lengths": [0.1, 0.08], "tendon_zeros": 5e-4}),
+    "forces": (
+        ForceTendonChain,
+        {
+            "lengths": [0.1, 0.08],
+            "bending_stiffness": [0.02, 0.01],
+            "axial_stiffness": 100.0,
+            "weight": 0.5,
+            "arcs": 2,
+        },
+    ),
 }
 
 
@@ -22,10 +33,12 @@ def pair(kind, tip_at=1.6):
     cls, options = KINDS[kind]
     given = {"radii": [0.01, 0.008], "rest_bends": 0.05, "offsets": [0.01, 0.02], **options}
     plain = cls(**given).with_tip(tip_at)
-    zeros = {} if kind == "elastic" else {"actuator_zeros": ZEROS}
+    zeros = {} if kind in ("elastic", "forces") else {"actuator_zeros": ZEROS}
     counted = cls(**given, gains=COUNTS, **zeros).with_tip(tip_at)
     metres = 0.004 * torch.randn(20, 6, generator=torch.manual_seed(0), dtype=torch.float64)
     metres = metres + 0.1 * (kind == "extensible")
+    if kind == "forces":
+        metres = 1e3 * metres.abs()  # [N]
     return plain, counted, metres, metres / COUNTS + counted.rest
 
 
@@ -43,11 +56,27 @@ def test_the_unit_of_q_changes_nothing(kind):
     assert_close(slope, plain.coordinates(metres)[1] * COUNTS)
     if kind == "elastic":
         assert_close(counted.tensions(q), plain.tensions(metres))
+        assert_close(counted.slack(q), plain.slack(metres))
         assert counted.slack(q).any()
+        assert_close(counted.pulls, -COUNTS.sign())
+    elif kind == "forces":
+        assert_close(counted.forces(q), metres)
+        assert counted.check_actuators(q) == []
+        with pytest.raises(ValueError, match="20 of 20 rows"):
+            counted.check_actuators(-q)
     else:
         assert_close(counted.consistency(q), plain.consistency(metres))
         assert_close(counted.contradictory(q), plain.contradictory(metres))
+        assert counted.contradiction(q) == plain.contradiction(metres)
+    if kind != "forces":
+        in_counts, in_metres = counted.plausible_rows(), plain.plausible_rows()
+        assert_close(in_counts.rest, counted.rest.numpy())
+        assert_close(in_counts.weights, in_metres.weights * COUNTS.numpy())
+    x, J = evaluate(counted, q.numpy(), jacobian=True)  # the compiled core, where there is one
+    assert_close(torch.from_numpy(x), plain(metres), atol=1e-12, rtol=0)
+    assert_close(torch.from_numpy(J), plain.jacobian(metres) * COUNTS, atol=1e-15, rtol=1e-8)
     assert counted.unit_messages(q, "q") == []
+    assert len(counted.unit_messages(2e3 * q, "q")) == (kind != "forces")
     assert counted(q.float()).dtype == torch.float32
 
 
@@ -86,6 +115,18 @@ def test_gains_of_all_of_segments_and_of_actuators():
         gains([1.0, 2.0, 3.0])
     with pytest.raises(ValueError, match="`gains` must be finite"):
         gains(float("nan"))
+
+
+def test_no_tip_is_farther_than_the_longest_robot():
+    """For every q within a bound, also of a chain in counts whose zeros are far from it."""
+    rows = torch.rand(200, 6, generator=torch.manual_seed(1), dtype=torch.float64)
+    for kind in ("extensible", "tendons", "elastic"):
+        _, counted, _, q = pair(kind, tip_at=2.0)
+        largest = q.abs().amax(0)
+        inside = (2.0 * rows - 1.0) * largest
+        away = torch.linalg.vector_norm(counted(inside), dim=-1).max()
+        assert away <= counted.longest(largest)
+        assert (counted.misses(counted(inside), largest) <= 0.0).all()
 
 
 def test_lengths_are_positive_in_metres():
