@@ -247,6 +247,17 @@ def test_weights_are_repetitions(loss, names, apart, rng):
     assert weighted.cv_rmse == pytest.approx(expanded.cv_rmse, rel=rtol)
 
 
+def test_the_effect_of_what_is_not_identified_is_that_on_a_mean_row(rng):
+    q = 0.25 + 0.001 * uniform(rng, 12, 9)
+    x = trunk()(q) + 0.0015 * gauss(rng, 12, 3)
+    thrice = torch.arange(12).repeat(3)
+    apart = 1e-12 * torch.arange(36)[:, None]  # or equal rows are merged
+    nominal = trunk([0.09, 0.09, 0.09])
+    weighted = calibrate(nominal, q, x, ("radii",), sample_weight=[3.0] * 12).unidentified
+    assert "mm rms" in weighted[0]
+    assert weighted == calibrate(nominal, q[thrice], x[thrice] + apart, ("radii",)).unidentified
+
+
 @pytest.mark.parametrize("loss", LOSSES)
 def test_order_of_rows_and_names_of_motions_do_not_matter(loss, rng):
     q = chambers(rng, 40)
