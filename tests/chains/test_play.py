@@ -114,15 +114,15 @@ def test_no_play_in_a_log_is_none():
 
 def test_play_of_counts_is_that_of_metres_and_runs_go_on_from_motion_to_motion():
     truth, q, x, _ = log_of(0.4e-3, 0.0)
-    parts, one_run = np.repeat(np.arange(30), 5), np.zeros(len(q))
-    x = truth(torch.as_tensor(PlayOperator(0.4e-3).apply_by_group(q, one_run))).detach().numpy()
-    metres = fit_play(truth, Commands(q, one_run), x, parts, parameters=("radii",))
+    parts, runs = np.repeat(np.arange(30), 5), np.repeat([1, 0], 75)
+    x = truth(torch.as_tensor(PlayOperator(0.4e-3).apply_by_group(q, runs))).detach().numpy()
+    metres = fit_play(truth, Commands(q, runs), x, parts, parameters=("radii",))
     assert metres.width == 0.4e-3
     assert metres.cv_distance[4] < 1e-5 < 1e-4 < np.delete(metres.cv_distance, 4).min()
     assert metres.result.rmse < 1e-9
     counted = truth.with_geometry(gains=truth.gains * 2e-5)
     names = np.array([f"part {k:02d}" for k in parts])  # in the same order: so are the folds
-    counts = fit_play(counted, Commands(q / 2e-5, one_run), x, names, parameters=("radii",))
+    counts = fit_play(counted, Commands(q / 2e-5, runs), x, names, parameters=("radii",))
     close(2e-5 * counts.widths, metres.widths)
     assert_close(torch.as_tensor(counts.cv_distance), torch.as_tensor(metres.cv_distance))
     assert_close(counts.result.chain.radii, metres.result.chain.radii)
