@@ -177,19 +177,20 @@ def choose_geometry(
     nominal = chain
     chain = copy.deepcopy(chain).cpu()
     q, x, _ = check_data(chain, q, x)
-    if groups is not None:
-        groups = labels(groups, len(q))
+    motions = None if groups is None else labels(groups, len(q))
     if weights is not None:
         weights = as_tensor(weights, "weights").to(q)
-    first, counts, _ = distinct_rows(q, x, weights, groups)
+    first, counts, _ = distinct_rows(q, x, weights, motions)
     if counts is None:
         counts = np.ones(len(first))
     order = np.arange(len(first))
-    if groups is not None:
-        groups = groups[first]
-        order = np.argsort(groups, kind="stable")
+    if motions is not None:
+        motions = motions[first]
+        order = np.argsort(motions, kind="stable")
     chosen = np.sort(order[evenly_spaced(len(first), _MOST)])
     rows = Rows(q[first], x[first], torch.from_numpy(counts).to(q)).take(chosen)
+    if motions is not None:
+        motions = motions[chosen]
     with torch.no_grad():
         candidates = _candidates(chain, q, parameters)
         messages = () if parameters is not None else unmoved(chain, q)
@@ -200,7 +201,6 @@ def choose_geometry(
     near = []
     errors = {}
     if len(candidates) > 1:
-        motions = None if groups is None else groups[chosen]
         splits = _splits(rows, motions)
         outer = None
         if outside and len(chosen) >= _FEW:
