@@ -164,6 +164,18 @@ def test_pauses_between_motions_are_no_gaps():
     assert "up to 2.1 s; the usual step is 0.1 s" in gap.message
 
 
+def test_a_usual_step_is_one_within_motions():
+    """Poses far from each other, and some pairs of near ones, in one of which the tip jumps."""
+    poses = np.random.default_rng(0).standard_normal((60, 4))
+    rows = np.sort(np.append(np.arange(60), np.arange(20)))
+    second = np.append(False, np.diff(rows) == 0)
+    q = poses[rows] + 0.001 * second[:, None]
+    x = q[:, :3].copy()
+    x[21] += 0.05  # the second row of pair 10
+    (jump,) = (f for f in datasets.check_log(Log(q, x, rows)).findings if f.kind == "jumps")
+    assert jump.rows.tolist() == [21]
+
+
 def test_a_lag_is_one_within_motions():
     """Each tip is that of the command three rows before, and exactly linear in it."""
     rng = np.random.default_rng(0)
