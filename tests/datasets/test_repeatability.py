@@ -51,10 +51,21 @@ def test_units_names_and_order_of_rows_do_not_matter():
 def test_a_log_that_never_comes_back_cannot_tell():
     q, motions = log(20, seed=0)
     once = motions < 20
-    x = tips(q)
+    x = tips(q) + 1e-4 * np.random.default_rng(0).standard_normal((len(q), 3))
+    assert repeatability(q, x, motions) is not None
     assert repeatability(q[once], x[once], motions[once]) is None
     assert repeatability(q, x, np.zeros(len(q))) is None
     assert repeatability(q[:3], x[:3], motions[:3]) is None
+
+
+def test_a_robot_that_waits_is_compared_with_other_motions():
+    """Rows beside each other share the error of their motion, which counts."""
+    q, motions = (np.repeat(rows, 3, axis=0) for rows in log(60, seed=0))
+    rng = np.random.default_rng(1)
+    of_motions = 1e-3 * rng.standard_normal((120, 3))
+    x = tips(q) + of_motions[motions] + 1e-5 * rng.standard_normal((len(q), 3))
+    # 60 pairs of motions: their median is within 20 %.
+    assert repeatability(q, x, motions) == pytest.approx(MEAN_LENGTH * 1e-3, rel=0.2)
 
 
 def test_hysteresis_counts_where_the_past_differs():
