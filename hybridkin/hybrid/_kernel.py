@@ -52,7 +52,8 @@ def tuned_kernel(
             f"grows with the square of their number, got {len(X)}; use fewer rows, or "
             "error_model=ELMRegressorCV()."
         )
-    spread = X.var(axis=0).mean() or 1.0
+    squares = np.square(X - np.average(X, axis=0, weights=weights))
+    spread = np.average(squares, axis=0, weights=weights).mean() or 1.0
 
     def held_out(most: int) -> _HeldOut:
         rows = evenly_spaced(len(X), most)

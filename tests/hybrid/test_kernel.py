@@ -32,7 +32,7 @@ def test_no_neighbour_of_the_tuned_kernel_is_better(enough, n_outputs, grouped, 
     weights = rng.integers(1, 4, 60).astype(float)
     groups = np.arange(60) // 6 if grouped else None
     found = tuned_kernel(X, y, weights, groups)
-    spread = X.var(axis=0).mean()
+    spread = np.repeat(X, weights.astype(int), axis=0).var(axis=0).mean()
     best = held_out(X, y, weights, groups, found.gamma, found.alpha)
     width = np.argmin(np.abs(np.array(_kernel._GAMMAS) - found.gamma * spread))
     penalty = np.argmin(np.abs(np.array(_kernel._ALPHAS) - found.alpha))
