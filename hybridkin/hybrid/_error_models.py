@@ -336,7 +336,7 @@ class RegressorModel(TipModel, Generic[_Regressor]):
             noise = self._noise(regressor, module, rows)
         correction = TipCorrection(_on_moved_directions(module, directions))
         return FittedError(
-            regressor,
+            self._shown(regressor, rows),
             [[(1.0, correction)]],
             self._settled(regressor),
             noise,
@@ -349,14 +349,19 @@ class RegressorModel(TipModel, Generic[_Regressor]):
     def _settled(self, regressor: _Regressor) -> ErrorModel:
         return self
 
+    def _shown(self, regressor: _Regressor, rows: Rows) -> _Regressor:
+        """Return the fitted regressor with its results for the rows as they were given."""
+        return regressor
+
     def _noise(self, regressor: _Regressor, module: ForwardModel, rows: Rows) -> float:
         """Return the spread of training errors; regressors may overfit, so it has a least share."""
         rows = rows.thinned(_MOST)
         before = _residual(rows)
         with torch.no_grad():
             after = before - module(rows.q).numpy()
-        least = _LEAST * np.sqrt(np.var(before, axis=0).mean())
-        return max(_spread(after, rows.counts), float(least))
+        mean = np.average(before, axis=0, weights=rows.counts)
+        least = _LEAST * _spread(before - mean, rows.counts)
+        return max(_spread(after, rows.counts), least)
 
 
 class NetworkModel(RegressorModel[ELMRegressor]):
@@ -382,13 +387,13 @@ class NetworkModelCV(RegressorModel[ELMRegressorCV]):
 
     holds_out = True
 
-    def _fitted(self, rows: Rows) -> ELMRegressorCV:
-        network = super()._fitted(rows)
-        network.left_out_errors_ = rows.as_given(network.left_out_errors_)
-        return network
-
     def _settled(self, regressor: ELMRegressorCV) -> ErrorModel:
         return NetworkModel(ELMRegressor(**regressor.best_params_))
+
+    def _shown(self, regressor: ELMRegressorCV, rows: Rows) -> ELMRegressorCV:
+        """Return the network with the errors of the given rows."""
+        regressor.left_out_errors_ = rows.as_given(regressor.left_out_errors_)
+        return regressor
 
     def starting_at(self, settled: ErrorModel) -> ErrorModel:
         """Return the model with a shorter search, which starts at the settled input scales.
@@ -410,8 +415,7 @@ class NetworkModelCV(RegressorModel[ELMRegressorCV]):
         self, regressor: ELMRegressorCV, module: ForwardModel, rows: Rows
     ) -> float:
         """Return the spread of the errors of rows that were held out."""
-        squares = np.square(regressor.left_out_errors_)
-        return float(np.sqrt(np.nanmean(squares)))
+        return _spread(regressor.left_out_errors_.reshape(len(rows), -1), rows.counts)
 
 
 @named("kernel")
