@@ -9,6 +9,7 @@ import torch
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.stats import multivariate_normal
 from sklearn.base import BaseEstimator, RegressorMixin
+from sklearn.model_selection import KFold
 
 from hybridkin import ConstantCurvatureChain, HybridForwardModel
 from hybridkin.hybrid import _radius
@@ -19,6 +20,7 @@ from hybridkin.hybrid._features import Features
 from hybridkin.hybrid._readout_fit import _Problem as ReadoutProblem
 from hybridkin.hybrid._readout_fit import fit_readout
 from hybridkin.hybrid._rows import Rows
+from hybridkin.hybrid._selection import _is_small
 from hybridkin.hybrid._spec import Spec
 from hybridkin.hybrid._wrapped import PoseRows, WithPose
 from hybridkin.hybrid.held_out import HeldOut, Predictions, chosen_blend
@@ -106,6 +108,73 @@ def test_a_gain_in_one_motion_alone_is_not_sure():
     assert chosen_blend(names, held_out(errors, groups=groups))[1]["chosen"] == "mechanical"
 
 
+def test_a_blend_is_scored_on_each_fold_with_weights_of_the_others():
+    """Each of two models is exact in half of the folds; the other half chooses the wrong one."""
+    fold = np.arange(N) % 2
+    y = np.zeros((N, 3))
+    off = np.stack([np.full(N, 3.0), 0.8 * fold, 1.0 - fold])[..., None] * [1.0, 0.0, 0.0]
+    every = Predictions(y + off, y, np.ones(N), None)
+    both = HeldOut.of(every, every, np.append(fold, fold))
+    shares, results = chosen_blend(NAMES, both)
+    assert_array_equal(shares, [0.0, 1.0, 0.0])
+    assert_allclose(results["mean_distance"], [3.0, 0.4, 0.5, 0.9])
+    assert_allclose(results["io_distance"], [3.0, 0.4, 0.5, 0.9])
+    assert results["expected_distance"] == pytest.approx(0.9)
+
+
+def repeated(rows, many):
+    """Return predictions of rows, each as often as its place is in `many`."""
+    groups = None if rows.groups is None else rows.groups[many]
+    return Predictions(rows.predicted[:, many], rows.y[many], np.ones(len(many)), groups)
+
+
+@pytest.mark.parametrize("grouped", [False, True])
+def test_weights_of_predictions_are_repetitions(grouped):
+    rng = np.random.default_rng(2)
+    counts = rng.integers(1, 6, N).astype(float)
+    groups = np.arange(N) // 4 if grouped else None
+    errors = random_errors(1.2, 1.0, 0.9) + rng.uniform(-1.0, 1.0, (3, 1, 3))
+    y = rng.standard_normal((N, 3))
+    outer = np.arange(0, N, N // M)
+    of_folds = Predictions(y + errors[:, :N], y, counts, groups)
+    outside = Predictions(y[outer] + errors[:, N:], y[outer], counts[outer], None)
+    fold = np.arange(N) % 5
+    weighed = HeldOut.of(of_folds, outside, np.append(fold, fold[outer]))
+    many = np.repeat(np.arange(N), counts.astype(int))
+    further = np.repeat(np.arange(M), counts[outer].astype(int))
+    folds = np.append(fold[many], fold[outer][further])
+    twice = HeldOut.of(repeated(of_folds, many), repeated(outside, further), folds)
+    renamed = of_folds._replace(counts=7.0 * counts)
+    if grouped:
+        renamed = renamed._replace(groups=np.array([f"motion {k}" for k in groups]))
+    scaled = HeldOut.of(renamed, outside._replace(counts=7.0 * counts[outer]), weighed.fold)
+    shares, results = chosen_blend(NAMES, weighed)
+    assert 0.0 < shares[1] < 1.0
+    for other in (twice, scaled):
+        other_shares, other_results = chosen_blend(NAMES, other)
+        assert_allclose(other_shares, shares)
+        assert other_results["chosen"] == results["chosen"]
+        for name in ("mean_distance", "std_distance", "io_distance", "expected_distance"):
+            assert_allclose(other_results[name], results[name], rtol=1e-12)
+
+
+def test_the_gain_of_a_blend_is_weighted():
+    """In every motion a row that counts often gains, and one that counts once loses more."""
+    often = np.arange(N) % 2 == 0
+    outer = np.arange(0, N, N // M)
+    noise = random_errors(1.0)[0]
+    noise /= np.linalg.norm(noise, axis=1, keepdims=True)
+    factor = np.where(np.append(often, often[outer]), 0.5, 2.0)[:, None]
+    errors = np.stack([noise, factor * noise])
+    counts = np.where(often, 9.0, 1.0)
+    found = held_out(errors, counts, np.arange(N) // 4)
+    _, results = chosen_blend(["mechanical", "learned"], found)
+    assert results["weights"]["learned"] > 0.5
+    assert_allclose(results["mean_distance"][:2], [1.0, (9.0 * 0.5 + 2.0) / 10.0])
+    found = held_out(errors, None, np.arange(N) // 4)
+    assert chosen_blend(["mechanical", "learned"], found)[1]["chosen"] == "mechanical"
+
+
 class Recorded(NoCorrection):
     """No correction; records to how many rows it was fitted."""
 
@@ -123,6 +192,30 @@ def test_the_radius_chooses_the_error_model_without_the_held_out_rows():
     assert model.lengths == [24] * 5
     assert messages == []
     assert 0.0 < found.inside < inf
+
+
+def test_the_rows_of_the_radius_move_by_hysteresis_without_the_held_out_ones():
+    rows = Rows(*log(30))
+    model = Recorded()
+    without = []
+
+    def moved(held_out):
+        without.append(held_out)
+        return rows
+
+    _radius.conformal_radius(Spec(CHAIN, model, coverage=0.5), rows, moved)
+    expected = [test for _, test in KFold(5, shuffle=True, random_state=0).split(rows.X)]
+    for found, test in zip(without, expected, strict=True):
+        assert_array_equal(found, test)
+
+
+@pytest.mark.parametrize(
+    ("n_rows", "motions", "small"),
+    [(60, None, True), (2, None, False), (120, None, False), (120, 12, True), (90, 45, False)],
+)
+def test_a_log_is_small_by_its_motions(n_rows, motions, small):
+    groups = None if motions is None else np.arange(n_rows) % motions
+    assert _is_small(Rows(*log(n_rows), groups=groups)) == small
 
 
 # Who gets what
