@@ -89,7 +89,12 @@ def choose_hysteresis(spec: Spec, rows: Rows) -> HysteresisOperator | None:
     model = spec.mechanical
     if model is None:
         network = ELMRegressorCV(200, weight_scales=(0.4,), **_PLAIN)
-        network.fit(rows.X[usable], np.nan_to_num(positions[usable]))
+        network.fit(
+            rows.X[usable],
+            np.nan_to_num(positions[usable]),
+            rows.counts[usable],
+            groups[usable],
+        )
         model = as_forward_model(network)
     return find_hysteresis(
         HysteresisLog(

@@ -92,22 +92,28 @@ class Rows:
         return replace(self, y=tips, residual=residual).take(measured)
 
     def distinct(self) -> Self:
-        """Return the different rows with the number of times each counts."""
-        return self._merged(runs=False)
+        """Return the different rows with the number of times each counts, without an order."""
+        return replace(self, runs=None, time=None)._merged(self.y)
 
     def in_runs(self) -> Self:
-        """Return the rows in order of time, without those that repeat the row before."""
-        return self._merged(runs=True)
+        """Return the rows in order of time, without those that repeat the row before.
+
+        What the actuators do does not change: rows at other times, and of other runs, stay apart.
+        """
+        columns = [self.y, _numbered(self.run_of_rows)]
+        if self.time is not None:
+            columns.append(self.time)
+        return self._merged(np.column_stack(columns), follow=True)
 
     def effective(self, operator: HysteresisOperator) -> Self:
         """Return the rows with what the actuators do in place of the commands."""
         moved = operator.apply_by_group(self.X, self.run_of_rows, self.time)
         return replace(self, X=moved, runs=None, time=None)
 
-    def _merged(self, runs: bool) -> Self:
-        columns = [self.y] if self.runs is None else [self.y, _numbered(self.runs)]
+    def _merged(self, columns: NDArray, follow: bool = False) -> Self:
+        """Return the rows without those that equal another one, or `follow` it, in all columns."""
         first, counts, place = distinct_rows(
-            self.X, np.column_stack(columns), self.weights, self.groups, runs
+            self.X, columns, self.weights, self.groups, follow
         )
         return replace(self.take(first), weights=counts, place=place)
 
