@@ -1,6 +1,7 @@
 """A model that follows its robot to another day: moved base, shifted zeros, nothing else."""
 
 import copy
+from itertools import product
 
 import numpy as np
 import pytest
@@ -13,10 +14,13 @@ from hybridkin import (
     ELMRegressor,
     HybridForwardModel,
     RigidChain,
+    as_forward_model,
     datasets,
     robots,
 )
 from hybridkin._core.rotations import rotation, rotation_vector
+from hybridkin.hybrid._adapt import _SCALES, _likeliest_scales, _whitened
+from hybridkin.hybrid._drift import MISFITS, SWITCH
 
 SHIFT = 0.006 * np.array([1.0, -0.5, 0.8, -1.2, 0.3, 0.9, -1.0, 0.6, -0.7])
 TURN, WAY = torch.tensor([0.1, -0.06, 0.08], dtype=torch.float64), np.array([0.03, -0.05, 0.02])
@@ -170,17 +174,71 @@ def test_the_rows_of_one_motion_count_as_fewer(trunk):
     assert one.module_ is one.fitted_module_
 
 
-def test_outputs_that_are_not_in_space_have_no_base():
+def two_outputs(q):
+    """Return two outputs, whose slopes at different rows span all actuators."""
+    return torch.stack([q.sum(-1), q[..., 0] ** 2 + q[..., 1] * q[..., 2]], dim=-1)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1000.0])
+def test_outputs_that_are_not_in_space_have_no_base(unit):
+    """The shift is found as exactly as the noise allows: within four standard errors."""
     rng = np.random.default_rng(0)
+    sigma = 2e-3
     q = rng.uniform(-1, 1, (60, 3))
-    y = np.column_stack([q.sum(1), q[:, 0] ** 2])
-    model = HybridForwardModel(None, ELMRegressor(60, 1e-6, random_state=0)).fit(q, y)
+    y = two_outputs(torch.from_numpy(q)).numpy()
+    robot = as_forward_model(lambda q: two_outputs(q / unit))
+    model = HybridForwardModel(robot, "drop")
+    model.fit(unit * q, y + sigma * rng.standard_normal(y.shape))
     with pytest.raises(ValueError, match="'base' needs"):
-        model.adapt(q, y)
-    shifted = q[:40] - [0.1, -0.2, 0.05]
-    model.adapt(shifted, y[:40], parameters=["actuator_zeros"])
-    assert_allclose(model.change_.shift, [0.1, -0.2, 0.05], rtol=0, atol=0.02)
-    assert_allclose(model.predict(shifted), y[:40], rtol=0, atol=0.05)
+        model.adapt(unit * q, y)
+    shift = np.array([0.1, -0.2, 0.05])
+    new = y[:40] + sigma * rng.standard_normal((40, 2))
+    model.adapt(unit * (q[:40] - shift), new, parameters=["actuator_zeros"])
+    A = np.stack([np.ones((40, 3)), q[:40, [0, 2, 1]] * [2.0, 1.0, 1.0]], axis=1).reshape(-1, 3)
+    standard_errors = sigma * np.sqrt(np.diag(np.linalg.inv(A.T @ A)))
+    assert standard_errors.max() < 0.02 * np.abs(shift).min()
+    assert (np.abs(model.change_.shift / unit - shift) < 4.0 * standard_errors).all()
+
+
+@pytest.mark.parametrize("renamed", [False, True])
+def test_groups_of_new_rows_are_correlated_errors(renamed):
+    """Of rows with half of their variance in common, what is whitened has unit covariance."""
+    groups = np.array([0, 1, 0, 2, 1, 0, 0])
+    covariance = 0.5 * np.eye(7) + 0.5 * (groups[:, None] == groups)
+    names = np.array(["c", "a", "b"])[groups] if renamed else groups
+    whitening = _whitened(np.eye(7), names)
+    assert_allclose(whitening @ covariance @ whitening.T, np.eye(7), rtol=0, atol=1e-14)
+    assert _whitened(covariance, None) is covariance
+
+
+@pytest.mark.parametrize("parameters", [["base"], ["actuator_zeros"], ["base", "actuator_zeros"]])
+@pytest.mark.parametrize("size", [0.0, 20.0])
+def test_the_evidence_of_a_change_is_that_of_normal_errors(size, parameters):
+    """Each part of a change has a cost; so has every doubling of the variance not explained."""
+    rng = np.random.default_rng(1)
+    A = 5.0 * rng.standard_normal((12, 8))
+    theta = size * np.repeat([0.03, 0.01, 0.02], [3, 3, 2]) * rng.standard_normal(8)
+    target = A @ theta + rng.standard_normal(12)
+    bases = [(0.0, 0.0)]
+    if "base" in parameters:
+        bases += product(_SCALES, _SCALES)
+    zeros = [0.0]
+    if "actuator_zeros" in parameters:
+        zeros += [*_SCALES]
+    best = -np.inf
+    for (turn, way), zero, variance in product(bases, zeros, MISFITS):
+        tried = np.repeat([turn, way, zero], [3, 3, 2])
+        covariance = variance * np.eye(12) + (A * tried**2) @ A.T
+        evidence = -0.5 * (target @ np.linalg.solve(covariance, target))
+        evidence -= 0.5 * np.linalg.slogdet(covariance)[1] + np.log2(variance)
+        evidence -= SWITCH * ((way > 0.0) + (zero > 0.0))
+        if evidence > best:
+            best = evidence
+            expected = tried, variance
+    std, misfit = _likeliest_scales(A, target, parameters)
+    assert_allclose(std, expected[0])
+    assert misfit == expected[1]
+    assert (std > 0.0).any() == (size > 0.0)
 
 
 @pytest.mark.filterwarnings("ignore:`")  # a row of 9e74 is no usual one
