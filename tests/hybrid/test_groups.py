@@ -7,6 +7,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from sklearn.linear_model import Ridge
 
 from hybridkin import ConstantCurvatureChain, ELMRegressorCV, HybridForwardModel, calibrate
+from hybridkin.calibration.measured import inner_and_outer
+from hybridkin.hybrid import _selection
 from hybridkin.hybrid._error_models import (
     LinearModel,
     NoCorrection,
@@ -17,6 +19,7 @@ from hybridkin.hybrid._fit import fit_hybrid
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._selection import Auto
 from hybridkin.hybrid._spec import FitStart, Spec
+from hybridkin.hybrid.held_out import chosen_blend
 
 CHAIN = ConstantCurvatureChain([0.05])
 NETWORK = ELMRegressorCV(40, weight_scales=(0.4,), relevance_rounds=0, max_hidden=0, random_state=0)
@@ -88,6 +91,28 @@ def test_the_candidates_of_auto_hold_out_motions(part):
         corrections.append(correction(tips, q))
     assert corrections[0] > 5e-3
     assert corrections[1] < 0.4 * corrections[0]
+
+
+def test_the_gain_of_a_blend_is_that_of_whole_motions(monkeypatch):
+    """Its score has every row in the fold of its motion, outer rows again, and the motion."""
+    given = []
+
+    def recorded(names, held_out, geometry):
+        given.append(held_out)
+        return chosen_blend(names, held_out, geometry)
+
+    monkeypatch.setattr(_selection, "chosen_blend", recorded)
+    q, x, motions, _ = learnable()
+    fit_hybrid(Spec(CHAIN, FewAtTip(0), guard=None), Rows(q, x, groups=motions))
+    (held_out,) = given
+    assert_array_equal(held_out.groups, motions)
+    outer = inner_and_outer(q)[1]
+    assert_array_equal(held_out.y, np.concatenate([x, x[outer]]))
+    fold_of_motion = [np.unique(held_out.fold[: len(q)][motions == k]) for k in range(8)]
+    assert sorted(np.concatenate(fold_of_motion)) == list(range(8))
+    assert_array_equal(
+        held_out.fold, np.concatenate(fold_of_motion)[np.append(motions, motions[outer])]
+    )
 
 
 @pytest.mark.slow
