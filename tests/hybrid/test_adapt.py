@@ -29,9 +29,9 @@ TURN, WAY = torch.tensor([0.1, -0.06, 0.08], dtype=torch.float64), np.array([0.0
 R = rotation(TURN)[0].numpy()
 
 
-def moved(x):
+def moved(x, R=R, way=WAY):
     """Return tips (N, 3), or poses (N, 6), after the base has moved."""
-    tips = x[:, :3] @ R.T + WAY
+    tips = x[:, :3] @ R.T + way
     turns = rotation(torch.from_numpy(x[:, 3:]))[0] if x.shape[1] == 6 else None
     if turns is None:
         return tips
@@ -142,6 +142,22 @@ def test_an_adapted_model_is_the_fit_moved_and_shifted(case):
     assert_close(single.double(), x, rtol=0, atol=1e-4)
     if model.output == "pose":
         assert_allclose(model.module_.pose(at), motion @ fitted.module_.pose(then).numpy())
+
+
+def test_measurements_after_a_change_are_learned_as_those_before_it(case):
+    """What is then learned moves and shifts with the robot."""
+    fitted, q, x, _ = case
+    model = copy.deepcopy(fitted).adapt(q, x)
+    shift, motion = model.change_
+    load = np.zeros(x.shape[1])
+    load[:3] = 0.02, -0.01, 0.03
+    before = fitted.predict(q + shift) + load
+    follows = copy.deepcopy(fitted).partial_fit(q[:50] + shift, before[:50], alpha=1.0)
+    turn = motion[:3, :3], motion[:3, 3]
+    model.partial_fit(q[:50], moved(before[:50], *turn), alpha=1.0)
+    expected = moved(follows.predict(q + shift), *turn)
+    assert_allclose(model.predict(q), expected, rtol=0, atol=1e-9)
+    assert np.abs(follows.predict(q + shift) - fitted.predict(q + shift)).max() > 0.01
 
 
 def test_only_what_may_have_changed_is_adapted(trunk):

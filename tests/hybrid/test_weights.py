@@ -284,3 +284,17 @@ def test_regressors_of_others_get_the_rows_as_they_were_given(log):
         error = x - chain(torch.from_numpy(q)).numpy()
     expected = pipeline.fit(q[twice], error[twice]).predict(new)
     assert_allclose(model.predict_error(new), expected, rtol=0, atol=1e-10)
+
+
+def test_equal_commands_with_other_tips_are_other_rows(log):
+    """Their mean counts as often as there are rows; a nanometre or a float32 is a difference."""
+    q, x, _, _, new = log
+    twice = np.append(np.arange(len(q)), [3, 3, 7])
+    apart = x[twice] + np.append(np.zeros(len(q)), [1e-9, 0.02, -0.02])[:, None]
+    chain = ConstantCurvatureChain([0.06])
+    with torch.no_grad():
+        error = apart - chain(torch.from_numpy(q[twice])).numpy()
+    model = HybridForwardModel(chain, Ridge(0.1), guard=None).fit(q[twice], apart)
+    expected = Ridge(0.1).fit(q[twice], error).predict(new)
+    assert_allclose(model.predict_error(new), expected, rtol=0, atol=1e-12)
+    assert len(Rows(q[twice], apart).distinct()) == len(twice)
