@@ -228,7 +228,7 @@ def test_groups_of_new_rows_are_correlated_errors(renamed):
 
 
 @pytest.mark.parametrize("parameters", [["base"], ["actuator_zeros"], ["base", "actuator_zeros"]])
-@pytest.mark.parametrize("size", [0.0, 20.0])
+@pytest.mark.parametrize("size", [0.0, 12.0, 20.0])
 def test_the_evidence_of_a_change_is_that_of_normal_errors(size, parameters):
     """Each part of a change has a cost; so has every doubling of the variance not explained."""
     rng = np.random.default_rng(1)

@@ -10,6 +10,7 @@ import torch
 from numpy.testing import assert_allclose
 from sklearn.linear_model import Ridge
 from sklearn.model_selection import GroupKFold, KFold
+from sklearn.neighbors import KNeighborsRegressor
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
@@ -146,6 +147,16 @@ def test_the_noise_and_the_guard_of_a_network_are_those_of_fits_without_each_row
     assert model.module_.corrections[0].guard.limit.item() == pytest.approx(max(leverage))
 
 
+def test_the_noise_of_a_regressor_that_overfits_is_a_part_of_what_it_learned(log):
+    """A fifth of the spread about the mean, over rows as often as they count."""
+    q, x, weights, _, error = counted(log)
+    model = HybridForwardModel(ConstantCurvatureChain([0.06]), KNeighborsRegressor(1))
+    noise = model.fit(q, x, weights)._fitted.error.noise
+    spread = np.repeat(error, weights.astype(int), axis=0).var(axis=0).mean() ** 0.5
+    assert noise == pytest.approx(0.2 * spread)
+    assert noise != pytest.approx(0.2 * error.var(axis=0).mean() ** 0.5, rel=1e-3)
+
+
 def test_the_radius_is_that_of_weighted_fits_and_weighted_errors(log):
     """Every motion has the mass 1 / 7, shared by its rows by their weights."""
     q, x, weights, motions, error = counted(log)
@@ -266,10 +277,11 @@ def test_a_row_of_weight_zero_still_moves_the_actuators(log):
 def test_rows_of_a_later_fit_fade_once_for_each_repetition(log):
     q, x, weights, _, new = log
     fitted = hybrid("linear").fit(q, x)
-    many = np.repeat(np.arange(6), weights[:6])
     one, two = (hybrid("linear").fit(q, x) for _ in range(2))
-    one.partial_fit(q[:6], x[:6] + 0.02, weights[:6], decay=0.9)
-    two.partial_fit(q[many], x[many] + 0.02, decay=0.9)
+    for rows in (np.arange(6), np.arange(6, 12)):
+        many = np.repeat(rows, weights[rows])
+        one.partial_fit(q[rows], x[rows] + 0.02, weights[rows], decay=0.9)
+        two.partial_fit(q[many], x[many] + 0.02, decay=0.9)
     assert_allclose(one.predict(new), two.predict(new), rtol=0, atol=1e-12)
     assert np.abs(one.predict(new) - fitted.predict(new)).max() > 1e-3
 
