@@ -136,7 +136,13 @@ def test_an_adapted_model_is_the_fit_moved_and_shifted(case):
     assert_allclose(x, x_then.numpy() @ turn.T + motion[:3, 3], rtol=0, atol=1e-13)
     assert_allclose(J, turn @ J_then.numpy(), rtol=1e-12, atol=1e-12)
     assert_close(model.module_.domain_distance(at), fitted.module_.domain_distance(then))
-    assert_allclose(model.error_weight(q), fitted.module_.error_weight(then))
+    far = q + 4.0 * (q - q.mean(axis=0))
+    weights = fitted.module_.error_weight(torch.from_numpy(far + shift)).numpy()
+    assert_allclose(model.error_weight(far), weights, rtol=0, atol=1e-12)
+    if fitted.mechanical_model is not None:
+        assert weights.min() < 0.9
+    for end, before in zip(model.training_range_, fitted.training_range_, strict=True):
+        assert_allclose(end, before - shift, rtol=0, atol=1e-15)
     single = copy.deepcopy(model.module_).float()(at.float())
     assert single.dtype == torch.float32
     assert_close(single.double(), x, rtol=0, atol=1e-4)

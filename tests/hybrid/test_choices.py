@@ -322,3 +322,32 @@ def test_noise_of_the_actuators_alone_is_found_and_allowed_for(seed):
     ignored = fit_readout(chain, features, rows, alphas=found.alphas)
     assert found.noise_ratio < inf == ignored.noise_ratio
     assert (found.readout(q) - moved).norm() < (ignored.readout(q) - moved).norm()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("noisy", "coupling"), [("actuators", "serial"), ("tips", "serial"), ("tips", "parallel")]
+)
+def test_weights_of_a_readout_are_repetitions(noisy, coupling):
+    """Every score of the search, in metres or in units of the actuators' noise."""
+    rng = np.random.default_rng(2)
+    q = torch.from_numpy(rng.uniform(0.15, 0.25, (60, 3)))
+    noise = 1e-3 * torch.from_numpy(rng.standard_normal((60, 3)))
+    chain = ConstantCurvatureChain([0.03])
+    off = 0.1 * (q - 0.22) + (noise if noisy == "actuators" else 0.0)
+    x = (chain(q + off) + (noise if noisy == "tips" else 0.0)).numpy()
+    counts = rng.integers(1, 4, 60)
+    places = np.arange(60)
+    many = np.repeat(places, counts)
+    features = Features.of_range(q)
+    weighed = Rows(q.numpy(), x, counts.astype(float), places)
+    repeated = Rows(q.numpy()[many], x[many], None, places[many])
+    one, two = (fit_readout(chain, features, rows, coupling) for rows in (weighed, repeated))
+    assert (one.noise_ratio < inf) == (noisy == "actuators")
+    assert two.noise_ratio == pytest.approx(one.noise_ratio)
+    assert two.alphas == one.alphas
+    for penalties, score in one.scores.items():
+        assert two.scores[penalties] == pytest.approx(score, rel=1e-6)
+    assert_allclose(two.residual, one.residual[many], rtol=0, atol=1e-8)
+    assert two.rmse == pytest.approx(one.rmse)
+    assert_allclose(two.readout(q).numpy(), one.readout(q).numpy(), rtol=0, atol=1e-8)

@@ -104,6 +104,10 @@ def test_every_kind_comes_back_with_its_settings(tmp_path, kind, fitted):
         assert_equal(settings(twin), settings(model))
         assert_equal(twin.cv_results_, model.cv_results_)
         assert_array_equal(twin._drift.moment, model._drift.moment)
+        for name in ("noise", "rejected", "held_out"):  # what adapt and notebooks read
+            assert_equal(getattr(twin._fitted.error, name), getattr(model._fitted.error, name))
+        for name in ("radius_", "training_range_"):
+            assert_equal(getattr(twin, name), getattr(model, name))
 
 
 def settings(model):
@@ -147,6 +151,12 @@ def test_the_header_describes_the_model(tmp_path, fitted):
     save_model(fitted["blend"][0], path)
     chosen = model_header(path)["training"]["cv_results"]["chosen"]
     assert chosen == fitted["blend"][0].cv_results_["chosen"]
+    adapted = fitted["adapted"][0]
+    save_model(adapted, path)
+    assert np.abs(adapted.change_.shift).min() > 1e-6
+    low, high = adapted._fitted.training_range
+    assert_allclose(model_header(path)["domain"]["q_low"], low - adapted.change_.shift)
+    assert_allclose(model_header(path)["domain"]["q_high"], high - adapted.change_.shift)
     save_model(arm(), path)
     assert model_header(path)["units"] == {"q": ["rad", "m", "rad"], "x": "m"}
     chambers, tendons = [0.02, 0.01], {"lengths": [None, 0.1], "n_actuators": [1, 3]}
