@@ -579,10 +579,10 @@ class RigidChain(Chain):
 
     def unit_messages(self, q: Tensor, name: str, factor: float = 1.0) -> list[str]:
         """Return warnings if joints turn by more than two turns, or slide too far."""
-        turns = torch.tensor([unit == "rad" for unit in self.units], device=q.device)
-        sizes = q.abs()
-        turned = degrees_message(name, sizes[:, turns], factor)
-        slid = millimetres_message(name, sizes[:, ~turns], factor * _FAR)
+        # The motion of every joint by each actuator alone: an actuator may have a gear.
+        joints = (q[:, None] * self.couplings.to(q)).abs()
+        turned = degrees_message(name, joints[:, ~self.slides], factor)
+        slid = millimetres_message(name, joints[:, self.slides], factor * _FAR)
         return [message for message in (turned, slid) if message is not None]
 
     def extra_repr(self) -> str:

@@ -18,6 +18,13 @@ ELASTIC = ElasticTendonChain([0.005], [0.2])
 ORIGINS = np.tile(np.eye(4), (2, 1, 1))
 ORIGINS[1, 2, 3] = 0.3
 ARM = RigidChain(ORIGINS, [[0.0, 0.0, 1.0]] * 2, kinds=["revolute", "prismatic"])
+# Motors [rad] of a joint with a gear of 50 turns to one, and of a thread of 2 mm per radian.
+GEARED = RigidChain(
+    ORIGINS,
+    [[0.0, 0.0, 1.0]] * 2,
+    kinds=["revolute", "prismatic"],
+    couplings=[[-0.02, 0.0], [0.0, 0.002]],
+)
 
 
 def messages_of(model, **settings):
@@ -35,12 +42,15 @@ IN_OTHER_UNITS = [
     (TENDONS, {"q_min": -20.0, "q_max": 20.0, "dq_max": 30.0}, ["q_min", "q_max", "dq_max"]),
     (PoseTask(TENDONS), {"q_min": -20.0}, ["q_min"]),
     (ARM, {"q_max": [180.0, 0.2]}, ["q_max"]),
+    (GEARED, {"q_max": [180.0 * 50.0, 0.2 * 500.0]}, ["q_max"]),
+    (GEARED, {"q_max": [1.0 * 50.0, 200.0 * 500.0], "dq_max": 1e9}, ["q_max", "dq_max", "dq_max"]),
 ]
 IN_METRES = [
     (TRUNK, {"q_min": 0.1, "q_max": np.inf, "dq_max": np.inf}),
     (TRUNK, {"q_min": 0.0, "q_max": 9.0, "dq_max": 10.0}),  # hardly a limit
     (ELASTIC, {"q_min": -0.5, "q_max": 0.5}),
     (ARM, {"q_min": [-6.3, 0.0], "q_max": [6.3, 0.2], "dq_max": [30.0, 1.0]}),
+    (GEARED, {"q_min": [-300.0, 0.0], "q_max": [300.0, 100.0], "dq_max": [1500.0, 500.0]}),
     (lambda q: q, {"q_min": -400.0, "q_max": 400.0}),  # whose unit is not known
     (TRUNK, {"q_min": 0.1, "q_max": 0.4, "weights": 1e6, "q_pref": lambda q: q}),
 ]
