@@ -8,6 +8,7 @@ import sys
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from simulated_log import run
 
 from hybridkin import ConstantCurvatureChain, load_model, robots
@@ -163,13 +164,30 @@ def test_demo_goes_from_a_log_to_a_film(tmp_path, capsys, monkeypatch):
     words = re.sub(r"\s+", " ", printed)
     for command in ("init", "fit", "track", "animate"):
         assert f"$ hybridkin {command} '{out.as_posix()}'/" in words
-    held_out = json.loads((out / "model" / "report.json").read_text())["held_out"]
-    shown = re.findall(
-        r"^\| (mechanical|data-driven|hybrid), (\w+) +\| +([\d.]+)", printed, re.MULTILINE
-    )
-    assert len(shown) >= 3
-    for part, learner, mean in shown:
-        assert float(mean) == pytest.approx(1e3 * held_out[f"{part}, {learner}"]["mean"], abs=0.006)
-    assert load_model(out / "model" / "model.safetensors").predict(np.full((1, 9), 0.25)).shape
-    assert (out / "track.gif").stat().st_size > 5_000
+    report = json.loads((out / "model" / "report.json").read_text())
+    means = {name: entry["mean"] for name, entry in report["held_out"].items()}
+    shown = re.findall(r"^\| ([a-z-]+, \w+) +\| +([\d.]+)", printed, re.MULTILINE)
+    assert {name for name, _ in shown} == {*_demo._SHOWN, report["saved"]}
+    for name, mean in shown:
+        assert float(mean) == pytest.approx(1e3 * means[name], abs=0.006)
+    # The errors on held-out rows, against those of the saved model on the rows of its fit.
+    table = np.loadtxt(out / "log.csv", delimiter=",", skiprows=1)  # [mm]
+    q, x = 1e-3 * table[:, 1:10], 1e-3 * table[:, 10:]
+    model = load_model(out / "model" / "model.safetensors")
+    training = np.linalg.norm(model.predict(q) - x, axis=1).mean()
+    saved, calibrated, nominal = (means[name] for name in (report["saved"], *_demo._SHOWN[1::-1]))
+    assert 0.001 < training < saved < calibrated < nominal < 0.1
+    assert f"with {calibrated / saved:.1f} times less mean error" in words
+    assert f"held-out error, {1e3 * saved:.1f} mm on average" in words
+    # The commands [mm] lead the tip of the model along a figure eight of 200 by 100 mm.
+    track = np.genfromtxt(out / "track" / "track.csv", delimiter=",", names=True, dtype=None)
+    on_path = track["status"] == "CONVERGED"
+    assert f"the tip reaches {on_path.sum()} of {on_path.sum()} points" in words
+    sent = 1e-3 * np.column_stack([track[f"c{k}"] for k in range(1, 10)])
+    target = 1e-3 * np.column_stack([track[f"target_{axis}"] for axis in "xyz"])
+    missed = np.linalg.norm(model.predict(sent) - target, axis=1)
+    assert missed[on_path].max() < 1e-4
+    assert np.ptp(target[on_path], axis=0).max() == pytest.approx(0.2, rel=0.05)
+    with Image.open(out / "track.gif") as film:
+        assert film.n_frames == 3
     assert robots.read_description(out / "robot.toml").log.groups == "group"
