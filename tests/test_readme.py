@@ -94,16 +94,92 @@ def test_what_pip_installs_is_there():
                 assert any(needed.startswith(name) for needed in project["dependencies"])
 
 
+CONTRIBUTING = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+PYTEST = "-m pytest -q -n auto --maxprocesses 4 --dist worksteal"
+RUNS = {  # the last command of a target
+    "paper": "python examples/paper --out results",
+    "test": f"python {PYTEST}",
+    "quick": f'python {PYTEST.replace("pytest", "pytest tests")} -m "not slow"',
+    "docs": "python -m sphinx -W --keep-going -n -b html docs docs/_build/html",
+    "examine": "python tests/examination --out results/examination",
+    "bench": "python -m pytest -q tests/benchmarks --benchmark-enable --benchmark-quiet",
+    "view-test": "python -m pytest -q tests/viewer -m browser",
+    "check": "pyright --pythonpath .venv/bin/python",
+}
+EXTRAS = {"docs": "docs", "bench": "bench"}  # more than the extra "dev"
+TARGETS = {*re.findall(r"make\s([a-z-]+)", README), *re.findall(r"make ([a-z-]+) +#", CONTRIBUTING)}
+
+
+def planned(folder, target):
+    """Return the command lines that make would run for a target in a folder."""
+    of_make = ("MAKEFLAGS", "MFLAGS", "MAKELEVEL", "PYTHON", "OUT", "TESTS")
+    environment = {name: value for name, value in os.environ.items() if name not in of_make}
+    done = subprocess.run(
+        ["make", "-n", target], cwd=folder, env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    return [shlex.split(line) for line in done.stdout.replace("\\\n", " ").splitlines()]
+
+
+@pytest.fixture
+def fresh(tmp_path):
+    """A folder with what make looks at in a clone, and nothing that it has made."""
+    for name in ("Makefile", "pyproject.toml", "hatch_build.py"):
+        shutil.copy(ROOT / name, tmp_path / name)
+    for name in ("hybridkin/_core/kernel_numbers.py", "hybridkin/native/src/hybridkin.h"):
+        (tmp_path / name).parent.mkdir(parents=True)
+        (tmp_path / name).touch()
+    return tmp_path
+
+
 @pytest.mark.skipif(shutil.which("make") is None, reason="needs make")
-def test_make_knows_its_targets():
-    """`make test` runs this very file, `make paper` what tests/workflow runs."""
-    named = re.findall(r"`make\s(\w+)`", README)
-    printed = [command[1] for command in COMMANDS if command[0] == "make"]
-    assert {"paper", "test", "docs"} <= {*named, *printed}
-    for target in {*named, *printed}:
-        done = subprocess.run(["make", "-n", target], cwd=ROOT, capture_output=True, text=True)
-        assert done.returncode == 0, done.stderr
-        assert "python" in done.stdout or ".venv" in done.stdout
+@pytest.mark.parametrize("target", sorted(TARGETS | {*RUNS}))
+def test_make_runs_what_a_target_says(fresh, target):
+    """In a clone it first makes the environment; once that is there, it runs the command alone."""
+    before = [".venv/bin/python", "-m", "pip", "install", "--quiet"]
+    clean = planned(fresh, target)
+    last = clean[-1]
+    if target == "native":
+        last = clean[-2]
+        assert last == [".venv/bin/python", "hatch_build.py"]
+    if target in RUNS:
+        assert last == shlex.split(f".venv/bin/{RUNS[target]}")
+    script = Path(last[1]) if last[0].endswith("python") and last[1] != "-m" else Path(last[0])
+    if script.parts[0] != ".venv":
+        assert (ROOT / script).exists()
+    if last[0].startswith(".venv"):  # others make an environment of their own
+        assert clean[0] == ["python3", "-m", "venv", ".venv"]
+        assert [*before, "--editable", ".[dev]"] in clean[: clean.index(last)]
+    if target in EXTRAS:
+        assert [*before, "--editable", f".[{EXTRAS[target]}]"] in clean[: clean.index(last)]
+    for name in ("installed", "native", "docs", "bench", "examine", "browser", "wheels"):
+        (fresh / ".venv").mkdir(exist_ok=True)
+        (fresh / ".venv" / f".{name}").touch()
+    installed = planned(fresh, target)
+    assert not [line for line in installed if "pip" in line or "venv" in line]
+    if target == "native":
+        assert "Nothing to be done" in " ".join(installed[0])
+    else:
+        assert installed[-1] == clean[-1]
+        assert len(installed) <= 3
+    # Changed sources are compiled before they are used.
+    later = 2 + max(path.stat().st_mtime for path in (fresh / ".venv").iterdir())
+    os.utime(fresh / "hybridkin/native/src/hybridkin.h", (later, later))
+    changed = planned(fresh, target)
+    compiles = [".venv/bin/python", "hatch_build.py"]
+    assert (compiles in changed) == (compiles in clean)
+    if target in {*RUNS} - {"docs", "check"}:
+        assert compiles in clean
+
+
+def test_every_target_that_the_readme_names_is_tried():
+    assert {"paper", "test", "docs"} <= TARGETS & {*RUNS}
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    assert {*re.findall(r"^([a-z-]+):", makefile, re.MULTILINE)} >= TARGETS
+    assert "not slow" in RUNS["quick"]
+    markers = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    markers = markers["tool"]["pytest"]["ini_options"]["markers"]
+    assert {"slow", "browser"} <= {marker.partition(":")[0] for marker in markers}
 
 
 QUICK = ["--folds", "2", "--jobs", "1", "--max-rows", "200"]  # of `fit`: less work
