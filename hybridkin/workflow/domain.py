@@ -103,16 +103,21 @@ def path_limits(
     if loaded.description is not None:
         described = loaded.description.limits
     trained = robots.Limits()
-    if within_fit or described.q_min is None or described.q_max is None:
+    if within_fit or not _has_ends(described):
         trained = loaded.trained_range or trained
-    limits = vars(described.narrowed(loaded.half_play).intersect(trained))
+    limits = dict(vars(described.narrowed(loaded.half_play).intersect(trained)))
     given = vars(robots.Limits(**overrides).narrowed(loaded.half_play))
-    limits = limits | {name: given[name] for name in overrides}
+    for name in overrides:
+        limit = given[name]
+        # Of one given end, scaled to actuators of both signs, some entries are open.
+        if name in ("q_min", "q_max") and limits[name] is not None:
+            limit = np.where(np.isfinite(limit), limit, limits[name])
+        limits[name] = limit
     values = {}
     for name, value in limits.items():
         if value is not None:
             values[name] = np.broadcast_to(value, n).astype(float)
-    if not {"q_min", "q_max"} <= {*values}:
+    if not _has_ends(robots.Limits(**values)):
         raise ValueError(
             "`q_min` and `q_max` must be given (--q-min, --q-max), or written as [limits] in the "
             "robot description, because this model has no training range."
@@ -133,6 +138,13 @@ def path_limits(
     elif "q_min" in overrides or "q_max" in overrides:
         source = f"given and {source}"
     return PathLimits(**values, source=source)
+
+
+def _has_ends(limits: robots.Limits) -> bool:
+    """Return whether every actuator has a finite range."""
+    if limits.q_min is None or limits.q_max is None:
+        return False
+    return bool(np.isfinite(limits.q_min).all() and np.isfinite(limits.q_max).all())
 
 
 @dataclass(frozen=True, eq=False)
@@ -279,17 +291,20 @@ class Domain:
 
     @cached_property
     def bending(self) -> NDArray:
-        """The projector (n, n) on the q that bend a plain tendon chain; for others the identity.
+        """The projector (n, n) of rows q on those that bend a plain tendon chain, else identity.
 
         The bendings of such a chain are linear in q and do not depend on the common pull of its
-        tendons.
+        tendons, which is one in metres.
         """
         chain = self.loaded.chain
         if not isinstance(chain, ConstantCurvatureChain) or any(chain.extensible):
             return np.eye(self.loaded.n_actuators)
         zero = torch.from_numpy(np.zeros(chain.n_actuators))
         slopes = torch.func.jacrev(lambda row: chain.arcs(row)[1].ravel())(zero)
-        return (torch.linalg.pinv(slopes, rtol=_PLANAR) @ slopes).numpy()
+        gains = as_array(chain.gains.detach())
+        slopes = as_array(slopes) / gains
+        of_metres = np.linalg.pinv(slopes, rcond=_PLANAR) @ slopes
+        return gains[:, None] * of_metres / gains
 
     def posture(self, pull: float) -> Posture:
         """Return the posture for ``InverseKinematics(q_pref=...)`` that keeps q in the domain.
