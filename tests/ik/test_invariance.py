@@ -186,20 +186,20 @@ def test_a_track_is_the_same_in_another_unit_of_q(name, limits, width, kind):
 
 
 @SLOW_IN_TORCH
-@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
-def test_which_solutions_differ_and_which_is_nearest_does_not_depend_on_the_unit(unit, kind):
-    """One of two joints in thousandths or thousands of a radian: ranges make them comparable."""
+@pytest.mark.parametrize("units", [(1e-3, 1.0), (1.0, 1.0), (1e3, 1e3)])
+def test_which_solutions_differ_and_which_is_nearest_does_not_depend_on_the_unit(units, kind):
+    """Joints in thousandths or thousands of a radian: ranges make them comparable."""
     origins = np.tile(np.eye(4), (2, 1, 1))
     origins[1, 0, 3] = 0.3
-    couplings = np.diag([unit, 1.0])
+    couplings = np.diag(units)
     arm = RigidChain(origins, [[0, 0, 1]] * 2, couplings=couplings, tool=[0.2, 0, 0])
-    ends = np.array([3.0 / unit, 3.0])
+    ends = 3.0 / np.array(units)
     ik = InverseKinematics(arm, q_min=-ends, q_max=ends)
-    q0 = np.array([0.35 / unit, -1.5])
+    q0 = np.array([0.35, -1.5]) / units
     found = ik.solve(kind([0.3, 0.2, 0.0]), kind(q0), tol=1e-9, n_solutions=3)
     names = [IKStatus(int(code)).name for code in found.status]
     assert names == ["CONVERGED", "CONVERGED", "NO_FURTHER"]
-    angles = np.asarray(found.q)[:2] * [unit, 1.0]
+    angles = np.asarray(found.q)[:2] * units
     first = 2.0 * math.atan2(0.2, 0.3)
     # In thousandths of a radian the other one has the smaller distance.
     assert_allclose(angles, [[first, -0.5 * math.pi], [0.0, 0.5 * math.pi]], rtol=0, atol=1e-6)
