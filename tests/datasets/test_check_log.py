@@ -234,6 +234,21 @@ def test_mistakes_against_the_chain(case):
     assert words in f"{finding.message} {finding.advice}"
 
 
+@pytest.mark.slow
+def test_only_pauses_within_a_motion_are_gaps():
+    """Whatever the clock and its unit; between motions the robot may rest."""
+    steps = np.full(240, 0.1)
+    steps[20::20] = 7.0
+    for unit, first in ((1.0, 0.0), (60.0, -50.0)):
+        log = measured(time=first + unit * np.cumsum(steps))
+        assert findings(log) == []
+        names = np.array([*"lkjihgfedcba"])[log.groups]  # whatever motions are called
+        assert findings(replace(log, groups=names)) == []
+        (finding,) = findings(replace(log, groups=log.groups // 2))
+        assert finding.kind == "time"
+        assert finding.rows.tolist() == [*range(20, 240, 40)]
+
+
 @pytest.mark.parametrize("base_is_free", [True, False])
 @pytest.mark.parametrize(
     "order",
