@@ -110,3 +110,41 @@ def test_csv_with_and_without_times(tmp_path):
     path = from_csv(file, dt=0.25)
     assert_array_equal(path.t, [0.0, 0.25, 0.5])
     assert_array_equal(path.x[1], [2.5, 3.5, 4.5])
+
+
+SHAPES = {
+    "eight": lambda m, **options: figure_eight(m * CENTER, (0.4 * m, 0.2 * m), **options),
+    "spiral": lambda m, **options: spiral(m * CENTER, (0.05 * m, 0.1 * m), rise=m, **options),
+    "line": lambda m, **options: line(m * CENTER, [0.0, 0.1 * m, 0.6 * m], **options),
+}
+
+
+@pytest.mark.parametrize("timing", ["min_jerk", "uniform"])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_a_shape_has_no_unit_of_length_and_of_time(shape, timing):
+    plain = SHAPES[shape](1.0, duration=2.0, dt=0.1, timing=timing)
+    assert len(plain) == 21
+    other = SHAPES[shape](4.0, duration=0.5, dt=0.025, timing=timing)
+    assert_allclose(other.x, 4.0 * plain.x, rtol=1e-14, atol=1e-14)
+    assert_allclose(other.t, plain.t / 4.0, rtol=1e-14)
+    assert (plain.duration, other.duration) == pytest.approx((2.0, 0.5))
+    # Half the period has the same points, and others between them.
+    finer = SHAPES[shape](1.0, duration=2.0, dt=0.05, timing=timing)
+    assert_allclose(finer.x[::2], plain.x, rtol=0, atol=1e-14)
+    assert_allclose(finer.t[::2], plain.t, rtol=1e-14)
+
+
+@pytest.mark.parametrize(("unit", "metre"), [("m", 1.0), ("cm", 1e-2), ("mm", 1e-3)])
+@pytest.mark.parametrize("first", [0.0, 5.0])
+def test_a_recorded_path_is_read_in_its_unit_at_its_times(tmp_path, unit, metre, first):
+    t = first + np.array([0.0, 0.1, 0.4, 0.5])  # unequal periods
+    x = np.array([[0.1, 0.2, 0.3], [0.2, 0.2, 0.3], [0.5, 0.2, 0.6], [0.5, 0.1, 0.6]])
+    table = np.column_stack([t, x / metre])
+    np.savetxt(tmp_path / "path.csv", table, delimiter=",")
+    path = from_csv(tmp_path / "path.csv", unit=unit)
+    assert_allclose(path.x, x, rtol=1e-14)
+    assert_allclose(path.t, t, rtol=1e-14)
+    even = from_csv(tmp_path / "path.csv", unit=unit, dt=0.1)
+    assert_allclose(even.t, first + 0.1 * np.arange(6), rtol=1e-14)
+    expected = [x[0], x[1], [0.3, 0.2, 0.4], [0.4, 0.2, 0.5], x[2], x[3]]
+    assert_allclose(even.x, expected, rtol=1e-12)
