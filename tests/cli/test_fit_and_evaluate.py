@@ -8,7 +8,7 @@ import pytest
 import torch
 from simulated_log import FIT, HEADER, ROBOT, document, rows, run, write
 
-from hybridkin import load_model, workflow
+from hybridkin import load_model, robots, workflow
 from hybridkin.cli.main import main
 
 
@@ -208,3 +208,31 @@ def test_play_reaches_the_fit_in_metres(log, robot, tmp_path, monkeypatch, optio
     assert main([str(argument) for argument in arguments]) == 2
     assert seen == [play]
     assert type(seen[0]) is type(play)
+
+
+def test_play_is_a_width_in_the_unit_of_q_of_every_actuator(log, robot, tmp_path, monkeypatch):
+    """Of motors whose signs differ: a width has no sign."""
+    seen = []
+
+    def fit_log(*_, settings, **__):
+        seen.append(settings.play)
+        raise ValueError("enough")
+
+    monkeypatch.setattr(workflow, "fit_log", fit_log, raising=False)
+    text = ROBOT.replace("q_sign = -1", "q_sign = [1, -1, 1, -1, 1, -1]")
+    text = text.replace('q_unit = "mm"', 'q_unit = "deg"').partition("[limits]")[0]
+    robot.write_text(text.replace("radius = 0.0055", "radius = 0.0055\nspool_radius = 0.006"))
+    arguments = ["fit", log, "--robot", robot, "--out", tmp_path / "m", "--play", "2"]
+    assert main([str(argument) for argument in arguments]) == 2
+    np.testing.assert_allclose(seen[0], np.full(6, np.radians(2.0)))
+
+
+@pytest.mark.parametrize(("limit", "code"), [("2.4", 1), ("2.6", 0)])
+def test_a_largest_error_is_in_millimetres(log, robot, tmp_path, capsys, limit, code):
+    """2.5 mm is the error of every row."""
+    table = rows()
+    with torch.no_grad():
+        tips = robots.from_toml(robot)(torch.from_numpy(-1e-3 * table[:, 1:7])).numpy()
+    table[:, 7:10] = 1e3 * tips + [1.5, 0.0, 2.0]
+    log = write(tmp_path / "moved.csv", table)
+    assert run(capsys, "evaluate", robot, log, "--fail-above", limit)[0] == code

@@ -8,7 +8,7 @@ import torch
 from simulated_log import COLUMNS, ROBOT, document, rows, run, write
 
 import hybridkin
-from hybridkin import PlayOperator, datasets, load_model, save_model
+from hybridkin import PlayOperator, datasets, load_model, robots, save_model, trajectories, workflow
 
 SHAPE = ["--shape", "figure-eight", "--unit", "mm", "--dt", "0.1"]
 CHAIN = hybridkin.ConstantCurvatureChain([0.005, 0.005], lengths=[0.1, 0.1])
@@ -55,6 +55,96 @@ def test_next_counts_what_is_measured_and_where_the_error_matters(robot, log, tm
     _, record = document(capsys, *plan, *path)
     assert record["where"].startswith("along the path")
     assert record["expected_errors"][-1] < 0.3 * fresh["expected_errors"][-1]
+
+
+class Enough(ValueError):
+    """A command has got so far."""
+
+
+@pytest.mark.parametrize(("unit", "metre"), [("mm", 1e-3), ("cm", 1e-2), ("m", 1.0), (None, 1e-3)])
+@pytest.mark.parametrize("source", ["shape", "file"])
+def test_options_of_a_track_arrive_in_metres(
+    robot, tmp_path, capsys, monkeypatch, unit, metre, source
+):
+    """Lengths by --unit (that of x in the log), the tolerance by mm, actuators by the log."""
+    seen = {}
+
+    def shape_path(loaded, limits, shape, size, **options):
+        seen.update(options, shape=shape, size=size)
+        return trajectories.line([0.0, 0.0, 0.1], [0.0, 0.0, 0.2], duration=1.0, dt=0.1)
+
+    def track_path(loaded, path, out, **options):
+        seen.update(options, path=path)
+        raise Enough("enough")
+
+    monkeypatch.setattr(workflow, "shape_path", shape_path, raising=False)
+    monkeypatch.setattr(workflow, "track_path", track_path, raising=False)
+    options = ["--tol", 0.2, "--scale", 0.5, "--from=1,-2,1,0.5,0,-0.5", "--q-min=-3"]
+    options += ["--q-max", "5,4,5,4,5,4", "--dq-max", 4, "--ddq-max", 50]
+    options += [] if unit is None else ["--unit", unit]
+    path = ["--shape", "spiral", "--size", "2,4", "--rise=5", "--center=1,-2,3", "--duration", 7]
+    if source == "file":
+        (tmp_path / "path.csv").write_text("x,y,z\n0,0,0.1\n0,0,0.3\n")
+        path = [tmp_path / "path.csv"]
+    assert (
+        run(capsys, "track", robot, *path, "--dt", 0.5, *options, "--out", tmp_path / "t")[0] == 2
+    )
+    if source == "shape":
+        np.testing.assert_allclose(seen["size"], [2.0 * metre, 4.0 * metre])
+        np.testing.assert_allclose(seen["center"], metre * np.array([1.0, -2.0, 3.0]))
+        assert seen["rise"] == pytest.approx(5.0 * metre)
+        assert (seen["duration"], seen["dt"]) == (7.0, 0.5)
+        np.testing.assert_allclose(seen["path"].x[[0, -1], 2], [0.125, 0.175])
+    else:
+        np.testing.assert_allclose(seen["path"].x[:, 2], metre * np.array([0.15, 0.25]))
+        np.testing.assert_allclose(seen["path"].t, [0.0, 0.5])
+    assert seen["tol"] == pytest.approx(2e-4)
+    np.testing.assert_allclose(seen["start"], 1e-3 * np.array([-1, 2, -1, -0.5, 0, 0.5]))
+    limits = seen["limits"]  # of the chain, which counts what the log counts backwards
+    np.testing.assert_allclose(limits.q_min, -1e-3 * np.array([5, 4, 5, 4, 5, 4]))
+    np.testing.assert_allclose(limits.q_max, np.full(6, 3e-3))
+    np.testing.assert_allclose(limits.dq_max, np.full(6, 4e-3))
+    np.testing.assert_allclose(limits.ddq_max, np.full(6, 5e-2))
+
+
+MIXED = (
+    ROBOT.replace("q_sign = -1", "q_sign = [1, -1, 1, -1, 1, -1]")
+    .replace('q_unit = "mm"', 'q_unit = "deg"')
+    .replace("radius = 0.0055", "radius = 0.0055\nspool_radius = 0.006")
+    .replace("q_min = -0.006", 'unit = "log"\nq_min = -60\ndq_max = [9, 8, 7, 6, 5, 4]')
+    .replace("q_max = 0.006", "q_max = 40")
+)
+
+
+def test_limits_in_the_unit_and_signs_of_the_log_come_back_as_they_were(robot, capsys):
+    robot.write_text(MIXED)
+    limits = robots.read_description(robot).limits
+    turn = np.radians(np.array([1, -1, 1, -1, 1, -1]))
+    np.testing.assert_allclose(limits.q_min, np.minimum(-60 * turn, 40 * turn))
+    np.testing.assert_allclose(limits.q_max, np.maximum(-60 * turn, 40 * turn))
+    np.testing.assert_allclose(limits.dq_max, np.radians([9, 8, 7, 6, 5, 4]))
+    text = " ".join(run(capsys, "describe", robot)[1].split())
+    assert "Limits: q_min = -60, -60, -60, -60, -60, -60 deg." in text
+    assert "Limits: q_max = 40, 40, 40, 40, 40, 40 deg." in text
+    assert "Limits: dq_max = 9, 8, 7, 6, 5, 4 deg/s." in text
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("x_unit", "metre"), [("mm", 1e-3), ("m", 1.0)])
+def test_next_writes_degrees_and_errors_in_the_units_of_the_log(
+    robot, tmp_path, capsys, x_unit, metre
+):
+    robot.write_text(MIXED.replace('x_unit = "mm"', f'x_unit = "{x_unit}"'))
+    code, record = document(capsys, "next", robot, "-n", 5, "--out", tmp_path / "plan")
+    assert code == 0
+    q, error = planned(tmp_path / "plan")
+    np.testing.assert_allclose(metre * error, record["expected_errors"], rtol=1e-6)
+    assert ((q >= -60.0) & (q <= 40.0)).all()
+    metres = 0.006 * np.radians(q) * [1, -1, 1, -1, 1, -1]
+    high = 0.006 * np.radians([40, 60, 40, 60, 40, 60])
+    common = metres.reshape(-1, 2, 3).sum(axis=2)
+    slack = (high - metres).reshape(-1, 2, 3).min(axis=2)
+    np.testing.assert_allclose(np.minimum(np.abs(common), slack), 0.0, atol=1e-9)
 
 
 @pytest.mark.slow
