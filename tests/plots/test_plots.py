@@ -315,3 +315,75 @@ def test_page_holds_every_frame_and_needs_no_network(film, track, tmp_path):
 
 
 # All of them
+
+
+def displays(x, track, film):
+    """Return functions that draw in a unit, whether in space, and which axes have the unit."""
+    errors = {"a": np.linalg.norm(x, axis=1), "b": 0.3 * np.abs(x[:, 0])}
+    tracks = plots.TrackingDisplay.from_tracks({"a": track})
+    chambers = plots.ActuatorDisplay.from_tracks({"a": track}, (3, 3, 3))
+    body = plots.BackboneDisplay.from_estimator(robots.bionic_handling_assistant(), BENT)
+    expected = {"robot": np.full(len(track.t), 0.01)}
+    return {
+        "histogram": (plots.ErrorHistogramDisplay(errors).plot, False, "x"),
+        "boxes": (plots.ErrorBoxDisplay(errors).plot, False, "x"),
+        "curve": (
+            plots.LearningCurveDisplay([9, 40], {"a": [[0.1, 0.2], [0.03, 0.04]]}).plot,
+            False,
+            "y",
+        ),
+        "workspace": (plots.WorkspaceDisplay(x, 1.1 * x).plot, True, "xyz"),
+        "body": (body.plot, True, "xyz"),
+        "film": (film.plot, True, "xyz"),
+        "path": (tracks.plot, False, "xy"),
+        "time": (tracks.plot_time, False, "y"),
+        "error": (lambda ax, unit: tracks.plot_error(ax, unit=unit, expected=expected), False, "y"),
+        "commands": (
+            lambda ax, unit: chambers.plot([ax, *ax.figure.axes[1:]], unit=unit),
+            False,
+            "y",
+        ),
+    }
+
+
+def drawn_range(ax, in_space):
+    """Return the range of what is drawn on each axis (2, 2) or (3, 2)."""
+    if in_space:
+        return np.vstack(
+            [ax.xy_dataLim.intervalx, ax.xy_dataLim.intervaly, ax.zz_dataLim.intervalx]
+        )
+    return np.vstack([ax.dataLim.intervalx, ax.dataLim.intervaly])
+
+
+@pytest.mark.slow
+def test_every_figure_has_its_axes_in_the_unit_they_name(x, track, film):
+    for name, (draw, in_space, axes) in displays(x, track, film).items():
+        ranges = {}
+        for unit in ("m", "cm", "mm"):
+            _, grid = plots.new_figure(4, 4, 3, 1, subplot_kw=SPACE if in_space else None)
+            draw(grid[0], unit=unit)
+            ranges[unit] = drawn_range(grid[0], in_space)
+            for axis in axes:
+                label = getattr(grid[0], f"get_{axis}label")()
+                assert label.endswith(f"[{unit}]"), name
+        for k, axis in enumerate("xyz"[: len(ranges["m"])]):
+            for unit, scale in (("cm", 100.0), ("mm", 1000.0)):
+                factor = scale if axis in axes else 1.0
+                np.testing.assert_allclose(
+                    ranges[unit][k], factor * ranges["m"][k], rtol=1e-9, err_msg=f"{name}, {axis}"
+                )
+
+
+def test_commands_are_drawn_in_the_unit_and_signs_of_a_log():
+    q = np.random.default_rng(0).uniform(-1.0, 1.0, (20, 6))
+    per_unit = np.radians([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
+    display = plots.ActuatorDisplay({"a": q}, (3, 3), limits=np.stack([q.min(0), q.max(0)]))
+    _, axes = plots.new_figure(4, 4, 2, 1)
+    display.plot(axes, unit="deg", per_unit=per_unit)
+    shown = [line.get_ydata() for ax in axes for line in ax.lines]
+    np.testing.assert_allclose(np.transpose(shown), q / per_unit)
+    for k, ax in enumerate(axes):
+        ends = np.unique([path.vertices[:, 1] for path in ax.collections[0].get_paths()])
+        columns = (q / per_unit)[:, 3 * k : 3 * k + 3]
+        np.testing.assert_allclose(ends, np.sort([*columns.min(0), *columns.max(0)]))
+        assert ax.get_ylabel() == f"segment {k + 1} [deg]"
