@@ -157,6 +157,50 @@ def test_on_tendons_that_only_pull_it_arrives_as_in_python(tmp_path, start):
 
 @needs_cc
 @pytest.mark.slow
+def test_code_for_motors_moves_the_robot_as_in_metres(tmp_path):
+    """Some motors turn the other way; limits, rates, weights and the posture are in radians."""
+    n = trunk().n_actuators
+    gains = np.array([0.02, -0.05, 0.03, 0.04, -0.02, -0.03])[:n]
+    radii = trunk().radii.tolist()
+    settings = {
+        "q_min": np.full(n, 0.15),
+        "q_max": np.full(n, 0.3),
+        "q_pref": np.linspace(0.2, 0.25, n),
+    }
+    rates = {"dq_max": np.linspace(0.05, 0.1, n), "ddq_max": np.full(n, 0.8)}
+    weights = np.linspace(1.0, 3.0, n)
+    plain = InverseKinematics(
+        ConstantCurvatureChain(radii), **settings, **rates, weights=weights, beta=5.0, dt=0.02
+    )
+    ends = np.sort([settings["q_min"] / gains, settings["q_max"] / gains], axis=0)
+    motors = InverseKinematics(
+        ConstantCurvatureChain(radii, gains=gains),
+        q_min=ends[0],
+        q_max=ends[1],
+        q_pref=settings["q_pref"] / gains,
+        dq_max=rates["dq_max"] / np.abs(gains),
+        ddq_max=rates["ddq_max"] / np.abs(gains),
+        weights=weights * gains**2,
+        beta=5.0,
+        dt=0.02,
+    )
+    start = np.linspace(0.22, 0.26, n)
+    target = plain.tracker(start).x + np.array([0.03, -0.01, 0.02])
+    export_c(motors, tmp_path, name="robot")
+    listed = [", ".join(map(repr, map(float, row))) for row in (start / gains, target)]
+    source = FOLLOWS.replace("[9]", f"[{n}]").replace("9;", f"{n};")
+    (tmp_path / "follows.c").write_text(source % tuple(listed))
+    program = built(tmp_path, sources=("robot.c", "follows.c"))
+    found = np.loadtxt(subprocess.check_output([program], text=True).splitlines())
+    tracker = plain.tracker(start)
+    expected = np.array([tracker.step(target) for _ in found])
+    # A box-limited step is good to 1e-9 of its size; they add up over the rows.
+    np.testing.assert_allclose(found[:, :n] * gains, expected, rtol=0, atol=1e-8)
+    assert np.abs(np.diff(expected, axis=0)).max() / 0.02 > 0.04  # the limits were met
+
+
+@needs_cc
+@pytest.mark.slow
 def test_the_readme_bounds_the_stack(tmp_path):
     model = limited(load_model(FOLDER / "blend.safetensors"))
     export_c(model, tmp_path, name="robot")
