@@ -48,3 +48,9 @@ def test_the_floor_is_the_noise_of_the_log(play):
     else:
         assert f"({DATA_ELM}) leaves 2 mm, and {AUTO}, with hysteresis, 1 mm; the" in words
     assert floors[-1] == pytest.approx(1e3 * NOISE * np.sqrt(8.0 / np.pi), rel=0.2)
+    # What differs from motion to motion counts, too: pairs are rows of two motions.
+    drift = 1e-3 * rng.standard_normal((12, 3))[groups]
+    rows = checked(datasets.Log(q, x + drift, groups), None, base_is_free=False)
+    words = explained_in_words(errors, rows, model)
+    drifted = [float(value) for value in re.findall(r"about (\S+) mm", words)]
+    assert drifted[-1] > 5.0 * floors[-1]
