@@ -220,8 +220,11 @@ def _with_plane(
     """
     if settings.plane is None:
         return J, v
-    stiff = IK_BALANCE * J.flatten(1).norm(dim=-1)[:, None, None]
-    rows = stiff * (settings.plane[1].to(J).mT * settings.unit(v))
+    # J is in the unit in which weights are 1, so that only their ratios count.
+    unit = settings.unit(v)
+    size = J.flatten(1).norm(dim=-1) / unit.square().mean().sqrt()
+    stiff = IK_BALANCE * size[:, None, None]
+    rows = stiff * (settings.plane[1].to(J).mT * unit)
     aside = torch.zeros_like(rows[..., 0])
     if posture is not None:
         aside = apply_rows(rows, posture)

@@ -75,3 +75,19 @@ def test_solutions_lie_in_the_plane(model, targets):
     assert model.in_domain(found.q).all()
     in_torch = ik.solve(torch.from_numpy(targets[:4]), q0=torch.from_numpy(balanced(1)[0]))
     assert off_plane(model, in_torch.q) < COUNT
+
+
+@pytest.mark.parametrize("weights", [None, [1.0, 2, 3, 4, 5, 6], [6.0, 5, 4, 3, 2, 1]])
+@pytest.mark.parametrize("kind", [np.asarray, torch.from_numpy], ids=["core", "torch"])
+def test_a_step_keeps_to_the_plane_whatever_the_weights(model, targets, weights, kind):
+    q = balanced(30, seed=2)
+    found = []
+    for factor in (1.0, 4.0**6, 4.0**-6):  # only ratios of weights count
+        scaled = None if weights is None else factor * np.array(weights)
+        step = solver(model, weights=scaled).step(kind(q), kind(targets))
+        found.append(np.asarray(step.dq))
+        assert np.asarray(step.saturated).any()
+        assert off_plane(model, q + found[-1]) < 5 * COUNT
+    # Steps in a box are good to 1e-8 of themselves.
+    for dq in found[1:]:
+        np.testing.assert_allclose(dq, found[0], rtol=0, atol=1e-7 * np.abs(found[0]).max())

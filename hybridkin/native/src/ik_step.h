@@ -158,7 +158,8 @@ static HK_NOINLINE void ik_limited_in_plane(const ik_settings *ik, const real *J
                                             const real *upper, real damping_sq, real *dq) {
     const int n = ik->n, m = ik->m;
     real *rows = ik_slot(ik, IK_IN_PLANE), motion[IK_MOST_ROWS], g[IK_MOST_PAIRS];
-    const real stiff = IK_BALANCE * ik_norm(m * n, J);
+    /* J is in the unit in which weights are 1, so that only their ratios count. */
+    const real stiff = IK_BALANCE * hk_sqrt((real)n) * ik_norm(m * n, J) / ik_norm(n, ik->unit);
     for (int i = 0; i < m * n; i++) rows[i] = J[i];
     for (int i = 0; i < m; i++) motion[i] = v[i];
     for (int k = 0; k < ik->n_normals; k++) {
