@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from hybridkin.ik.results import IKStatus, Track
+from hybridkin.ik.results import IKStatus, Track, score
 
 
 def a_track(q, error):
@@ -17,3 +17,17 @@ def test_figures_of_a_track_leave_out_what_is_not_known():
     assert repr(track) == text
     empty = a_track(np.empty((0, 2)), [])
     assert repr(empty) == "Track(0 targets; no error known; largest step 0)"
+
+
+def test_a_track_in_the_domain_is_better_than_a_longer_one_outside():
+    def of(*names):
+        track = a_track(np.zeros((4, 2)), np.zeros(4))
+        track.status[:] = [IKStatus[name] for name in names]
+        return score(track)
+
+    inside = of("CONVERGED", "CONVERGED", "MAX_ITER", "AT_LIMITS")
+    outside = of("CONVERGED", "OUT_OF_DOMAIN", "OUT_OF_DOMAIN", "OUT_OF_DOMAIN")
+    assert (inside, outside) == ((2, 2), (1, 4))
+    assert max(outside, inside) == inside
+    # Of equally many inside, the one that reaches more.
+    assert of("CONVERGED", "OUT_OF_DOMAIN", "MAX_ITER", "MAX_ITER") < outside

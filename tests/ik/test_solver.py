@@ -218,6 +218,29 @@ def test_feedback_on_the_plant_removes_what_the_model_does_not_know():
     assert seeing.largest_step == np.abs(np.diff(seeing.q, axis=0)).max()
 
 
+@pytest.mark.parametrize("kind", [np.asarray, torch.from_numpy], ids=["core", "torch"])
+def test_a_status_is_that_of_the_loop_and_an_error_that_of_the_robot(kind):
+    """A robot whose tip is 1 cm off: the model reaches the point, and the robot does not."""
+    path = kind(closed_path(50)[:8])
+
+    def plant(q):
+        return CHAIN(torch.as_tensor(q)).numpy() + np.array([0.0, 0.01, 0.0])
+
+    start = kind(np.asarray(bha().solve(closed_path(50)[0], tol=1e-9).q))
+    for more, converged in (
+        ({}, True),
+        ({"tol": 2e-3}, True),
+        ({"feedback": "measured", "tol": 1e-3}, False),
+        ({"feedback": "measured", "tol": 2e-2}, True),
+    ):
+        track = bha(dt=0.02, gain=1e-3).track(path, q0=start, plant=plant, **more)
+        np.testing.assert_allclose(track.error, 0.01, atol=1.5e-3)
+        reached = np.asarray(track.status) == IKStatus.CONVERGED
+        if "tol" in more:
+            assert reached.all() if converged else not reached.any()
+        assert reached[0] == converged
+
+
 def test_a_failing_plant_loses_only_its_own_point():
     calls = []
 

@@ -2,7 +2,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from hybridkin import ConstantCurvatureChain, ElasticTendonChain
+from hybridkin import ConstantCurvatureChain, ElasticTendonChain, ForwardModel
+from hybridkin.ik._starts import even_starts, nearest_starts
 from hybridkin.ik.solver import IKStatus, InverseKinematics
 
 TRUNK = ConstantCurvatureChain([0.100, 0.093, 0.079])
@@ -70,3 +71,26 @@ def test_a_miss_is_said_after_all_starts_at_a_bounded_cost():
     # One sample for both, and the iterations of every start.
     assert model.rows < 2048 + int((solution.n_iter + 2 * solution.n_starts).sum())
     assert ik.solve(target, restarts=3).n_starts.tolist() == [4, 4]
+
+
+class HalfKnown(ForwardModel):
+    """A robot x = q that is known for positive q1."""
+
+    n_actuators, n_outputs = 3, 3
+
+    def forward(self, q):
+        return 1.0 * q
+
+    def domain_distance(self, q):
+        return torch.where(q[..., 0] > 0.0, 0.5, 2.0).to(q)
+
+
+def test_starts_outside_the_domain_count_as_four_times_as_far():
+    settings = InverseKinematics(HalfKnown(), q_min=-1.0, q_max=1.0).settings
+    start, target = torch.zeros(1, 3).double(), torch.tensor([[-0.05, 0.1, 0.2]]).double()
+    sample = even_starts(settings, start, start[:, 0], 2048)[0]
+    distance = (sample - target).norm(dim=-1)
+    distance = torch.where(sample[:, 0] > 0.0, distance, 4.0 * distance)
+    nearest = nearest_starts(settings, start, start[:, 0], target, 400)[0]
+    assert_close(nearest, sample[distance.argsort()[:400]])
+    assert 0 < (nearest[:, 0] <= 0.0).sum() < 100

@@ -286,3 +286,15 @@ def test_single_precision_keeps_accelerations_and_half_spaces():
     tips = CHAIN(torch.from_numpy(q).double())
     assert tips[:, 2].max() <= 0.8 + 1e-4
     assert tips[-1, 2] > 0.79
+
+
+@pytest.mark.parametrize("radian", [0.05, 2.0])
+def test_the_distance_of_starts_to_a_pose_weighs_its_rotation(rng, radian):
+    """By chords in place of angles, which are the same for small rotations."""
+    task = PoseTask(CHAIN, radian=radian)
+    q = uniform(rng, 0.2, 0.3, 8, 9)
+    target = pose(CHAIN, q)
+    x = pose(CHAIN, q + 1e-4 * randn(rng, 8, 9))
+    errors = task.difference(x, target).norm(dim=-1)
+    assert_close(task.distances(x[:, None], target)[:, 0], errors, rtol=1e-4, atol=0.0)
+    assert_close(task.distances(x[None], target).diagonal(), errors, rtol=1e-4, atol=1e-9)

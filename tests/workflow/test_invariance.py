@@ -372,6 +372,7 @@ def test_a_comparison_does_not_depend_on_units_and_names(tmp_path, sign):
         found.append(compare_by_group(rows, robot, settings, fitted, n_jobs=1))
     ours, theirs = found
     assert_array_equal(ours.fold, theirs.fold)
+    assert all(len({*ours.fold[motions == k]}) == 1 for k in range(4))  # whole motions
     assert_allclose(theirs.distance, ours.distance, rtol=1e-6, atol=1e-9)
     assert ours.errors.keys() == theirs.errors.keys()
     for name in ours.errors:
