@@ -247,6 +247,11 @@ def test_only_pauses_within_a_motion_are_gaps():
         (finding,) = findings(replace(log, groups=log.groups // 2))
         assert finding.kind == "time"
         assert finding.rows.tolist() == [*range(20, 240, 40)]
+    # Nor do they count as usual steps, where every motion is short.
+    steps = np.where(np.arange(240) % 2, 0.1, 7.0)
+    steps[101] = 3.0
+    found = findings(measured(time=np.cumsum(steps), groups=np.arange(240) // 2))
+    assert [f.rows.tolist() for f in found if f.kind == "time"] == [[101]]
 
 
 @pytest.mark.parametrize("base_is_free", [True, False])
