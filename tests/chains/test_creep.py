@@ -125,7 +125,7 @@ def test_motions_may_be_renamed_mixed_and_have_clocks_in_any_unit(operator):
             close(inner[rows][-1], state[-1 - len(inner[0]) : -1])
     order = np.argsort(np.arange(30) % 10 + 0.1 * (2 - groups))
     names = np.array(["b", "c", "a"])[groups[order]]
-    clock = time[order] + 1e3 * groups[order]
+    clock = time[order] - 1e3 * groups[order]
     close(operator.apply_by_group(q[order], names, clock), y[order], atol=1e-12)
     close(operator.inner_states(q[order], names, clock), inner[order], atol=1e-12)
     if isinstance(operator, CreepOperator):

@@ -138,3 +138,6 @@ def test_lengths_are_positive_in_metres():
         chain.check_actuators(torch.tensor([[110.0, 120.0, -50.0], [110.0, 50.0, -50.0]]))
     (message,) = chain.check_actuators(torch.tensor([[1e6, 120.0, -50.0]]))
     assert message.startswith("`q` times `gains` reaches 20, which looks like millimetres")
+    # Small numbers may be speeds: they are no lengths of 20 m where the zeros are far.
+    far = ConstantCurvatureChain([0.01], gains=2e-5, actuator_zeros=1e6)
+    assert far.unit_messages(torch.full((1, 3), 100.0), "dq_max") == []

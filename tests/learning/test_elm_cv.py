@@ -77,6 +77,8 @@ def test_each_row_alone_equals_brute_force(n, fit_intercept):
 def test_groups_equal_refits(sizes, fit_intercept):
     groups = np.random.default_rng(0).permutation(np.repeat(np.arange(len(sizes)), sizes))
     X, y = data(len(groups))
+    other = np.flatnonzero(groups != groups[0])[0]
+    X[other], y[other] = X[0], y[0]  # a row of two groups
     weights = np.random.default_rng(1).uniform(0.2, 3.0, len(groups))
     model = quick(fit_intercept=fit_intercept).fit(X, y, weights, groups)
     brute = np.empty((len(ALPHAS), *y.shape))
