@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
+from saved_models import bent_chain, elastic_chain, tendon_chain
 from torch.testing import assert_close
 
 from hybridkin import (
@@ -21,6 +22,7 @@ from hybridkin import (
 from hybridkin._core.rotations import rotation, rotation_vector
 from hybridkin.hybrid._adapt import _SCALES, _likeliest_scales, _whitened
 from hybridkin.hybrid._drift import MISFITS, SWITCH
+from hybridkin.hybrid._wrapped import shifted
 
 SHIFT = 0.006 * np.array([1.0, -0.5, 0.8, -1.2, 0.3, 0.9, -1.0, 0.6, -0.7])
 TURN, WAY = torch.tensor([0.1, -0.06, 0.08], dtype=torch.float64), np.array([0.03, -0.05, 0.02])
@@ -164,6 +166,19 @@ def test_measurements_after_a_change_are_learned_as_those_before_it(case):
     expected = moved(follows.predict(q + shift), *turn)
     assert_allclose(model.predict(q), expected, rtol=0, atol=1e-9)
     assert np.abs(follows.predict(q + shift) - fitted.predict(q + shift)).max() > 0.01
+
+
+@pytest.mark.parametrize("gains", [None, np.linspace(-2.0, 3.0, 7)])
+@pytest.mark.parametrize("make", [tendon_chain, bent_chain, elastic_chain])
+def test_a_chain_with_shifted_zeros_is_the_chain_of_shifted_actuators(make, gains):
+    """In the unit of the actuators, whatever their gains are."""
+    chain = make() if gains is None else make(gains=gains)
+    rng = np.random.default_rng(0)
+    q, shift = (torch.from_numpy(1e-3 * rng.standard_normal(size)) for size in ((9, 7), 7))
+    moved_chain = shifted(chain, shift)
+    assert isinstance(moved_chain, type(chain))
+    assert_close(moved_chain(q), chain(q + shift), rtol=0, atol=1e-12)
+    assert (moved_chain(q) - chain(q)).abs().max() > 1e-4
 
 
 def test_only_what_may_have_changed_is_adapted(trunk):

@@ -139,6 +139,22 @@ def test_the_fits_of_the_radius_choose_by_motions():
     assert radii[1] == pytest.approx(radii[0], rel=0.1)
 
 
+def test_equal_rows_of_two_motions_stay_apart():
+    """As if they differed by a nanometre: each motion is predicted by the other one."""
+    q, x, motions, new = learnable()
+    twice = np.append(np.arange(len(q)), np.flatnonzero(motions < 3))
+    names = motions[twice].copy()
+    names[len(q) :] += 10
+    apart = x[twice] + 1e-9 * np.random.default_rng(1).standard_normal((len(twice), 3))
+    model = HybridForwardModel(CHAIN, "quadratic")
+    residuals = []
+    for tips in (x[twice], apart):
+        model.fit(q[twice], tips, groups=names)
+        residuals.append((model.error_model_.residual, model.predict(new)))
+    for found, expected in zip(*residuals, strict=True):
+        assert_allclose(found, expected, rtol=0, atol=3e-8)
+
+
 def learnable():
     """Return motions of different lengths of a robot with an error to be learned, and new rows."""
     rng = np.random.default_rng(0)

@@ -17,6 +17,7 @@ from hybridkin import (
     HysteresisSeries,
     PlayOperator,
     PrandtlIshlinskiiOperator,
+    calibrate,
 )
 from hybridkin.hybrid import _hysteresis
 from hybridkin.hybrid._error_models import NoCorrection
@@ -209,6 +210,27 @@ def test_the_search_gets_the_rows_as_they_are(mechanical, monkeypatch):
         network.fit(q, x, weights, groups)
         predicted = log.model(torch.from_numpy(q)).numpy()
         assert_allclose(predicted, network.predict(q), rtol=0, atol=1e-9)
+
+
+def test_the_chain_of_the_search_is_calibrated_with_the_weights(monkeypatch):
+    monkeypatch.setattr(_hysteresis, "find_hysteresis", lambda log: log)
+    q, runs, _ = motions()
+    weights = np.random.default_rng(0).integers(0, 4, len(q)).astype(float)
+    x = tips(q) + 0.02 * np.sin(20 * q)
+    found = chosen(Rows(q, x, weights, runs), ("base",)).model
+    expected, plain = (
+        calibrate(CHAIN, q, x, parameters=("base",), sample_weight=counts).chain
+        for counts in (weights, None)
+    )
+    assert_allclose(found.base, expected.base, rtol=0, atol=1e-8)
+    assert (found.base - plain.base).abs().max() > 1e-5
+
+
+def test_a_single_motion_that_counts_tells_nothing_of_hysteresis():
+    """There is none to hold out beside those of weight zero."""
+    q, runs, _ = motions()
+    x = tips(PLAY.apply_by_group(q, runs))
+    assert chosen(Rows(q, x, (runs == 2).astype(float), runs)) is None
 
 
 def test_the_range_of_states_is_tested_by_other_groups():

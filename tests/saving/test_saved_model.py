@@ -11,10 +11,12 @@ from saved_models import (
     bent_chain,
     predictions,
     tendon_chain,
+    trunk,
     trunk_log,
 )
 from sklearn.base import clone
 from sklearn.kernel_ridge import KernelRidge
+from sklearn.linear_model import LinearRegression
 
 import hybridkin
 from hybridkin import (
@@ -110,6 +112,32 @@ def test_every_kind_comes_back_with_its_settings(tmp_path, kind, fitted):
             assert_equal(getattr(twin, name), getattr(model, name))
 
 
+def test_a_file_knows_that_no_correction_was_taken(tmp_path):
+    q, _, groups = trunk_log()
+    chain = trunk()
+    noise = 1e-3 * np.random.default_rng(0).standard_normal((len(q), 3))
+    model = HybridForwardModel(chain, "linear")
+    model.fit(q, chain(torch.from_numpy(q)).numpy() + noise, groups=groups)
+    save_model(model, tmp_path / "model")
+    assert model._fitted.error.rejected
+    assert load_model(tmp_path / "model")._fitted.error.rejected
+
+
+def test_a_loaded_model_of_one_output_is_adapted_without_its_drift(tmp_path):
+    q, x, groups = trunk_log()
+    model = HybridForwardModel(None, LinearRegression())
+    model.fit(q, x[:, 0], groups=groups)
+    model.partial_fit(q[:9], x[:9, 0] + 0.03, alpha=1e-3)
+    save_model(model, tmp_path / "model")
+    twin = load_model(tmp_path / "model")
+    assert_array_equal(twin.predict(q), model.predict(q))
+    assert twin.predict(q).shape == (len(q),)
+    for followed in (model, twin):
+        followed.adapt(q, x[:, 0], parameters=["actuator_zeros"])
+    assert_array_equal(twin.predict(q), model.predict(q))
+    assert model._drift.alpha == np.inf
+
+
 def settings(model):
     """Return all parameters, those of the error model among them."""
     params = model.get_params()
@@ -147,7 +175,9 @@ def test_the_header_describes_the_model(tmp_path, fitted):
     save_model(fitted["parallel_elm"][0], path)
     found = model_header(path)["training"]
     assert found["rows"] == 24
-    assert found["calibration"]["rmse"] == fitted["parallel_elm"][0].calibration_.rmse
+    calibration = fitted["parallel_elm"][0].calibration_
+    assert found["calibration"]["rmse"] == calibration.rmse
+    assert found["calibration"]["held_out_rmse"] == calibration.cv_rmse > calibration.rmse
     save_model(fitted["blend"][0], path)
     chosen = model_header(path)["training"]["cv_results"]["chosen"]
     assert chosen == fitted["blend"][0].cv_results_["chosen"]
