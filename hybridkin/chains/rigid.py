@@ -36,7 +36,6 @@ from hybridkin.chains._joint_motions import (
     joint_motions,
     moving_frames,
 )
-from hybridkin.chains._urdf import Urdf
 from hybridkin.chains.chain import Chain
 
 if TYPE_CHECKING:
@@ -247,6 +246,8 @@ class RigidChain(Chain):
         UserWarning
             For joints without <limit>, with swapped limits, and with limits that are both zero.
         """
+        from hybridkin.chains._urdf import Urdf  # loads lxml
+
         return cls._of_joints(Urdf(text_or_path, end_link, root_link).joints, options)
 
     def to_urdf(
@@ -293,6 +294,8 @@ class RigidChain(Chain):
         <origin xyz="0.0 0.0 0.25" rpy="0.0 0.0 0.0"/> </joint> </robot>
         """
         origins = self.origins_at_zero.double().numpy(force=True)
+        from hybridkin.chains._urdf import Urdf  # loads lxml
+
         return Urdf(text_or_path, end_link, root_link).placed(self.names, origins)
 
     @classmethod
