@@ -251,8 +251,10 @@ class Chain(PoseModel):
 
     def misses(self, x: Tensor, largest: Tensor) -> Tensor:
         """Return how much farther points are from the base than the stretched robot is long."""
-        away = x.unflatten(-1, (-1, 3)) - self.base[:3, 3]
-        return away.norm(dim=-1).amax(-1) - self.longest(largest)
+        base = self.base[:3, 3]
+        away = x.unflatten(-1, (-1, 3)) - base.to(x.device)
+        longest = self.longest(largest.to(base.device))
+        return away.norm(dim=-1).amax(-1) - torch.as_tensor(longest, device=x.device)
 
     def longest(self, largest: Tensor) -> Tensor | float:
         """Return an upper bound of the distance from base to tip for ``|q| <= largest`` [m]."""

@@ -39,6 +39,10 @@ class _Statics(NamedTuple):
     offsets: Tensor  # (A,), rigid length after each arc [m]
     down: Tensor  # (3,), direction of gravity in the frame of the base
 
+    def at(self, rows: Tensor) -> _Statics:
+        """Return the same on the device of rows."""
+        return _Statics(*(part.to(rows.device) for part in self))
+
     def shape_of_least_energy(
         self, forces: Tensor, arcs: Tensor
     ) -> tuple[Tensor, Tensor]:
@@ -413,7 +417,7 @@ class ForceTendonChain(ArcChain):
     def _arcs_and_slope(self, rows: Tensor) -> tuple[Tensor, Tensor]:
         q = rows.double()
         arcs = self._at_rest(q)
-        statics = self._statics()
+        statics = self._statics().at(q)
         gains = self.gains.to(q)
         shape = _Shape(statics, arcs, self.forces(q))
         by_force, _ = torch.linalg.solve_ex(shape.hessian, -statics.readings.mT)
@@ -433,7 +437,7 @@ class ForceTendonChain(ArcChain):
         arcs, compliance = self._shapes(q)
 
         def imbalance(chain: ForceTendonChain) -> Tensor:
-            return _Shape(chain._statics(), arcs, chain.forces(q)).imbalance
+            return _Shape(chain._statics().at(q), arcs, chain.forces(q)).imbalance
 
         forcing = self._slope_of(imbalance, tangents)  # (3 A, N, P)
         by_geometry = -compliance @ forcing.permute(1, 0, 2)
@@ -451,7 +455,7 @@ class ForceTendonChain(ArcChain):
         second.
         """
         arcs, compliance = self._shapes(q)
-        statics = self._statics()
+        statics = self._statics().at(q)
         forces = self.forces(q)
         for _ in range(2):
             imbalance = _Shape(statics, arcs, forces).imbalance.mT
@@ -470,7 +474,7 @@ class ForceTendonChain(ArcChain):
         """Return arcs (N, 3 A) at rest and the flat compliance, for entries of the geometry."""
         geometry = dict(zip(self._entries, entries, strict=True))
         chain = self.with_geometry(**geometry)
-        statics = chain._statics()
+        statics = chain._statics().at(q)
         start = statics.rest[:, None].expand(-1, len(q))
         last = self._last
         if last is not None and torch.equal(last.q, q):

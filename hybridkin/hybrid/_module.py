@@ -314,7 +314,8 @@ class HybridModule(Hybrid):
         """Return how much farther targets are than f reaches with the longest correction."""
         if self.mechanical is None:
             return super().misses(x, largest)
-        return self.mechanical.misses(x, largest) - self.longest_correction
+        longest = torch.as_tensor(self.longest_correction, device=x.device)
+        return self.mechanical.misses(x, largest) - longest
 
     def with_drift(self, drift: AffineModule) -> Self:
         """Return the same model with another drift; this model does not change."""

@@ -135,7 +135,7 @@ class Shifted(Wrapped):
 
     def misses(self, x: Tensor, largest: Tensor) -> Tensor:
         """Return by how much targets are out of reach of f, shape (...) [m]."""
-        return self.model.misses(x, largest + self.shift.abs())
+        return self.model.misses(x, largest + self.shift.abs().to(largest.device))
 
     def _inner(self, q: Tensor) -> Tensor:
         check_vectors(
@@ -395,7 +395,8 @@ class WithPose(Hybrid, PoseModel):
 
     def misses(self, x: Tensor, largest: Tensor) -> Tensor:
         """Return how much farther targets are than f reaches with the longest correction."""
-        return self.mechanical.misses(x, largest) - self.learned.longest_correction
+        longest = torch.as_tensor(self.learned.longest_correction, device=x.device)
+        return self.mechanical.misses(x, largest) - longest
 
     def with_drift(self, drift: AffineModule) -> Self:
         """Return the same model with another drift; this model does not change."""
@@ -440,13 +441,13 @@ class WithPose(Hybrid, PoseModel):
 
     def _pose(self, q: Tensor) -> tuple[Tensor]:
         error = self.learned(q)
-        turn = rotation(error[:, 3:] / reach_of(self.mechanical))[0]
+        turn = rotation(error[:, 3:] / reach_of(self.mechanical).to(error))[0]
         return (_displaced(self.mechanical.pose(q), error[:, :3], turn),)
 
     def _pose_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         T, J = self.mechanical.pose_and_jacobian(q)
         error, slope = self.learned.forward_and_jacobian(q)
-        reach = reach_of(self.mechanical)
+        reach = reach_of(self.mechanical).to(error)
         turn, left = rotation(error[:, 3:] / reach)
         # exp(phi) R_mech has the angular velocity J_l(phi) dphi/dq + exp(phi) omega_mech.
         angular = left @ (slope[:, 3:] / reach) + turn @ J[:, 3:]
@@ -510,7 +511,7 @@ def pose_errors(mechanical: PoseModel, q: Tensor, y: NDArray) -> NDArray:
     with torch.no_grad():
         rows = PoseRows(mechanical)(q)
     error = pose_difference(rows, torch.from_numpy(y))
-    error[:, 3:] *= reach_of(mechanical)
+    error[:, 3:] *= reach_of(mechanical).to(error)
     return error.numpy()
 
 
@@ -520,9 +521,11 @@ def pose_difference(before: Tensor, after: Tensor) -> Tensor:
     return torch.cat([after[:, :3] - before[:, :3], rotation_vector(turn)], dim=-1)
 
 
-def reach_of(mechanical: PoseModel) -> Tensor | float:
-    """Return the length [m] that a radian of orientation error counts as."""
-    return mechanical.reach if isinstance(mechanical, Chain) else 1.0
+def reach_of(mechanical: PoseModel) -> Tensor:
+    """Return the length [m] that a radian of orientation error counts as, shape ()."""
+    if isinstance(mechanical, Chain):
+        return mechanical.reach
+    return torch.ones((), dtype=torch.float64, device="cpu")
 
 
 def _displaced(T: Tensor, way: Tensor, turn: Tensor) -> Tensor:
