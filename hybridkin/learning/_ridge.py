@@ -10,6 +10,7 @@ from scipy.linalg.lapack import dpocon, dpotrf, dtrtri  # pyright: ignore
 from sklearn.utils import gen_batches
 
 from hybridkin._core.arrays import copied
+from hybridkin._core.blocks import rows_at_once
 
 # 4 MB of float64: enough rows to feed the BLAS, near the cache.
 BLOCK_ELEMENTS = 500_000
@@ -35,7 +36,8 @@ def gather(stats, elm, X, y, sample_weight, block_size):
     n_columns = n_features + y.shape[1]
     if stats is None:
         stats = Statistics(0.0, np.zeros(n_columns), np.zeros((n_columns, n_columns)))
-    block_size = block_size or max(1, BLOCK_ELEMENTS // n_columns)
+    if block_size is None:
+        block_size = rows_at_once(max(1, BLOCK_ELEMENTS // n_columns), device)
     n = stats.n
     mean = torch.tensor(stats.mean, device=device)
     # In the order of BLAS; only one half is updated.

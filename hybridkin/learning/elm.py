@@ -12,7 +12,7 @@ from sklearn.utils._param_validation import Interval, StrOptions
 from sklearn.utils.validation import check_is_fitted
 
 from hybridkin._core.arrays import copied, real_array
-from hybridkin._core.blocks import in_blocks
+from hybridkin._core.blocks import in_blocks_of, rows_at_once
 from hybridkin._core.estimators import estimator_of, params_of, restore_columns
 from hybridkin._core.stored import Stored
 from hybridkin.learning._ridge import (
@@ -129,8 +129,8 @@ class FittedNetwork(MultiOutputMixin, RegressorMixin, BaseEstimator):
         size = BLOCK_ELEMENTS // max(elm.output_weights.shape[0], elm.tangent.shape[1])
         with torch.no_grad():
             q = copied(X, elm.input_center.device, np.float64)
-            block_size = int(self.block_size or max(1, size))
-            parts = in_blocks(partial(function, elm), q, block_size)
+            block_size = self.block_size or rows_at_once(max(1, size), q.device)
+            parts = in_blocks_of(int(block_size), partial(function, elm), q)
         return self._shaped(X, [part.cpu().numpy() for part in parts])
 
     def _shaped(self, X, arrays):
@@ -173,7 +173,7 @@ class ELMRegressor(FittedNetwork):
     direct_link : bool, default=False
         Whether the scaled inputs are additional features, after the hidden neurons.
     block_size : int, default=None
-        Rows computed at a time; None means about 4 MB of features.
+        Rows computed at a time; None means about 4 MB of features, on a GPU 128 MB.
     device : str or torch.device, default=None
         Where to compute; None means the CPU. A model is unpickled to the CPU if it is missing.
     random_state : int, RandomState instance or None, default=None
