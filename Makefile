@@ -8,7 +8,7 @@ TESTS := -q -n auto --maxprocesses 4 --dist worksteal
 # More threads than cores make torch many times slower; the processes share the cores.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: paper test quick portable everything view-test bench examine coverage check docs clean dist oldest native claims-quick
+.PHONY: paper test quick portable everything view-test bench examine coverage check docs clean dist oldest native claims-quick gpu
 
 paper: $(VENV)/.native
 	$(BIN)/python examples/paper --out $(OUT)
@@ -40,6 +40,10 @@ bench: $(VENV)/.bench $(VENV)/.native
 # The published figures that take under a minute each, beside the committed ones.
 claims-quick: $(VENV)/.native
 	$(BIN)/python examples/studies/claims.py
+
+# Models on a GPU: whether they agree with the CPU, speed and memory. The CPU uses all its cores.
+gpu: $(VENV)/.native
+	env -u OMP_NUM_THREADS $(BIN)/python examples/studies/gpu.py --out $(OUT)/gpu
 
 # A shortened examination; docs/reliability.md has the figures of the full one.
 examine: $(VENV)/.examine $(VENV)/.native
