@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 from sklearn.kernel_ridge import KernelRidge
 
 from hybridkin import HybridForwardModel
@@ -42,6 +43,47 @@ def test_no_neighbour_of_the_tuned_kernel_is_better(enough, n_outputs, grouped, 
     for gamma, alpha in near:
         other = held_out(X, y, weights, groups, gamma / spread, alpha)
         assert best <= other * (1.0 + 1e-9)
+
+
+def rows_of_motions():
+    """Return inputs, targets, weights and motions of three rows each."""
+    rng = np.random.default_rng(4)
+    X = rng.uniform(-0.1, 0.1, (60, 2))
+    y = 0.01 * np.sin(20.0 * X) + 1e-3 * rng.standard_normal((60, 2))
+    return X, y, rng.integers(1, 9, 60).astype(float), np.arange(60) // 3
+
+
+@pytest.mark.parametrize("grouped", [False, True])
+@pytest.mark.parametrize("place", [(0, 1), (3, 4), (5, 6)])
+def test_the_score_of_a_kernel_is_that_of_weighted_fits_on_the_folds(place, grouped):
+    X, y, weights, groups = rows_of_motions()
+    groups = groups if grouped else None
+    score = _kernel._HeldOut(X, y, weights, groups, 0.01).distance(place)
+    gamma = _kernel._GAMMAS[place[0]] / 0.01
+    expected = held_out(X, y, weights, groups, gamma, _kernel._ALPHAS[place[1]])
+    # Few digits are lost: the least penalty is 1e-4 of the kernel's weights.
+    assert score == pytest.approx(expected, rel=1e-8)
+
+
+@pytest.mark.parametrize("first", [7, 40])
+def test_a_first_search_on_some_rows_keeps_their_weights_and_every_motion(first, monkeypatch):
+    X, y, weights, groups = rows_of_motions()
+    searched = []
+
+    class Recorded(_kernel._HeldOut):
+        def __init__(self, *rows):
+            searched.append(rows)
+            super().__init__(*rows)
+
+    monkeypatch.setattr(_kernel, "_HeldOut", Recorded)
+    monkeypatch.setattr(_kernel, "_FIRST", first)
+    tuned_kernel(X, y, weights, groups)
+    few = searched[0]
+    places = [int(np.flatnonzero((X == row).all(axis=1))[0]) for row in few[0]]
+    assert len(places) == (60 if first == 7 else 40)  # 7 rows would leave motions out
+    for found, given in zip(few[1:4], (y, weights, groups), strict=True):
+        assert_array_equal(found, given[places])
+    assert len(np.unique(few[3])) == 20
 
 
 def test_more_rows_than_the_memory_holds_are_refused():

@@ -126,6 +126,8 @@ def test_names_of_runs_and_the_start_of_the_clock_do_not_matter(operator):
     one.partial_fit(commands, moved, decay=1.0)
     other.partial_fit(others, moved[order], decay=1.0)
     assert_equal_models()
+    by_motion = one.predict(Commands(q, None, time), groups=runs)
+    assert_array_equal(by_motion, one.predict(commands))
     as_one_run = one.predict(Commands(q, None, time))
     assert np.abs(as_one_run - one.predict(commands)).max() > 1e-3
 
