@@ -14,8 +14,8 @@ from torch.utils._python_dispatch import TorchDispatchMode, return_and_correct_a
 from torch.utils._pytree import tree_leaves, tree_map
 
 NAME = "pretended"
-SOLVED = ("tendons of fixed length, all parts", "hybrid, network", "adapted poses")
-EVALUATED = ("tendons by force", "elastic tendons", "serial, pose", "backlash and creep")
+SOLVED = ("hybrid, network", "adapted poses")
+EVALUATED = ("tendons by force", "backlash and creep")
 aten = torch.ops.aten
 COPIES = (aten._to_copy.default, aten.copy_.default)
 INDEXED = (aten.index.Tensor, aten.index_put.default, aten.index_put_.default)
