@@ -12,7 +12,7 @@ FILES = (
     "tests/hybrid/test_guards.py",
     "tests/ik/test_hysteresis.py::test_the_core_commands_what_torch_does",
 )
-RUNS = (0, 1, 6)  # no core, other instructions of everything, and two threads
+RUNS = (0, 1)  # without the core and with two threads; other instructions of everything
 
 
 @pytest.mark.slow
