@@ -59,6 +59,8 @@ def tested(
     command = [sys.executable, "-m", "pytest", "-q", "--no-header"]
     command += ["--hypothesis-profile=portable", f"--hypothesis-seed={seed}", *arguments]
     changed = {name: value for name, value in settings.items() if value}
+    # More threads than cores must not wait actively: this makes torch many times slower.
+    changed["OMP_WAIT_POLICY"] = "passive"
     return subprocess.run(
         command, cwd=ROOT, env={**inherited, **changed}, capture_output=True, text=True
     )
@@ -78,9 +80,7 @@ def main() -> int:
             print(f"  left out: this processor has no {' or '.join(lacking(settings))}", flush=True)
             continue
         sys.stdout.flush()
-        # More threads than cores make torch many times slower.
-        n_processes = min(4, os.cpu_count() or 1) // int(settings["OMP_NUM_THREADS"])
-        processes = ["-n", str(max(1, n_processes)), "--dist", "worksteal"]
+        processes = ["-n", "auto", "--maxprocesses", "4", "--dist", "worksteal"]
         start = time.perf_counter()
         seed = N_RUNS * options.seed + run
         done = tested(settings, seed, *processes, "-m", "not slow", "tests")
