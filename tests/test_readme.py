@@ -118,7 +118,8 @@ def planned(folder, target):
         ["make", "-n", target], cwd=folder, env=environment, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
-    return [shlex.split(line) for line in done.stdout.replace("\\\n", " ").splitlines()]
+    lines = done.stdout.replace("\\\n", " ").splitlines()
+    return [shlex.split(re.sub(r"^env -u \w+ ", "", line)) for line in lines]
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@ import warnings
 
 import numpy as np
 import pytest
+import rounding
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
 from sklearn.base import clone
@@ -106,7 +107,12 @@ def test_jacobian_is_that_of_the_whole_sum(log, error_model, guard):
     # inside the domain, at its edge, and far outside, where the guard is at work
     points = 0.25 + np.outer([0.5, 1.05, 1.6, 3.0], q[0] - 0.25)
     prediction, J = model.predict_and_jacobian(points)
-    assert_array_equal(prediction, model.predict(points))
+    # Without the core, tips alone and tips with J are computed by other operations: sums of up to
+    # a hundred terms.
+    close = 100.0 * rounding.EPS
+    assert_allclose(
+        prediction, model.predict(points), rtol=0, atol=close * np.abs(prediction).max()
+    )
     assert_array_equal(J, model.jacobian(points))
     step = 1e-5
     moves = step * np.eye(9)
