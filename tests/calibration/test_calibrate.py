@@ -392,3 +392,30 @@ def test_columns_in_a_wrong_order_are_noticed_but_not_outliers(rng):
     spoiled = x.clone()
     spoiled[: len(x) // 5] += 0.1
     calibrate(chain, q, spoiled, ("base",), loss="cauchy")
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:`q` holds 4 different rows")
+def test_standard_errors_are_the_spread_of_the_estimates_also_with_few_rows(rng):
+    """Four rows determine the six numbers of the base: half of the degrees of freedom are left."""
+    truth = trunk(base=planted_base())
+    q = chambers(rng, 4)
+    x = truth(q)
+    squares, variances = [], []
+    for _ in range(40):
+        result = calibrate(truth, q, x + 1e-4 * gauss(rng, 4, 3), parameters=("base",))
+        squares.append((result.values["base"][:3, 3] - truth.base[:3, 3]).square().sum())
+        variances.append(result.std_errors["base"][3:].square().sum())
+    # Means of 40 variances with 6 degrees of freedom are right to a tenth; 12 degrees of freedom
+    # would halve them.
+    expected = 1e-8 * _base_variance(truth, q)
+    assert torch.stack(squares).mean() == pytest.approx(expected, rel=0.4)
+    assert torch.stack(variances).mean() == pytest.approx(expected, rel=0.3)
+
+
+def _base_variance(chain, q):
+    """Return the summed variances of the origin of the base, for tips of unit variance."""
+    # A small turn phi and shift move a tip by phi x (x - origin) + shift.
+    arms = (chain(q) - chain.base[:3, 3]).numpy()
+    J = np.vstack([np.hstack([np.cross(arm, np.eye(3)), np.eye(3)]) for arm in arms])
+    return np.trace(np.linalg.inv(J.T @ J)[3:, 3:])

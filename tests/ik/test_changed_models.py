@@ -223,3 +223,17 @@ def test_a_pose_task_follows_its_estimator():
     after = ik.step(NOW, poses[8].numpy()).dq
     assert np.abs(after - before).max() > 1e-4
     np.testing.assert_array_equal(after, fresh.step(NOW, poses[8].numpy()).dq)
+
+
+def test_limits_that_the_model_gives_are_those_of_its_present_zeros():
+    """Chambers are longer than nothing: `q_min` moves with the zeros that `adapt` finds."""
+    model = HybridForwardModel(CHAIN, "linear", guard=None).fit(Q, X)
+    ik = InverseKinematics(model, q_max=0.2)
+    base = np.zeros(3)  # all chambers as short as they can be
+    shortest = ik.solve(base, NOW).q
+    model.adapt(Q[:40] + 0.03, X[:40], parameters=["actuator_zeros"])
+    q_min = as_numpy(InverseKinematics(model, q_max=0.2).settings.q_min)
+    np.testing.assert_allclose(q_min, 0.03, atol=0.01)
+    assert (shortest < q_min).any()
+    assert (ik.solve(base, NOW + 0.03).q >= q_min).all()
+    assert (ik.tracker(NOW + 0.03).step(base) >= q_min).all()

@@ -351,6 +351,20 @@ def test_bad_calls_are_refused_by_name(call, message):
         call(bha())
 
 
+@pytest.mark.parametrize("rate", ["gain", "beta"])
+def test_a_track_with_one_long_period_is_refused_before_the_robot_moves(rate):
+    """A step of the longest period would go past its target."""
+    sent = []
+    path = np.full((4, 3), [0.0, 0.0, 0.75])
+    ik = InverseKinematics(CHAIN, q_min=0.1, q_max=0.4, dt=0.05, **{rate: 10.0})
+    times = [0.0, 0.05, 0.1, 0.15]
+    ik.track(path, times, q0=np.full(9, 0.25), plant=lambda q: sent.append(q) or path[0])
+    assert len(sent) == 4
+    with pytest.raises(ValueError, match=f"`{rate}` times .* got 10 1/s x 0.15 s"):
+        ik.track(path, [0.0, 0.05, 0.1, 0.25], plant=sent.append)
+    assert len(sent) == 4
+
+
 def test_what_cannot_be_known_is_asked_for(A):
     with pytest.raises(TypeError, match="fitted regressor"):
         InverseKinematics(object())
