@@ -84,7 +84,14 @@ OF_COLUMNS = {
     "constant, coordinate": (with_rows("x0", slice(None), 0.0), "warning", None, "'x[0]'"),
     "constant, tip": (with_rows("x", slice(None), 0.0), "error", None, "never change"),
     "duplicates": (copied(0.0), "warning", range(200, 220), "20 of them in another motion"),
-    "same command": (copied([3e-4, 0, 0]), "note", None, "40 rows have the same"),
+    # Pairs 0.3 mm apart: each has one degree of freedom, 0.3 mm / sqrt(2).
+    "same command": (
+        copied([3e-4, 0, 0]),
+        "note",
+        None,
+        "40 rows have the same command as another row, as in a motion out and back; their tips "
+        "differ by 0.212 mm rms",
+    ),
     "jumps": (with_rows("x", [110], [0.3, 0.0, 0.0]), "warning", [110, 111], "soft_l1"),
     "time": (measured(time=0.1 * np.arange(240) * (np.arange(240) != 105)), "warning", [105], ""),
     "time, run": (
@@ -213,6 +220,7 @@ SIGN = np.where(np.arange(9) == 4, -1.0, 1.0)
 OF_GEOMETRY = {
     "one sign": (measured(SIGN * Q, x=X), CHAIN, {}, "sign", "q_sign = [1, 1, 1, 1, -1, 1"),
     "all signs": (measured(-Q, x=X), CHAIN, FIXED, "sign", "q_sign = -1"),
+    "signs as read": (measured(-Q, x=X, q_sign=-1), CHAIN, FIXED, "sign", "set q_sign = 1 in"),
     "half turn": (measured(-Q, x=X), CHAIN, {}, "sign", "rotated by"),
     "only lengthened": (measured(np.abs(Q), x=X), CHAIN, {}, "sign", "only lengthened"),
     "clockwise": (measured(), CLOCKWISE, {}, "numbering", "clockwise = "),

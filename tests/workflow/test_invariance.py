@@ -180,6 +180,18 @@ def test_commands_exceed_the_limits_by_half_the_backlash_in_any_unit(tmp_path):
     assert_allclose(found[1], found[0], rtol=1e-9, atol=1e-12)
     inner = workflow.path_limits(metres)
     assert_allclose(found[0], [inner.q_min - 0.5 * width, inner.q_max + 0.5 * width])
+    given = {"q_min": np.full(6, -0.003), "q_max": np.full(6, 0.002)}
+    asked = Domain(metres, workflow.path_limits(metres, **given)).of_commands
+    assert_allclose(asked, [*given.values()], rtol=1e-9)
+
+
+@pytest.mark.parametrize("learned", [False, True])
+def test_limits_beside_the_log_hold_what_a_domain_prefers(tmp_path, learned):
+    given = {"q_min": np.full(6, 0.0005), "q_max": np.full(6, 0.002)}
+    model = loaded(np.ones(6), tmp_path, learned=learned)
+    domain = Domain(model, workflow.path_limits(model, **given))
+    for q in (domain.preferred, domain.postures(50)):
+        assert ((q >= 0.0005) & (q <= 0.002)).all()
 
 
 def pulled(metres):
