@@ -16,7 +16,7 @@ _POINT = 1e-6  # of the largest value: the range of rows of a single configurati
 _COUNTS = 1e-4  # of a step: numbers this close to multiples of a step are whole counts
 _AS_ROUNDED = 2.0  # variances of rounding: what moves less is not distinguished from it
 _INSIDE = 0.05  # part of a unit vector outside a span that counts as zero
-_FAIR = 0.49  # of the largest part: one with more can be named first; a half is decided
+_FAIR = 0.49  # of the largest part: one with more can be named first, so also a half
 _MENTIONED = 0.05  # of the largest part of a direction
 # Later entries cost more, by this part of the root of their place: of equal sums the first count.
 _EARLIER = 1e-4

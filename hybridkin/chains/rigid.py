@@ -293,9 +293,9 @@ class RigidChain(Chain):
         <joint name="j" type="continuous"> <parent link="a"/> <child link="b"/> <!-- 1 -->
         <origin xyz="0.0 0.0 0.25" rpy="0.0 0.0 0.0"/> </joint> </robot>
         """
-        origins = self.origins_at_zero.double().numpy(force=True)
         from hybridkin.chains._urdf import Urdf  # loads lxml
 
+        origins = self.origins_at_zero.double().numpy(force=True)
         return Urdf(text_or_path, end_link, root_link).placed(self.names, origins)
 
     @classmethod
