@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from html import escape
 
 import numpy as np
 
 from hybridkin._core.arrays import Numbers, as_array
+from hybridkin._core.texts import html_text, visible
 
 _MOST = 48  # numbers of an array that are shown
 _ROUNDING = 12  # decimals
@@ -58,7 +58,7 @@ def _folding(title: str, rows: Mapping[str, object], state: str = "") -> str:
             lines.append(_row(name, value))
     body = "\n".join(lines)
     return (
-        f"<details{state}><summary>{escape(title)}</summary>"
+        f"<details{state}><summary>{html_text(title)}</summary>"
         f"<table><tbody>\n{body}\n</tbody></table></details>"
     )
 
@@ -67,5 +67,5 @@ def _row(name: str, value: object) -> str:
     if isinstance(value, Mapping):
         return f'<tr><td colspan="9">{_folding(name, value)}</td></tr>'
     cells = value if isinstance(value, tuple) else (value,)
-    columns = "".join(f"<td>{escape(str(cell))}</td>" for cell in cells)
-    return f'<tr><th scope="row">{escape(name)}</th>{columns}</tr>'
+    columns = "".join(f"<td>{html_text(cell)}</td>" for cell in cells)
+    return f'<tr><th scope="row">{html_text(visible(name))}</th>{columns}</tr>'

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import json
 import math
 import re
 import sys
 from collections.abc import Callable, Sequence
-from functools import partial
 from importlib.resources import files
 from typing import Any, NamedTuple
 
 import hybridkin
+from hybridkin._core.texts import toml_value, visible
 from hybridkin._core.units import METRES
+from hybridkin.cli._terminal import write
 from hybridkin.cli._values import (
     count,
     existing,
@@ -132,7 +132,7 @@ def _asked(question: _Question) -> Any:
         proposal = default
     hint = "" if default is _NEEDED else f" [{proposal or 'none'}]"
     while True:
-        print(f"{name}: {text}{hint}: ", end="", file=sys.stderr, flush=True)
+        write(f"{name}: {text}{visible(hint)}: ", sys.stderr, end="")
         answer = input().strip()
         if not answer and default is not _NEEDED:
             return default
@@ -140,7 +140,7 @@ def _asked(question: _Question) -> Any:
             return parse(answer)
         except (ValueError, argparse.ArgumentTypeError) as error:
             clear = isinstance(error, argparse.ArgumentTypeError)
-            print(f"  {error if clear else 'must be a number'}", file=sys.stderr)
+            write(f"  {error if clear else 'must be a number'}", sys.stderr)
 
 
 def _proposed(answers: _Answers, delimiter: str | None) -> _Answers:
@@ -205,6 +205,5 @@ def _of_segments(answers: _Answers, key: str) -> Sequence[tuple[str, float | Non
 
 def _filled(block: str, values: _Answers) -> str:
     """Return a part of the template with its values; keys without one become comments."""
-    dumps = partial(json.dumps, ensure_ascii=False)
-    block = re.sub(r"\$(\w+)", lambda name: dumps(values[name[1]]), block)
+    block = re.sub(r"\$(\w+)", lambda name: toml_value(values[name[1]]), block)
     return re.sub(r"^(\w+ =) null$", r"# \1", block, flags=re.MULTILINE)

@@ -17,6 +17,7 @@ from typing import Any, NoReturn
 import hybridkin
 from hybridkin._core.units import METRES, UNITS
 from hybridkin.cli._init import QUESTIONS
+from hybridkin.cli._terminal import write
 from hybridkin.cli._values import (
     between,
     count,
@@ -93,13 +94,10 @@ class _Parser(argparse.ArgumentParser):
 
 def failed(message: str, code: int, as_json: bool) -> int:
     """Print why a command failed, with --json also as a document, and return the exit code."""
-    print(f"hybridkin: {message}", file=sys.stderr)
+    write(f"hybridkin: {message}", sys.stderr, indent="  ")
     if as_json:
-        print(
-            json.dumps(
-                {"error": message.removeprefix("error: "), "exit_code": code}, indent=2
-            )
-        )
+        record = {"error": message.removeprefix("error: "), "exit_code": code}
+        write(json.dumps(record, indent=2), sys.stdout)
     return code
 
 

@@ -5,10 +5,13 @@ from __future__ import annotations
 import re
 import sys
 import time
+from typing import TextIO
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.text import Text
+
+from hybridkin._core.texts import visible, visible_lines
 
 _PATIENCE = 15.0  # seconds between two lines of progress in files and pipes
 _LONG = 30.0  # seconds of a stage from which on the remaining time is of interest
@@ -37,6 +40,7 @@ class Stages:
         """Report a stage, and how much of it is done."""
         if self.quiet:
             return
+        what = visible(what)
         now = time.monotonic()
         if self._what != what:
             self._end()
@@ -68,7 +72,7 @@ class Stages:
         """Print text, unless only what is important is asked for."""
         self._end()
         if important or not self.quiet:
-            print(text, file=sys.stderr)
+            write(text, sys.stderr)
 
     def warn(self, message: object, *_: object) -> None:
         """Print a warning, of those that differ in numbers only the first."""
@@ -92,7 +96,18 @@ class Stages:
         self.close()
 
     def _line(self, text: str) -> None:
-        self._console.print(Text(f"hybridkin: {text}"), soft_wrap=True)
+        shown = visible_lines(f"hybridkin: {text}").replace("\n", "\n  ")
+        self._console.print(Text(shown), soft_wrap=True)
+
+
+def write(text: str, to: TextIO, *, end: str = "\n", indent: str = "") -> None:
+    """Write text, in which a user's text cannot steer the terminal; all writing goes here.
+
+    Further lines are indented, so that none looks like one of its own.
+    """
+    print(
+        visible_lines(text).replace("\n", f"\n{indent}"), end=end, file=to, flush=True
+    )
 
 
 def _in_words(seconds: float) -> str:

@@ -23,12 +23,13 @@ import numpy as np
 
 import hybridkin  # its folders are opened when used: help comes at once
 from hybridkin._core.files import write_file
+from hybridkin._core.texts import visible
 from hybridkin._core.turns import one_thread
 from hybridkin._core.units import METRES
 from hybridkin.cli import _demo as demo
 from hybridkin.cli._init import answered, description
 from hybridkin.cli._parser import failed, parser
-from hybridkin.cli._terminal import Stages
+from hybridkin.cli._terminal import Stages, write
 
 if TYPE_CHECKING:
     from hybridkin.chains.chain import Chain
@@ -78,7 +79,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if report.paths and not arguments.json:
         text = "\n  ".join([f"{text}\n\nWrote", *map(str, report.paths)])
     try:
-        print(text, flush=True)
+        write(text, sys.stdout)
     except BrokenPipeError:  # `head` has what it wants
         # For the flush at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -180,12 +181,8 @@ def _replaced_model(arguments: argparse.Namespace) -> str:
         f"the model of {datetime.fromtimestamp(model.stat().st_mtime):%Y-%m-%d %H:%M}"
     )
     if sys.stdin.isatty() and not arguments.force and not arguments.json:
-        print(
-            f"Replace {words} in {arguments.out}? [y/N]: ",
-            end="",
-            file=sys.stderr,
-            flush=True,
-        )
+        question = f"Replace {words} in {visible(arguments.out)}? [y/N]: "
+        write(question, sys.stderr, end="")
         if input().strip().lower() not in ("y", "yes"):
             raise FileExistsError(
                 f"{arguments.out} keeps {words}; name another folder by --out."
@@ -363,11 +360,16 @@ def _init(arguments: argparse.Namespace, stages: Stages) -> _Result:
         look.append(str(log))
     fit = ["hybridkin", "fit", str(log or "log.csv"), "--robot", str(out)]
     report.text(
-        f"Columns: actuators {', '.join(log_format.q)}; tip {', '.join(log_format.x)}; motion "
-        f"{log_format.groups or '(none)'}.",
-        f"Read through {out}, and look whether every actuator bends the robot the "
-        f"right way:\n$ {shlex.join(look)}",
-        f"Then fit a model:\n$ {shlex.join(fit)} --out model",
+        "Columns: actuators {q}; tip {x}; motion {groups}.",
+        "Read through {out}, and look whether every actuator bends the robot the right way:\n"
+        "$ {look}",
+        "Then fit a model:\n$ {fit} --out model",
+        q=", ".join(log_format.q),
+        x=", ".join(log_format.x),
+        groups=log_format.groups or "(none)",
+        out=out,
+        look=shlex.join(look),
+        fit=shlex.join(fit),
     )
     write_file(out, partial(Path.write_text, data=text, encoding="utf-8"))
     report.paths = [out]

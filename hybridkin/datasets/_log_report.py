@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridkin._core.stored import plain
+from hybridkin._core.texts import visible
 
 SEVERITIES = ("error", "warning", "note")
 MISREAD = ("units", "order", "sign", "numbering", "axes", "size")
@@ -134,7 +135,10 @@ class LogReport:
         motions = "motions not named"
         if self.n_motions is not None:
             motions = f"{self.n_motions} motions"
-        head = f"Log {self.source}: {self.n_rows} rows, {motions}, {self.n_actuators} actuators"
+        head = (
+            f"Log {visible(self.source)}: {self.n_rows} rows, {motions}, "
+            f"{self.n_actuators} actuators"
+        )
         if self.duration is not None:
             head += f", {self.duration:.4g} s"
         scale, unit = _SHOWN_IN.get(self.q_unit, (1.0, ""))
@@ -145,8 +149,8 @@ class LogReport:
         lines = [head, f"  q from {low:.4g} to {high:.4g}{unit}, {tips}"]
         for finding in self.findings:
             title = f"  {finding.severity.upper():8s} {finding.kind}: "
-            lines.append(_filled(title, finding.message))
-            lines.append(_filled(_ARROW, finding.advice))
+            lines.append(_filled(title, visible(finding.message)))
+            lines.append(_filled(_ARROW, visible(finding.advice)))
         lines.append(f"  {self.summary()}")
         return "\n".join(lines)
 

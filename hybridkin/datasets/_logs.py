@@ -26,6 +26,7 @@ from hybridkin._core.arrays import (
     real_array,
 )
 from hybridkin._core.commands import Commands
+from hybridkin._core.texts import csv_cell
 from hybridkin._core.units import METRES, UNITS
 from hybridkin.datasets._log_report import named_rows
 from hybridkin.datasets._npz import arrays_of, check_expansion
@@ -356,6 +357,9 @@ class _Table(NamedTuple):
             raise TypeError(
                 f"`groups`, `runs` and `time` must be names of columns, got {name!r:.80}."
             )
+        written = csv_cell(name).strip()  # as our own tables hold it
+        if name not in self.header and written in self.header:
+            name = written
         count = self.header.count(name)
         path = str(self.path)
         if count > 1:
@@ -447,7 +451,8 @@ def _read_text(path: Path, delimiter: str | None) -> _Table:
         )
     try:
         with open(path, encoding="utf-8-sig", newline="") as file:
-            delimiter = delimiter or max(_DELIMITERS, key=file.readline().count)
+            unquoted = re.sub('"[^"]*("|$)', "", file.readline())
+            delimiter = delimiter or max(_DELIMITERS, key=unquoted.count)
             file.seek(0)
             reader = csv.reader(file, delimiter=delimiter)
             rows = [

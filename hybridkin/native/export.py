@@ -29,6 +29,7 @@ from hybridkin._core.kernel_numbers import (
 from hybridkin._core.model import ForwardModel, as_forward_model
 from hybridkin._core.plan import NoKernel, Plan
 from hybridkin._core.rotations import rotation
+from hybridkin._core.texts import c_comment, markdown
 from hybridkin._core.version import __version__
 
 _FOLDER = Path(__file__).parent
@@ -177,7 +178,10 @@ def export_c(
                 f"`folder` has a {path.name} of another origin; use another."
             )
     measured = _measured(f"{name}.c", texts)
-    texts["README.md"] = filled("README.md", {**project.entries, "MEASURED": measured})
+    entries = {**project.entries, "MEASURED": measured}
+    entries["TITLE"] = markdown(project.title)
+    entries["ABOUT_Q"] = markdown(project.about_q)
+    texts["README.md"] = filled("README.md", entries)
     writers = {file: partial(Path.write_text, data=t) for file, t in texts.items()}
     write_files(folder, writers)
     return paths
@@ -194,8 +198,10 @@ class CProject(NamedTuple):
         The numbers.
     home : ndarray of shape (n,)
         A typical q, within the limits.
+    title, about_q : str
+        Class of the model, and unit and sign of q, as given.
     entries : dict
-        What templates are filled with.
+        What templates of C code are filled with.
     texts : dict
         Header, source, test and CMakeLists.txt by the name of the file.
     """
@@ -203,6 +209,8 @@ class CProject(NamedTuple):
     controller: _Controller | None
     plan: Plan
     home: NDArray
+    title: str
+    about_q: str
     entries: Entries
     texts: dict[str, str]
 
@@ -246,12 +254,13 @@ def c_project(
         f"{name}_test.c": "check.c",
     }
     sources["CMakeLists.txt"] = "CMakeLists.txt"
+    title = type(model).__name__
     entries: Entries = {
         "NAME": name,
         "GUARD": name.upper(),
-        "TITLE": type(model).__name__,
+        "TITLE": c_comment(title),
         "VERSION": __version__,
-        "ABOUT_Q": about_q.replace("*/", "* /"),
+        "ABOUT_Q": c_comment(about_q),
         "REAL": _REAL[dtype],
         "N": plan.n_inputs,
         "TOL": _TOLERANCE[dtype],
@@ -265,7 +274,7 @@ def c_project(
 
     texts = {file: filled(template, entries) for file, template in sources.items()}
     home = _middle(modules[0], plan, controller)[0].astype(dtype).astype(float)
-    return CProject(controller, plan, home, entries, texts)
+    return CProject(controller, plan, home, title, about_q, entries, texts)
 
 
 def filled(template: str, entries: Mapping[str, object]) -> str:

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridkin._core.files import write_file
+from hybridkin._core.texts import xml_text
 from hybridkin._core.version import __version__
 from hybridkin.native.export import (
     ABOUT_Q,
@@ -155,7 +156,7 @@ def _variables(project: CProject) -> list[Variable]:
     n = plan.n_inputs
     if project.controller is None:
         m = plan.n_outputs
-        about_q = str(project.entries["ABOUT_Q"])
+        about_q = project.about_q
         return [
             Variable("q", "input", about_q, (n,), project.home),
             Variable("x", "output", "tip [m]", (m,)),
@@ -177,7 +178,7 @@ def _variables(project: CProject) -> list[Variable]:
         Variable("gain", "parameter", "of the error [1/s]", (), number(gain)),
         Variable("beta", "parameter", "of the posture [1/s]", (), number(beta)),
         Variable("memory", "parameter", "of measurements [s]", (), number(0.0)),
-        Variable("command", "output", str(project.entries["ABOUT_Q"]), (n,)),
+        Variable("command", "output", project.about_q, (n,)),
         Variable("tip", "output", "of the model at the command, as target", width),
         Variable("error", "output", "distance to the target [m]", ()),
         Variable("status", "output", "0 free, 1 at limits, 2 held", ()),
@@ -231,7 +232,7 @@ def _description(project: CProject, variables: list[Variable], token: str) -> by
         fmiVersion="3.0",
         modelName=name,
         instantiationToken=token,
-        description=f"{project.entries['TITLE']}. {project.entries['ABOUT_Q']}",
+        description=xml_text(f"{project.title}. {project.about_q}"),
         generationTool=f"hybridkin {__version__}",
     )
     unit = SubElement(
@@ -261,7 +262,7 @@ def _description(project: CProject, variables: list[Variable], token: str) -> by
             name=variable.name,
             valueReference=str(reference),
             causality=variable.causality,
-            description=variable.about,
+            description=xml_text(variable.about),
         )
         if variable.causality == "parameter":
             entry.set("variability", "tunable")

@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 
 from hybridkin._core.files import write_files
+from hybridkin._core.texts import matlab_comment
 from hybridkin.native.export import ABOUT_Q, c_project, filled
 
 
@@ -54,7 +55,8 @@ def export_mex(
     """
     project = c_project(model, name=name, about_q=about_q)
     entries = dict(project.entries)
-    about_lines = textwrap.wrap(str(entries["ABOUT_Q"]), 92)
+    entries["TITLE"] = matlab_comment(project.title)
+    about_lines = textwrap.wrap(matlab_comment(about_q), 92)
     entries["ABOUT_Q_HELP"] = "\n%   ".join(about_lines)
     parts = {
         "STEP_MEX": "mex_step.c",

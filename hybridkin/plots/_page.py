@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 
+from hybridkin._core.texts import visible
 from hybridkin.plots._canvas import COLORS
 from hybridkin.plots._scene import Line, Scene
 
@@ -62,7 +63,7 @@ def _recorded(
         _Stroke(server.scene, line.label, line, longest).show(0)
     strokes = []
     for k, line in enumerate(scene.moving):
-        name = line.label or f"part {k + 1}"
+        name = visible(line.label or f"part {k + 1}").replace("/", "\u2215")
         strokes.append(_Stroke(server.scene, name, line, longest))
     above = np.append(middle[:2], scene.high[2] / longest + 0.08)
     caption = server.scene.add_label("/caption", "", position=above)

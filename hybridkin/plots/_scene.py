@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
+from hybridkin._core.texts import plot_label
 from hybridkin.plots._canvas import COLORS, Space, label_space, small_legend
 
 
@@ -64,7 +65,9 @@ class Stage:
         self.trail = trail[0]
         self.artists = []
         for line in scene.moving:
-            artists = ax.plot([], [], [], label=line.label or None, **line.look())
+            artists = ax.plot(
+                [], [], [], label=plot_label(line.label) or None, **line.look()
+            )
             self.artists += artists
         small_legend(ax, loc="upper left", bbox_to_anchor=(-0.25, 1.0))
         self.cursor = None

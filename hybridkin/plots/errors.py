@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Self
 
+from hybridkin._core.texts import plot_label
 from hybridkin.plots._arrays import distance, named, plain, positions
 from hybridkin.plots._canvas import (
     Display,
@@ -119,7 +120,7 @@ class ErrorHistogramDisplay(_ErrorDisplay):
         edges = np.linspace(0.0, top, _BINS + 1).tolist()
         for look, (name, values) in zip(looks_of(finite), finite.items(), strict=True):
             color = look["color"]
-            label = f"{name}: mean {values.mean():.2f}, max {values.max():.1f} {unit}"
+            label = f"{plot_label(name)}: mean {values.mean():.2f}, max {values.max():.1f} {unit}"
             ax.hist(values, edges, histtype="stepfilled", color=color, alpha=0.25)
             ax.hist(values, edges, histtype="step", label=label, **look)
             ax.axvline(values.mean(), color=color, linestyle="--", linewidth=1.0)
@@ -186,7 +187,7 @@ class ErrorBoxDisplay(_ErrorDisplay):
         largest = np.array([errors.max() for errors in values])
         ax.plot(means, places, "o", color="black", label="mean")
         ax.plot(largest, places, "x", color="black", label="maximum")
-        ax.set_yticks(places, [*finite])
+        ax.set_yticks(places, [*map(plot_label, finite)])
         ax.set(xlabel=f"tip error [{unit}]")
         if log:
             most = largest.max()

@@ -14,6 +14,7 @@ from sklearn.utils import check_random_state
 from sklearn.utils.validation import has_fit_parameter
 from typing_extensions import Self
 
+from hybridkin._core.texts import plot_label
 from hybridkin.plots._arrays import distance, named, plain, positions
 from hybridkin.plots._canvas import (
     MARKERS,
@@ -194,7 +195,7 @@ class LearningCurveDisplay(Display):
                 form,
                 color=color,
                 markersize=4,
-                label=name,
+                label=plot_label(name),
             )
             if values.shape[1] > 1:
                 low = np.nanmin(values, axis=1)

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Self
 
 from hybridkin._core.arrays import whole
+from hybridkin._core.texts import plot_label
 from hybridkin.plots._arrays import distance, plain, shaped, shaped_or_none
 from hybridkin.plots._canvas import (
     COLORS,
@@ -380,7 +381,7 @@ class BackboneDisplay(Display):
         """Draw all parts of the only configuration."""
         for line in self.lines():
             points = scale * line.points[0]
-            space.plot(*points.T, label=line.label or None, **line.look())
+            space.plot(*points.T, label=plot_label(line.label) or None, **line.look())
         if self.disks is not None and self.disks.size:
             disks = scale * self.disks[0]
             space.add_collection3d(

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Self
 
 from hybridkin._core.arrays import one_of, whole
+from hybridkin._core.texts import plot_label
 from hybridkin.plots._arrays import (
     distance,
     named,
@@ -166,7 +167,7 @@ class TrackingDisplay(Display):
         steps, when = steps_of(self.t, len(self.target))
         for name, x, look in self._looks():
             lines = ax.plot(steps, scale * x, **{**look, "linewidth": 1.2})
-            lines[0].set_label(name)
+            lines[0].set_label(plot_label(name))
         ax.plot(steps, scale * self.target, color="black", linewidth=1.0)
         for letter, values in zip("xyz", scale * self.target.T, strict=True):
             if np.isfinite(values).any():
@@ -222,7 +223,9 @@ class TrackingDisplay(Display):
             if finite.size:
                 least.append(finite.min())
                 label = f"{label}: {finite.mean():.3g} {unit}"
-            ax.plot(steps, level, color="black", linestyle=style, label=label)
+            ax.plot(
+                steps, level, color="black", linestyle=style, label=plot_label(label)
+            )
         if least:
             ax.set_yscale("log")
             ax.set_ylim(bottom=max(ax.get_ylim()[0], 1e-4 * min(least)))
@@ -241,7 +244,7 @@ class TrackingDisplay(Display):
         error = scale * distance(self.tracks[name], self.target)
         finite = error[np.isfinite(error)]
         mean = finite.mean() if finite.size else np.nan
-        return f"{name}: mean error {mean:.{decimals(mean)}f} {unit}"
+        return f"{plot_label(name)}: mean error {mean:.{decimals(mean)}f} {unit}"
 
 
 class ActuatorDisplay:
@@ -371,7 +374,7 @@ class ActuatorDisplay:
         parts = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
         for k, (ax, columns) in enumerate(zip(axes, parts, strict=True)):
             self._draw_segment(ax, steps, columns, scale)
-            ax.set(ylabel=f"segment {k + 1} [{unit}]")
+            ax.set(ylabel=f"segment {k + 1} [{plot_label(unit)}]")
         if self.names:
             for ax in axes:
                 small_legend(ax, loc="center left", bbox_to_anchor=(1.0, 0.5))
@@ -398,13 +401,13 @@ class ActuatorDisplay:
         for i, (name, q) in enumerate(self.paths.items()):
             values = (scale * q)[:, columns]
             lines = ax.plot(steps, values, **{**looks[i], "linewidth": 1.2})
-            lines[0].set_label(name)
+            lines[0].set_label(plot_label(name))
             if self.names:
                 for line, color in zip(lines, colors, strict=True):
                     line.set(color=color, linestyle="-:"[i % 2])
             if self.names and i == 0:
                 for line, column in zip(lines, columns, strict=True):
-                    line.set_label(self.names[column])
+                    line.set_label(plot_label(self.names[column]))
         if self.limits is not None:
             look = {"colors": 2 * colors, "linestyles": "dashed", "linewidth": 0.8}
             values = (scale * self.limits)[:, columns].ravel()

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 import io
+import itertools
 import time
 from collections.abc import Callable
 from contextlib import redirect_stdout
@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Self
 
+from hybridkin._core.texts import csv_table, markdown, visible
 from hybridkin.chains.chain import Chain
 from hybridkin.datasets import Log
 from hybridkin.hybrid.estimator import HybridForwardModel
@@ -274,8 +275,9 @@ class LiveView:
         low, high = np.sort(ends, axis=0)
         start = robot.q / self._factor
         self._sliders = []
-        with self._server.gui.add_folder(f"Actuators [{log_format.q_unit}]"):
-            for k, name in enumerate(log_format.q):
+        unit = visible(log_format.q_unit)
+        with self._server.gui.add_folder(f"Actuators [{unit}]"):
+            for k, name in enumerate(map(visible, log_format.q)):
                 step = max((high[k] - low[k]) / 1000.0, 1e-12)
                 end = max(high[k], low[k] + step)
                 slider = self._server.gui.add_slider(name, low[k], end, step, start[k])
@@ -318,12 +320,11 @@ class LiveView:
             self.go_to(values * self._factor)
 
     def _download(self, event: Any) -> None:
-        text = io.StringIO()
-        writer = csv.writer(text)
-        writer.writerow(["t", *self.robot.loaded.log_format().q])
+        rows = []
         for k, row in enumerate(self.robot.commands()):
-            writer.writerow([f"{k / RATE:.2f}", *(f"{value:.9g}" for value in row)])
-        event.client.send_file_download("commands.csv", text.getvalue().encode())
+            rows.append([f"{k / RATE:.2f}", *(f"{value:.9g}" for value in row)])
+        text = csv_table(["t", *self.robot.loaded.log_format().q], rows)
+        event.client.send_file_download("commands.csv", text.encode())
 
     def _expected(self) -> float:
         """Return the error to expect of the robot here [m], 0 if it is not known."""
@@ -337,7 +338,7 @@ class LiveView:
             self._tick_until_closed()
         except Exception as error:
             self._failure = error
-            self._words.content = f"**The view has stopped: {error}**"
+            self._words.content = f"**The view has stopped: {markdown(error)}**"
 
     def _tick_until_closed(self) -> None:
         """Tick while something moves, else wait."""
@@ -392,7 +393,8 @@ class LiveView:
             color = GREEN
         if tuple(self._ball.color) != color:
             self._ball.color = color
-        at_limits = np.array(robot.loaded.log_format().q)[robot.held]
+        names = map(markdown, robot.loaded.log_format().q)
+        at_limits = itertools.compress(names, robot.held)
         lines = [f"**{situation.words}**"]
         if np.isfinite(situation.error):
             lines.append(f"error {1e3 * situation.error:.2f} mm")
@@ -400,7 +402,7 @@ class LiveView:
         lines.append(f"{self.ticks_per_second:.0f} ticks/s")
         motion = self._motion
         if motion is not None:
-            lines.append(f"moving: {motion.label}")
+            lines.append(f"moving: {markdown(motion.label)}")
         self._words.content = "<br>".join(lines)
         for slider, value in zip(self._sliders, robot.q / self._factor, strict=True):
             if abs(slider.value - value) > 0.5 * slider.step:

@@ -203,10 +203,11 @@ class Calibration:
             "position.",
         )
         write_parameters(report, self.entries)
-        report.text(*(f"Warning: {message}" for message in self.warnings))
+        for message in self.warnings:
+            report.text("Warning: {message}", message=message)
         if self.unidentified:
             report.text("What the log does not identify:")
-            report.text("\n".join(f"- {line}" for line in self.unidentified))
+            report.items(self.unidentified)
 
 
 def deviations(start: Chain, result: CalibrationResult) -> Iterator[str]:

@@ -9,6 +9,7 @@ from typing import Any
 
 from torch import Tensor
 
+from hybridkin._core.texts import visible
 from hybridkin.chains.robots import Limits, LogFormat
 from hybridkin.hybrid.cv_results import CvResults
 from hybridkin.workflow.errors import HeldOutErrors
@@ -16,6 +17,7 @@ from hybridkin.workflow.model import LoadedModel, hysteresis_in_words, play_widt
 from hybridkin.workflow.report import Report, listed
 
 _NAMES = 24  # width of the names of rows
+_NOTES = ("log", "rows", "n_whole", "n_motions", "saved", "chosen")
 _PER_TIME = {"dq_max": "/s", "ddq_max": "/s^2"}
 
 
@@ -110,13 +112,21 @@ def describe(loaded: LoadedModel) -> Report[Description]:
         if limits is not None:
             _write_limits(report, name, limits, log)
     report.text(
-        f"Logs: q in {log.q_unit}, q_sign {log.q_sign} ({', '.join(log.q)}), x in {log.x_unit} "
-        f"({', '.join(log.x)})."
+        "Logs: q in {unit}, q_sign {sign} ({q}), x in {x_unit} ({x}).",
+        unit=log.q_unit,
+        sign=log.q_sign,
+        q=", ".join(log.q),
+        x_unit=log.x_unit,
+        x=", ".join(log.x),
     )
     _write_training(report, record.training)
     if record.versions is not None:
         words = [f"{name} {version}" for name, version in record.versions.items()]
-        report.text(f"Saved on {record.created} by {', '.join(words)}.")
+        report.text(
+            "Saved on {date} by {versions}.",
+            date=record.created,
+            versions=", ".join(words),
+        )
     return report
 
 
@@ -124,6 +134,7 @@ def _in_lines(rows: Mapping[str, object]) -> str:
     """Return names and values, one in a line; parts are indented."""
     lines = []
     for name, value in rows.items():
+        name = visible(name)
         if isinstance(value, Mapping):
             lines += [f"{name}:", textwrap.indent(_in_lines(value), "  ")]
         elif value is not None:
@@ -143,7 +154,8 @@ def _write_limits(
     for name, values in vars(limits.scaled(1 / log.q_factor)).items():
         if values is not None:
             numbers = listed(values, ".4g")
-            report.text(f"{title}: {name} = {numbers}{unit}{_PER_TIME.get(name, '')}.")
+            value = f"{numbers}{unit}{_PER_TIME.get(name, '')}"
+            report.text(f"{title}: {name} = {{value}}.", value=value)
 
 
 def _write_training(report: Report[Description], training: Mapping[str, Any]) -> None:
@@ -151,9 +163,9 @@ def _write_training(report: Report[Description], training: Mapping[str, Any]) ->
     if "held_out" not in training:
         return
     report.text(
-        f"Fitted to {training['log']}: {training['rows']} rows of {training['n_whole']}, "
-        f"{training['n_motions']} motions. Model: {training['saved']}, {training['chosen']}. "
-        "Errors on held-out motions:"
+        "Fitted to {log}: {rows} rows of {n_whole}, {n_motions} motions. Model: {saved}, "
+        "{chosen}. Errors on held-out motions:",
+        **{name: training[name] for name in _NOTES},
     )
     errors = {}
     for name, entry in training["held_out"].items():

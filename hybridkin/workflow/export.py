@@ -69,7 +69,7 @@ def export_model(
         record["limits"] = limits
         report.text(f"Steps of {dt:g} s within limits: {limits.source}.")
     about_q = _about_q(loaded)
-    report.text(about_q)
+    report.text("{about_q}", about_q=about_q)
     words = {"name": name, "about_q": about_q}
     if kind == "fmu":
         report.paths = [export_fmu(model, out, **words)]

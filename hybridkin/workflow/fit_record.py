@@ -186,7 +186,8 @@ def write_model(report: Report[FitRecord]) -> None:
         f"chosen in each fold: {'; '.join(by_fold)}."
     )
     write_markers(report, record.markers, f"{record.saved}, on held-out motions")
-    report.text(*record.words)
+    for words in record.words:
+        report.text("{words}", words=words)
     if record.tried:
         _write_tried(report, record)
     if record.calibration is not None:

@@ -188,7 +188,13 @@ def write_check(report: Report, check: LogReport) -> None:
     """Add the findings of the check of a log to a report."""
     report.text(f"## The log\n\nThe check of the log found {check.summary()}.")
     for f in check.findings:
-        report.text(f"- **{f.severity}**, {f.kind}: {f.message} Advice: {f.advice}")
+        report.text(
+            "- **{severity}**, {kind}: {message} Advice: {advice}",
+            severity=f.severity,
+            kind=f.kind,
+            message=f.message,
+            advice=f.advice,
+        )
 
 
 def checked(log: Log, chain: Chain | None, base_is_free: bool) -> MeasuredLog:

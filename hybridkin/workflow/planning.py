@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -119,15 +118,9 @@ def next_rows(
     )
     log = loaded.log_format()
     sent = log.to_log(loaded.commands(candidates[rows]))
-    write_commands = partial(
-        np.savetxt,
-        X=np.column_stack([sent, errors / METRES[log.x_unit]]),
-        fmt="%.9g",
-        delimiter=",",
-        header=",".join([*log.q, "expected_error"]),
-        comments="",
-        encoding="utf-8",
+    numbers = np.column_stack([sent, errors / METRES[log.x_unit]])
+    report.table_file(
+        "next.csv", [*log.q, "expected_error"], np.char.mod("%.9g", numbers)
     )
-    report.file("next.csv", write_commands)
     report.write(out)
     return report

@@ -7,7 +7,7 @@ import math
 import os
 import platform
 import textwrap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import is_dataclass
 from functools import partial
@@ -20,6 +20,14 @@ from numpy.typing import NDArray
 from hybridkin._core.arrays import as_path
 from hybridkin._core.files import Writer, write_files
 from hybridkin._core.stored import plain
+from hybridkin._core.texts import (
+    csv_table,
+    markdown,
+    markdown_block,
+    markdown_cell,
+    visible,
+    visible_lines,
+)
 from hybridkin.datasets import LogReport
 
 if TYPE_CHECKING:
@@ -31,10 +39,9 @@ Progress = Callable[[str, int, int], None]
 Record = TypeVar("Record")
 
 _WIDTH = 98
-_FENCE = "```"
 
 
-class _Figure(Protocol):
+class _Picture(Protocol):
     def savefig(self, path: Path, /) -> object: ...
 
 
@@ -99,27 +106,30 @@ class Report(Generic[Record]):
         self.title = title
         self.record = record
         self.paths: list[Path] = []
-        self._blocks = [f"# {title}"]
+        self._blocks: list[_Block] = [_Text("# {title}", {"title": title})]
         self._files: dict[str, Writer] = {}
 
-    def text(self, *paragraphs: str) -> None:
-        """Add paragraphs."""
-        self._blocks += paragraphs
+    def text(self, *paragraphs: str, **names: object) -> None:
+        """Add paragraphs of Markdown.
+
+        A user's text is no Markdown: give it by a name, as in
+        ``text("Fitted to {log}.", log=path)``. Such a field is shown as text, whatever it holds.
+        """
+        for paragraph in paragraphs:
+            self._blocks.append(_Text(paragraph, names))
+
+    def items(self, lines: Sequence[str]) -> None:
+        """Add a list of texts, which are shown as they are."""
+        names = {f"line_{k}": line for k, line in enumerate(lines)}
+        self.text("\n".join(f"- {{{name}}}" for name in names), **names)
 
     def verbatim(self, text: str) -> None:
         """Add lines as they are."""
-        self._blocks.append(f"{_FENCE}\n{text}\n{_FENCE}")
+        self._blocks.append(_Verbatim(text))
 
     def table(self, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
         """Add a table, the first column aligned to the left, the others to the right."""
-        widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
-        rule = ["-" * width for width in widths]
-        lines = []
-        for name, *cells in [header, rule, *rows]:
-            aligned = map(str.rjust, cells, widths[1:])
-            line = " | ".join([name.ljust(widths[0]), *aligned])
-            lines.append(f"| {line} |")
-        self._blocks.append("\n".join(lines))
+        self._blocks.append(_Table([header, *rows]))
 
     def errors(self, entries: Mapping[str, Errors], columns: Sequence[str]) -> None:
         """Add a table of tip errors [mm] by name; `columns` are attributes of the errors."""
@@ -134,30 +144,29 @@ class Report(Generic[Record]):
             rows.append(row)
         self.table(["tip error [mm]", *(column.title for column in shown)], rows)
 
-    def figure(self, name: str, figure: _Figure, caption: str) -> None:
+    def figure(self, name: str, figure: _Picture, caption: str) -> None:
         """Add a figure that becomes `name`.png."""
-        self._blocks.append(f"![{caption}]({name}.png)\n\n*{caption}*")
+        self._blocks.append(_Figure(name, caption))
         self.file(f"{name}.png", figure.savefig)
 
     def file(self, name: str, write: Writer) -> None:
         """Add a file; `write` gets its path and writes it."""
         self._files[name] = write
 
+    def table_file(
+        self, name: str, header: Sequence[str], rows: Iterable[Sequence[object]]
+    ) -> None:
+        """Add a CSV file, see `csv_table`."""
+        self.file(name, partial(_write_text, text=csv_table(header, rows)))
+
     def markdown(self) -> str:
         """Return the report as Markdown text."""
-        return "\n\n".join(self._blocks) + "\n"
+        return "\n\n".join(block.markdown() for block in self._blocks) + "\n"
 
     def plain(self) -> str:
         """Return the report as text for a terminal: without figures, with wrapped lines."""
-        texts = []
-        for block in self._blocks:
-            if block.startswith(_FENCE):
-                texts.append(block.strip(f"{_FENCE}\n"))
-            elif block.startswith("|"):
-                texts.append(block)
-            elif not block.startswith("!["):
-                texts.append(_wrapped(block))
-        return "\n\n".join(texts)
+        texts = [block.plain() for block in self._blocks]
+        return "\n\n".join(text for text in texts if text is not None)
 
     def json(self) -> str:
         """Return the record as JSON, with the title, versions and the written files."""
@@ -184,18 +193,88 @@ class Report(Generic[Record]):
         }
 
 
+class _Block(Protocol):
+    """A part of a report, in Markdown and as text for a terminal; None: not shown there."""
+
+    def markdown(self) -> str: ...
+    def plain(self) -> str | None: ...
+
+
+class _Text(NamedTuple):
+    """A paragraph of Markdown, with fields for texts of a user."""
+
+    template: str
+    names: Mapping[str, object]
+
+    def markdown(self) -> str:
+        return self._filled(self.template, markdown)
+
+    def plain(self) -> str:
+        lines: list[str] = []
+        wrapper = textwrap.TextWrapper(_WIDTH, break_on_hyphens=False)
+        for line in self.template.replace("**", "").splitlines():
+            wrapper.subsequent_indent = "  " if line.startswith("- ") else ""
+            lines += wrapper.wrap(self._filled(line.lstrip("# "), visible))
+        return "\n".join(lines)
+
+    def _filled(self, template: str, show: Callable[[object], str]) -> str:
+        if not self.names:
+            return template
+        shown = {name: show(text) for name, text in self.names.items()}
+        return template.format_map(shown)
+
+
+class _Verbatim(NamedTuple):
+    """Lines as they are."""
+
+    text: str
+
+    def markdown(self) -> str:
+        return markdown_block(self.text)
+
+    def plain(self) -> str:
+        return visible_lines(self.text)
+
+
+class _Table(NamedTuple):
+    """A table; its first row is the header."""
+
+    rows: Sequence[Sequence[str]]
+
+    def markdown(self) -> str:
+        return self._aligned(markdown_cell)
+
+    def plain(self) -> str:
+        return self._aligned(visible)
+
+    def _aligned(self, show: Callable[[object], str]) -> str:
+        header, *rows = [[*map(show, row)] for row in self.rows]
+        widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
+        rule = ["-" * width for width in widths]
+        lines = []
+        for name, *cells in [header, rule, *rows]:
+            aligned = map(str.rjust, cells, widths[1:])
+            line = " | ".join([name.ljust(widths[0]), *aligned])
+            lines.append(f"| {line} |")
+        return "\n".join(lines)
+
+
+class _Figure(NamedTuple):
+    """A picture beside the report."""
+
+    name: str
+    caption: str
+
+    def markdown(self) -> str:
+        caption = markdown(self.caption)
+        return f"![{caption}]({self.name}.png)\n\n*{caption}*"
+
+    def plain(self) -> None:
+        return None
+
+
 def _write_text(path: Path, text: str) -> None:
-    path.write_text(text, encoding="utf-8")
-
-
-def _wrapped(text: str) -> str:
-    """Return lines of Markdown as text, wrapped to the width of a terminal."""
-    lines: list[str] = []
-    wrapper = textwrap.TextWrapper(_WIDTH, break_on_hyphens=False)
-    for line in text.replace("**", "").splitlines():
-        wrapper.subsequent_indent = "  " if line.startswith("- ") else ""
-        lines += wrapper.wrap(line.lstrip("# "))
-    return "\n".join(lines)
+    path.write_text(text, encoding="utf-8", newline="")
 
 
 def check_out(
@@ -243,7 +322,10 @@ def json_text(record: object) -> str:
     str
         JSON text.
     """
-    return json.dumps(plain(record), indent=2, allow_nan=False, default=_in_json)
+    text = json.dumps(plain(record), indent=2, allow_nan=False, default=_in_json)
+    return text.replace(
+        "\x7f", "\\u007f"
+    )  # the one control character that JSON lets pass
 
 
 def _in_json(value: object) -> Any:

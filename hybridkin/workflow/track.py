@@ -7,7 +7,6 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -102,9 +101,10 @@ def _write(report: Report[TrackRecord], loaded: LoadedModel, better: str) -> Non
     log = loaded.log_format()
     sign = ", shortening positive" if np.all(np.less(log.q_sign, 0)) else ""
     report.text(
-        f"track.csv: q in {log.q_unit}{sign}; x, target and error in {log.x_unit}; t in s. Its "
-        f"first {record.lead_in} rows, with the status LEAD_IN, move from the start of the robot "
-        "to the path."
+        f"track.csv: q in {{unit}}{sign}; x, target and error in {log.x_unit}; t in s. Its first "
+        f"{record.lead_in} rows, with the status LEAD_IN, move from the start of the robot to the "
+        "path.",
+        unit=log.q_unit,
     )
     if loaded.hybrid is not None and loaded.play is not None:
         report.text(
@@ -113,7 +113,7 @@ def _write(report: Report[TrackRecord], loaded: LoadedModel, better: str) -> Non
             "is the motion of the actuators."
         )
     if loaded.plane_in_words():
-        report.text(loaded.plane_in_words())
+        report.text("{plane}", plane=loaded.plane_in_words())
     words = "The error of the robot is not known: the model has no held-out errors"
     if record.expected:
         mean = millimetres(record.expected["mean"], ".2g")
@@ -212,14 +212,8 @@ def track_path(
         commands["actuator"] = whole.effective
     _add_path(report, loaded, track)
     _add_commands(report, domain, whole.t, commands, n_lead)
-    rows = partial(
-        _write_track,
-        whole,
-        commands,
-        [LEAD_IN] * n_lead + statuses,
-        loaded.log_format(),
-    )
-    report.file("track.csv", rows)
+    statuses = [LEAD_IN] * n_lead + statuses
+    _add_track(report, whole, commands, statuses, loaded.log_format())
     report.write(out)
     return report
 
@@ -395,14 +389,14 @@ def read_track(path: str | Path, log_format: LogFormat) -> Log:
     return load_log(file, **columns.reading)
 
 
-def _write_track(
+def _add_track(
+    report: Report[TrackRecord],
     track: Track,
     commands: Mapping[str, NDArray],
     statuses: Sequence[str],
     log: LogFormat,
-    file: Path,
 ) -> None:
-    """Write commands, and with backlash the motion of the actuators, point by point."""
+    """Add commands, and with backlash the motion of the actuators, point by point."""
     lengths = np.column_stack([track.x, track.target, track.error]) / METRES[log.x_unit]
     head = [TIME, *log.q, *log.x, *TARGET, "error", "status"]
     columns = [
@@ -414,10 +408,7 @@ def _write_track(
     if "actuator" in commands:
         head += [f"effective_{name}" for name in log.q]
         columns += [*_text(log.to_log(commands["actuator"]))]
-    with open(file, "w", encoding="utf-8", newline="") as lines:
-        writer = csv.writer(lines, lineterminator="\n")
-        writer.writerow(head)
-        writer.writerows(zip(*columns, strict=True))
+    report.table_file("track.csv", head, zip(*columns, strict=True))
 
 
 def _text(values: NDArray) -> NDArray:
