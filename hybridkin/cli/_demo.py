@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import shlex
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 import hybridkin
+from hybridkin._core.files import write_file
 
 if TYPE_CHECKING:
     from hybridkin.workflow import FitRecord, Report, TrackRecord
@@ -26,7 +28,8 @@ def write_log(path: Path) -> None:
         [np.arange(_ROWS) // _BLOCK, 1e3 * data.q[rows], 1e3 * data.x[rows]]
     )
     names = "group,c1,c2,c3,c4,c5,c6,c7,c8,c9,tip_x,tip_y,tip_z"
-    np.savetxt(path, table, "%.6g", ",", header=names, comments="")
+    form = {"fmt": "%.6g", "delimiter": ",", "header": names, "comments": ""}
+    write_file(path, partial(np.savetxt, X=table, **form))
 
 
 def steps(out: Path) -> dict[str, str]:

@@ -478,6 +478,7 @@ def _animate(command: argparse.ArgumentParser) -> None:
         metavar="N",
         help="largest number of frames (150)",
     )
+    add("--force", action="store_true", help=_REPLACE_OTHERS)
 
 
 def _export(command: argparse.ArgumentParser) -> None:
@@ -513,6 +514,7 @@ def _export(command: argparse.ArgumentParser) -> None:
         metavar="S",
         help="control period [s] of the step (no step)",
     )
+    add("--force", action="store_true", help=_REPLACE_OTHERS)
     _add_limits(command)
 
 
@@ -578,7 +580,7 @@ def _add_model(
     command.add_argument("--robot", type=Path, metavar="ROBOT.toml", help=default)
 
 
-_REPLACE_OTHERS = "in --out, replace files that another command or program wrote"
+_REPLACE_OTHERS = "replace files that another command or program wrote"
 _DELIMITER = "separator of a text file (comma, semicolon or tab, by the header)"
 
 

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import hybridkin  # its folders are opened when used: help comes at once
-from hybridkin._core.files import write_file
+from hybridkin._core.files import check_outputs, write_file
 from hybridkin._core.texts import visible
 from hybridkin._core.turns import one_thread
 from hybridkin._core.units import METRES
@@ -281,6 +281,7 @@ def _animate(arguments: argparse.Namespace, stages: Stages) -> _Result:
         unit=arguments.unit,
         speed=arguments.speed,
         n_frames=arguments.frames,
+        force=arguments.force,
         progress=stages,
     )
     return report, 0
@@ -302,6 +303,7 @@ def _export(arguments: argparse.Namespace, stages: Stages) -> _Result:
         dtype=arguments.dtype,
         dt=arguments.dt,
         limits=None if arguments.dt is None else _limits(arguments, loaded),
+        force=arguments.force,
     )
     return report, 0
 
@@ -326,10 +328,8 @@ def _describe(arguments: argparse.Namespace, stages: Stages) -> _Result:
 def _init(arguments: argparse.Namespace, stages: Stages) -> _Result:
     workflow = hybridkin.workflow
     out = arguments.out
-    if out.exists() and not arguments.force:
-        raise FileExistsError(
-            f"{out} exists; name another file, or replace it with --force."
-        )
+    # Its file is made to be edited: it is the user's, and not one of an earlier `init`.
+    check_outputs([out], "init", lambda _: False, force=arguments.force)
     options = vars(arguments)
     answers, missing = answered(options, ask=False)
     if missing and sys.stdin.isatty() and not arguments.json:
@@ -371,6 +371,7 @@ def _init(arguments: argparse.Namespace, stages: Stages) -> _Result:
         look=shlex.join(look),
         fit=shlex.join(fit),
     )
+    check_outputs([out], "init", lambda _: False, force=arguments.force)
     write_file(out, partial(Path.write_text, data=text, encoding="utf-8"))
     report.paths = [out]
     return report, int(check is not None and not check.ok)

@@ -19,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hybridkin._core.files import write_files
+from hybridkin._core.files import check_outputs, write_files
 from hybridkin._core.kernel_numbers import (
     IK_LIMITED,
     IK_STAGES,
@@ -129,6 +129,7 @@ def export_c(
     name: str = "model",
     dtype: str = "float64",
     about_q: str = ABOUT_Q,
+    force: bool = False,
 ) -> list[Path]:
     """Write a model or inverse kinematics as C99 code for a controller; return the files.
 
@@ -147,6 +148,8 @@ def export_c(
         Floating-point type of the code.
     about_q : str
         Unit and sign of q in sentences, for README.md and the header.
+    force : bool, default=False
+        Replace files that hybridkin did not write.
 
     Returns
     -------
@@ -172,11 +175,7 @@ def export_c(
     project = c_project(model, name=name, dtype=dtype, about_q=about_q)
     texts = dict(project.texts)
     paths = [Path(folder) / file for file in (*texts, "README.md")]
-    for path in paths:
-        if path.exists() and "hybridkin" not in path.read_text(errors="replace"):
-            raise FileExistsError(
-                f"`folder` has a {path.name} of another origin; use another."
-            )
+    check_outputs(paths, "export", force=force)
     measured = _measured(f"{name}.c", texts)
     entries = {**project.entries, "MEASURED": measured}
     entries["TITLE"] = markdown(project.title)

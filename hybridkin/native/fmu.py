@@ -17,7 +17,7 @@ from xml.etree.ElementTree import Element, SubElement, indent, tostring
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridkin._core.files import write_file
+from hybridkin._core.files import check_outputs, write_file
 from hybridkin._core.texts import xml_text
 from hybridkin._core.version import __version__
 from hybridkin.native.export import (
@@ -74,6 +74,7 @@ def export_fmu(
     *,
     name: str = "model",
     about_q: str = ABOUT_Q,
+    force: bool = False,
 ) -> Path:
     """Write a model or inverse kinematics as a functional mock-up unit, and return the file.
 
@@ -95,6 +96,8 @@ def export_fmu(
         Name of the unit in the other tool.
     about_q : str
         Unit and sign of q in sentences, for the description of the unit.
+    force : bool, default=False
+        Replace a file that hybridkin did not write. A unit of hybridkin is replaced.
 
     Returns
     -------
@@ -105,6 +108,8 @@ def export_fmu(
     ------
     NoKernel
         If a part of the model cannot be written in C.
+    FileExistsError
+        If there is such a file that hybridkin did not write.
     RuntimeError
         Without a C compiler.
 
@@ -120,6 +125,8 @@ def export_fmu(
     >>> native.export_fmu(robots.bionic_handling_assistant(), file, name="trunk").name
     'trunk.fmu'
     """
+    path = Path(path)
+    check_outputs([path], "export", force=force)
     project = c_project(model, name=name, about_q=about_q)
     variables = _variables(project)
     texts = {f"{name}.c": project.texts[f"{name}.c"]}
@@ -139,13 +146,13 @@ def export_fmu(
 
     def write(staging: Path) -> None:
         with zipfile.ZipFile(staging, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.comment = b"Written by hybridkin."
             archive.writestr("modelDescription.xml", description)
             archive.writestr(f"binaries/{_platform()}/{name}{suffix}", library)
             archive.writestr("sources/buildDescription.xml", _build_description(name))
             for file, text in texts.items():
                 archive.writestr(f"sources/{file}", text)
 
-    path = Path(path)
     write_file(path, write)
     return path
 

@@ -6,7 +6,7 @@ import textwrap
 from functools import partial
 from pathlib import Path
 
-from hybridkin._core.files import write_files
+from hybridkin._core.files import check_outputs, write_files
 from hybridkin._core.texts import matlab_comment
 from hybridkin.native.export import ABOUT_Q, c_project, filled
 
@@ -17,6 +17,7 @@ def export_mex(
     *,
     name: str = "model",
     about_q: str = ABOUT_Q,
+    force: bool = False,
 ) -> list[Path]:
     """Write a model or inverse kinematics for MATLAB and Octave, and return the files.
 
@@ -29,11 +30,13 @@ def export_mex(
     model : ForwardModel, fitted HybridForwardModel or ELMRegressor, or InverseKinematics
         As for `export_c`.
     folder : str or Path
-        Output folder.
+        Output folder. Files of an earlier export are replaced, other files are not.
     name : str, default="model"
         Name of the function.
     about_q : str
         Unit and sign of q in sentences, for the help.
+    force : bool, default=False
+        Replace files that hybridkin did not write.
 
     Returns
     -------
@@ -44,6 +47,8 @@ def export_mex(
     ------
     NoKernel
         If a part of the model cannot be written in C.
+    FileExistsError
+        If the folder has a file with one of these names that hybridkin did not write.
 
     Examples
     --------
@@ -54,6 +59,8 @@ def export_mex(
     ['trunk.c', 'trunk.m']
     """
     project = c_project(model, name=name, about_q=about_q)
+    paths = [Path(folder) / f"{name}{suffix}" for suffix in (".c", ".m")]
+    check_outputs(paths, "export", force=force)
     entries = dict(project.entries)
     entries["TITLE"] = matlab_comment(project.title)
     about_lines = textwrap.wrap(matlab_comment(about_q), 92)
@@ -76,4 +83,4 @@ def export_mex(
         folder,
         {file: partial(Path.write_text, data=text) for file, text in texts.items()},
     )
-    return [Path(folder) / file for file in texts]
+    return paths

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from os import PathLike
 from pathlib import Path
@@ -14,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Self
 
 from hybridkin._core.arrays import whole
-from hybridkin._core.files import write_file
+from hybridkin._core.files import MARK, write_file
 from hybridkin.plots._arrays import (
     distance,
     plain,
@@ -275,8 +276,8 @@ class TrackAnimation(Display):
         scene = self._scene(unit)
         fps = speed * self.fps
         if kind == ".html":
-            text = page(scene, fps, progress)
-            write_file(path, lambda staging: staging.write_text(text, encoding="utf-8"))
+            text = page(scene, fps, progress).encode() + b"\n<!-- %s -->\n" % MARK
+            write_file(path, lambda staging: staging.write_bytes(text))
             return path
         writer = _writer(kind, fps)
         figure = Figure(figsize=_SIZE, layout="constrained")
@@ -291,6 +292,8 @@ class TrackAnimation(Display):
                     writer.grab_frame()
                     if progress is not None:
                         progress(k + 1, len(self.rows))
+            if kind == ".gif":
+                _mark(staging)
 
         write_file(path, draw)
         return path
@@ -383,6 +386,13 @@ def _stage(figure: Figure, scene: Scene) -> Stage:
     return stage
 
 
+def _mark(path: Path) -> None:
+    """Add a comment to a gif, before the byte that ends it."""
+    with open(path, "rb+") as file:
+        file.seek(-1, os.SEEK_END)
+        file.write(b"!\xfe" + bytes([len(MARK)]) + MARK + b"\0;")
+
+
 def _writer(kind: str, fps: float) -> animation.AbstractMovieWriter:
     if kind == ".gif":
         return animation.PillowWriter(fps=fps)  # pyright: ignore[reportArgumentType]
@@ -391,4 +401,5 @@ def _writer(kind: str, fps: float) -> animation.AbstractMovieWriter:
             "`path` ends in .mp4, which needs the program ffmpeg, and none was found; install it "
             "(apt, brew or conda install ffmpeg), or save as .gif or .html."
         )
-    return animation.FFMpegWriter(fps=fps, bitrate=2000)  # pyright: ignore[reportArgumentType]
+    about = {"comment": MARK.decode()}
+    return animation.FFMpegWriter(fps=fps, bitrate=2000, metadata=about)  # pyright: ignore[reportArgumentType]

@@ -30,6 +30,7 @@ def export_model(
     dtype: str = "float64",
     dt: float | None = None,
     limits: PathLimits | None = None,
+    force: bool = False,
 ) -> Report[dict[str, object]]:
     """Write a model as C code, see `native.export_c`.
 
@@ -50,6 +51,8 @@ def export_model(
         configuration in the domain of the model. Default: the model alone.
     limits : PathLimits, optional
         Limits of the step. Default: `path_limits`.
+    force : bool, default=False
+        Replace files that `export` did not write.
 
     Returns
     -------
@@ -72,11 +75,11 @@ def export_model(
     report.text("{about_q}", about_q=about_q)
     words = {"name": name, "about_q": about_q}
     if kind == "fmu":
-        report.paths = [export_fmu(model, out, **words)]
+        report.paths = [export_fmu(model, out, **words, force=force)]
     elif kind == "mex":
-        report.paths = export_mex(model, out, **words)
+        report.paths = export_mex(model, out, **words, force=force)
     else:
-        report.paths = export_c(model, out, dtype=dtype, **words)
+        report.paths = export_c(model, out, dtype=dtype, **words, force=force)
     return report
 
 

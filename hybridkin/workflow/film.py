@@ -7,6 +7,7 @@ from pathlib import Path
 
 import hybridkin
 from hybridkin._core.commands import Commands
+from hybridkin._core.files import check_outputs
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.workflow.model import LoadedModel
 from hybridkin.workflow.report import Progress, Report, quiet
@@ -21,6 +22,7 @@ def animate_track(
     unit: str = "cm",
     speed: float = 1.0,
     n_frames: int = 150,
+    force: bool = False,
     progress: Progress = quiet,
 ) -> Report[dict[str, object]]:
     """Write a film or an interactive page of a robot that follows a file of commands.
@@ -40,6 +42,8 @@ def animate_track(
         Speed of the film relative to the motion.
     n_frames : int, default=150
         Largest number of frames.
+    force : bool, default=False
+        Replace a file that `animate` did not write.
     progress : callable, optional
         Called with (what, done, total).
 
@@ -53,8 +57,9 @@ def animate_track(
             f"`model` {loaded.path} has no body to draw; give a model with a chain as its "
             "mechanical model."
         )
-    log = read_track(path, loaded.log_format())
     out = Path(out)
+    check_outputs([out], "animate", force=force)
+    log = read_track(path, loaded.log_format())
     q = loaded.effective(Commands(log.q, time=log.time))
     if log.groups is not None:  # the way to the path is no part of it
         on_path = log.groups != LEAD_IN

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import platform
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -18,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Generic, NamedTuple, Protocol, TypeVar
 from numpy.typing import NDArray
 
 from hybridkin._core.arrays import as_path
-from hybridkin._core.files import Writer, write_files
+from hybridkin._core.files import Writer, check_outputs, write_files
 from hybridkin._core.stored import plain
 from hybridkin._core.texts import (
     csv_table,
@@ -285,24 +284,13 @@ def check_out(
     `files` and a report are replaced only if the report is one of the same command, or by `force`.
     """
     path = as_path(out, "out")
-    folder = path.absolute()
-    while not folder.exists():
-        folder = folder.parent
-    if not folder.is_dir() or not os.access(folder, os.W_OK):
-        raise OSError(
-            f"`out` must be a folder that can be written, got {path}; name another one."
-        )
     report = path / "report.json"
     entry = f'"command": "{command}"'
-    if force or (report.is_file() and entry in report.read_text(errors="replace")):
-        return
+    is_ours = report.is_file() and entry in report.read_text(errors="replace")
     names = (*files, "report.json", "report.md")
-    present = [name for name in names if (path / name).exists()]
-    if present:
-        raise FileExistsError(
-            f"`out` {path} has {', '.join(present)}, not written by `hybridkin {command}`; name "
-            "another folder, or replace them with --force."
-        )
+    check_outputs(
+        [path / name for name in names], command, lambda _: is_ours, force=force
+    )
 
 
 def quiet(label: str, done: int, total: int) -> None:

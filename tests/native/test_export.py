@@ -251,7 +251,7 @@ def test_only_files_of_an_export_are_replaced(tmp_path):
     export_c(rigid, tmp_path, name="arm_3")
     assert readme.read_text() == text
     readme.write_text("mine")
-    with pytest.raises(FileExistsError, match=r"has a README\.md of another origin"):
+    with pytest.raises(FileExistsError, match=r"has README\.md, not written by `hybridkin export`"):
         export_c(rigid, tmp_path, name="arm_3")
 
 
