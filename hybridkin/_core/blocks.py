@@ -10,6 +10,7 @@ from torch import Tensor
 
 from hybridkin._core.arrays import check_shape
 from hybridkin._core.forks import THREADS
+from hybridkin._core.named_rows import rows_from
 
 _ON_GPU = 32  # times the rows of a CPU: a GPU computes them in the time of a few
 
@@ -39,8 +40,12 @@ def in_blocks_of(
         return function(q)  # which raises
     lead = q.shape[:-1]
     blocks = q.reshape(math.prod(lead), q.shape[-1]).split(size)
+    of_blocks = [function(blocks[0])]
+    for k, block in enumerate(blocks[1:], 1):
+        with rows_from(k * size):
+            of_blocks.append(function(block))
     results = []
-    for parts in zip(*map(function, blocks), strict=True):
+    for parts in zip(*of_blocks, strict=True):
         # Flattened, because a tensor of many axes in transposed memory is slow to join.
         whole = torch.cat([part.flatten(1) for part in parts])
         results.append(whole.reshape(*lead, *parts[0].shape[1:]))

@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from hybridkin._core.arrays import Numbers, Transform, identity, whole
+from hybridkin._core.arrays import Numbers, Transform, whole
+from hybridkin._core.blocks import in_blocks
+from hybridkin._core.named_rows import first_row, named_rows, without_warnings
 from hybridkin._core.stored import Layout, Restore, Stored
-from hybridkin.chains._arcs import WorkOfGravity, segments_of
 from hybridkin.chains._checks import filled, float_dtype, numeric, stiffnesses
+from hybridkin.chains._equilibrium import (
+    LEAST_LENGTH,
+    Outcome,
+    Shape,
+    Statics,
+    shapes_of_least_energy,
+)
 from hybridkin.chains._slack import WithoutDerivative, applied
 from hybridkin.chains.arc_chain import STRUCTURE, ArcChain, Change
 from hybridkin.chains.chain import Chain
@@ -20,72 +29,15 @@ from hybridkin.chains.markers import MarkedChain, Marker
 
 __all__ = ["ForceTendonChain"]
 
-_MOST_STEPS = 100
 _MOST_ARCS = 50  # of a segment
-_CONVERGED = 1e-6  # last Newton step, in units of 1 J^(1/2); two more follow
-_ROUNDING = 1e-12
-
-
-class _Statics(NamedTuple):
-    """The energy of a shape: arcs (3 A, N), all lengths, then x- and y-bendings.
-
-    ``1/2 (a - rest)' K (a - rest) + a' B' f`` minus the work of gravity.
-    """
-
-    stiffness: Tensor  # (3 A,), diagonal of K
-    rest: Tensor  # (3 A,), without forces and weight
-    readings: Tensor  # B (n, 3 A), change of the tendon paths per change of shape
-    weights: Tensor  # (A,) [N]
-    offsets: Tensor  # (A,), rigid length after each arc [m]
-    down: Tensor  # (3,), direction of gravity in the frame of the base
-
-    def at(self, rows: Tensor) -> _Statics:
-        """Return the same on the device of rows."""
-        return _Statics(*(part.to(rows.device) for part in self))
-
-    def shape_of_least_energy(
-        self, forces: Tensor, arcs: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Return arcs (3 A, N) at a minimum of the energy, and the inverse Hessian (N, 3 A, 3 A).
-
-        Newton steps from the given arcs. A step that does not lower the energy is repeated with
-        more damping. Each coordinate is scaled by the root of its stiffness.
-        """
-        unit = self.stiffness.rsqrt()
-        column_unit = unit[:, None]
-        eye = identity(len(unit), forces)
-        shape = _Shape(self, arcs, forces)
-        energy = shape.energy
-        damping = torch.zeros_like(energy)
-        for _ in range(_MOST_STEPS):
-            # The damped Newton step; none where the damped Hessian is not positive.
-            imbalance = (column_unit * shape.imbalance).mT
-            hessian = column_unit * shape.hessian * unit
-            damped = hessian + damping[:, None, None] * eye
-            factor, failed = torch.linalg.cholesky_ex(damped)
-            factor = torch.where(failed[:, None, None] > 0, eye, factor)
-            descent = torch.cholesky_solve(imbalance[..., None], factor)[..., 0]
-
-            # Accepted if it lowers the energy, or is near the end.
-            moved = arcs - column_unit * descent.mT
-            shape = _Shape(self, moved, forces)
-            moved_energy = shape.energy
-            size = descent.abs().amax(1)
-            lower = moved_energy <= energy + _ROUNDING * energy.abs()
-            accepted = (failed == 0) & (lower | (size < _CONVERGED))
-            arcs = torch.where(accepted, moved, arcs)
-            if not accepted.all():
-                shape = _Shape(self, arcs, forces)
-            energy = torch.where(accepted, moved_energy, energy)
-
-            more = (10.0 * damping).clamp(min=0.1)
-            less = torch.where(damping > 1e-3, 0.1 * damping, 0.0)
-            damping = torch.where(accepted, less, more)
-            if (accepted & (size < _CONVERGED)).all():
-                break
-        hessian = column_unit * shape.hessian * unit
-        inverse, _ = torch.linalg.solve_ex(hessian, eye.expand_as(hessian))
-        return arcs, column_unit * inverse * unit
+_SIDE = 1e-10  # relative load that decides to which side a body falls
+_WHY = {
+    Outcome.BUCKLED: "buckled: in {rows} no load decides to which side the body falls",
+    Outcome.COMPRESSED: (
+        f"compressed: in {{rows}} an arc is shorter than {LEAST_LENGTH:g} of its rest length"
+    ),
+    Outcome.NOT_FOUND: "not at rest: in {rows} the search found no shape of least energy",
+}
 
 
 @dataclass
@@ -94,40 +46,6 @@ class _LastShapes:
 
     q: Tensor
     arcs: Tensor
-
-
-class _Shape:
-    """Arcs (3 A, N) with tendon forces (N, n): their energy and its derivatives."""
-
-    def __init__(self, statics: _Statics, arcs: Tensor, forces: Tensor) -> None:
-        self.statics = statics
-        self.arcs = arcs
-        self.forces = forces
-        self.strain = arcs - statics.rest[:, None]
-        segments = segments_of(arcs, statics.offsets[:, None])
-        weights = statics.weights[:, None]
-        self.gravity = WorkOfGravity(segments, weights, statics.down[:, None])
-
-    @property
-    def energy(self) -> Tensor:
-        """The energy (N,) [J]."""
-        squares = self.strain.square()
-        elastic = 0.5 * (self.statics.stiffness[:, None] * squares).sum(0)
-        tendons = (self.forces.mT * (self.statics.readings @ self.strain)).sum(0)
-        return elastic + tendons - self.gravity.value
-
-    @property
-    def imbalance(self) -> Tensor:
-        """The derivative (3 A, N) of the energy by the arcs: zero at rest."""
-        elastic = self.statics.stiffness[:, None] * self.strain
-        tendons = self.statics.readings.mT @ self.forces.mT
-        return elastic + tendons - self.gravity.gradient()
-
-    @property
-    def hessian(self) -> Tensor:
-        """The second derivative (N, 3 A, 3 A) of the energy by the arcs."""
-        by_gravity = self.gravity.hessian().permute(2, 0, 1)
-        return torch.diag(self.statics.stiffness) - by_gravity
 
 
 class ForceTendonChain(ArcChain):
@@ -360,6 +278,23 @@ class ForceTendonChain(ArcChain):
         """Return no warning: forces have no plausible size that the geometry gives."""
         return []
 
+    def domain_distance(self, q: Tensor) -> Tensor:
+        """Return how far the most compressed arc is on its way to its least length, (...).
+
+        At most 1 inside the domain; NaN where the body has no shape. Differentiable.
+        """
+        rows = self._rows(q)
+        with without_warnings():
+            (distance,) = in_blocks(self._compression, rows)
+        return distance.reshape(q.shape[:-1])
+
+    def _compression(self, rows: Tensor) -> tuple[Tensor]:
+        lengths, *_ = self._arcs_of_rows(rows).chunk(3)
+        rest = (self.lengths / self.arcs_per_segment).to(lengths)
+        rest = rest.repeat_interleave(self.arcs_per_segment)[:, None]
+        shortened = (1.0 - lengths / rest) / (1.0 - LEAST_LENGTH)
+        return (shortened.amax(0).clamp(min=0.0)[:, None],)
+
     def plausible_rows(self) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Return None: every force is plausible."""
 
@@ -388,7 +323,7 @@ class ForceTendonChain(ArcChain):
         middles = torch.arange(k, dtype=torch.float64, device=taper.device) + 0.5
         return taper.double()[..., None] * middles / k
 
-    def _statics(self) -> _Statics:
+    def _statics(self) -> Statics:
         """Return the energy of shapes, in float64."""
         k = self.arcs_per_segment
         base = self.base.double()
@@ -402,7 +337,7 @@ class ForceTendonChain(ArcChain):
         rest = torch.stack([length, rest_x / k, rest_y / k])
         readings = self._readings().to(base).unflatten(-1, (3, -1))
         down = torch.tensor(self.gravity, dtype=base.dtype, device=base.device)
-        return _Statics(
+        return Statics(
             stiffness=torch.stack([axial, bending, bending]).flatten(),
             rest=rest.flatten(),
             readings=readings.repeat_interleave(k, dim=-1).flatten(1),
@@ -419,7 +354,7 @@ class ForceTendonChain(ArcChain):
         arcs = self._at_rest(q)
         statics = self._statics().at(q)
         gains = self.gains.to(q)
-        shape = _Shape(statics, arcs, self.forces(q))
+        shape = Shape(statics, arcs, self.forces(q))
         by_force, _ = torch.linalg.solve_ex(shape.hessian, -statics.readings.mT)
         pulls = (gains * q >= 0.0) * gains
         slope = by_force * pulls[:, None]
@@ -434,10 +369,10 @@ class ForceTendonChain(ArcChain):
         change at fixed arcs.
         """
         q = rows.double()
-        arcs, compliance = self._shapes(q)
+        arcs, compliance, is_known = self._shapes(q)
 
         def imbalance(chain: ForceTendonChain) -> Tensor:
-            return _Shape(chain._statics().at(q), arcs, chain.forces(q)).imbalance
+            return Shape(chain._statics().at(q), arcs, chain.forces(q)).imbalance
 
         forcing = self._slope_of(imbalance, tangents)  # (3 A, N, P)
         by_geometry = -compliance @ forcing.permute(1, 0, 2)
@@ -445,33 +380,42 @@ class ForceTendonChain(ArcChain):
         def change(by_arcs: Tensor) -> Tensor:
             return by_arcs @ by_geometry.to(by_arcs)
 
-        return arcs.to(rows), change
+        return torch.where(is_known, arcs, torch.nan).to(rows), change
 
     def _at_rest(self, q: Tensor) -> Tensor:
-        """Return the arcs (3 A, N) at rest, float64.
+        """Return the arcs (3 A, N) at rest, float64; NaN where there are none.
 
         The shape is found without derivative. Two steps with its constant compliance follow: by
         the implicit function theorem the first one gives the first derivative, the second one the
-        second.
+        second. Their values count only where they make the imbalance smaller.
         """
-        arcs, compliance = self._shapes(q)
+        found, compliance, is_known = self._shapes(q)
         statics = self._statics().at(q)
-        forces = self.forces(q)
-        for _ in range(2):
-            imbalance = _Shape(statics, arcs, forces).imbalance.mT
-            arcs = arcs - applied(compliance, imbalance).mT
-        return arcs
+        forces = self.forces(torch.where(is_known[:, None], q, 0.0))
+        first = Shape(statics, found, forces).imbalance.mT
+        stepped = found - applied(compliance, first).mT
+        second = Shape(statics, stepped, forces).imbalance.mT
+        arcs = stepped - applied(compliance, second).mT
 
-    def _shapes(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the arcs (3 A, N) at rest and the compliance (N, 3 A, 3 A), no derivatives."""
+        unit = statics.unit
+        is_better = (unit * second).norm(dim=1) < (unit * first).norm(dim=1)
+        value = torch.where(is_better, stepped, found).detach()
+        arcs = value + (arcs - arcs.detach())
+        return torch.where(is_known, arcs, torch.nan)
+
+    def _shapes(self, q: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return arcs (3 A, N), the compliance (N, 3 A, 3 A) and whether they are at rest (N,).
+
+        They have no derivatives. Where they are not at rest they are rest shapes and zeros.
+        """
         entries = [self.geometry()[name].detach() for name in self._entries]
         packed = WithoutDerivative.apply(self._search, q.detach(), *entries)
         n = 3 * self.n_segments * self.arcs_per_segment
-        arcs, compliance = packed.split([n, n * n], dim=1)
-        return arcs.mT, compliance.unflatten(1, (n, n))
+        arcs, compliance, is_known = packed.split([n, n * n, 1], dim=1)
+        return arcs.mT, compliance.unflatten(1, (n, n)), is_known[:, 0] > 0.0
 
     def _search(self, q: Tensor, *entries: Tensor) -> Tensor:
-        """Return arcs (N, 3 A) at rest and the flat compliance, for entries of the geometry."""
+        """Return what `_shapes` returns side by side (N, ...), for entries of the geometry."""
         geometry = dict(zip(self._entries, entries, strict=True))
         chain = self.with_geometry(**geometry)
         statics = chain._statics().at(q)
@@ -479,11 +423,49 @@ class ForceTendonChain(ArcChain):
         last = self._last
         if last is not None and torch.equal(last.q, q):
             start = last.arcs
-        arcs, compliance = statics.shape_of_least_energy(chain.forces(q), start)
-        if last is not None:
+        # The geometry is as precise as it is stored: its rounding decides nothing.
+        side = max(_SIDE, 16.0 * torch.finfo(self.base.dtype).eps)
+        found = shapes_of_least_energy(statics, chain.forces(q), start, side)
+        if last is None:
+            chain._warn(q, found.outcome)
+        else:
             last.q = q
-            last.arcs = arcs
-        return torch.cat([arcs.mT, compliance.flatten(1)], dim=1)
+            last.arcs = found.arcs
+        is_known = found.outcome == Outcome.AT_REST
+        parts = [found.arcs.mT, found.compliance.flatten(1), is_known[:, None].to(q)]
+        return torch.cat(parts, dim=1)
+
+    def _warn(self, q: Tensor, outcome: Tensor) -> None:
+        """Warn of rows q (N, n) without a shape, unless they are trials."""
+        first = first_row()
+        if first is None or (outcome == Outcome.AT_REST).all():
+            return
+        for reason, words in _WHY.items():
+            places = (outcome == reason).nonzero()[:, 0].tolist()
+            if places:
+                rows = named_rows([first + place for place in places])
+                why = words.format(rows=rows)
+                example = [float(f"{value:.6g}") for value in q[places[0]].tolist()]
+                warnings.warn(
+                    f"{why} (q of the first: {example}); they have no shape, and results are "
+                    f"NaN. The body {self._body()}.",
+                    stacklevel=2,
+                )
+
+    def _body(self) -> str:
+        """Return words about the weight and stiffness of the body, for messages."""
+        statics = self._statics()
+        along = float(statics.down[2])
+        pose = "stands on its base" if along < 0.0 else "hangs from its base"
+        length = float(self.lengths.sum())
+        ratio = (
+            float(statics.weights.sum()) * length**2 / float(self.bending_stiffness[0])
+        )
+        axial = float(self.axial_stiffness.min())
+        return (
+            f"{pose} (gravity along its axis: {along:.3g}), sum(W) L^2 / EI = {ratio:.3g}, "
+            f"least EA = {axial:.3g} N"
+        )
 
     @classmethod
     def _arguments(cls, stored: Stored) -> dict[str, Any]:

@@ -4,7 +4,7 @@ import torch
 from torch.testing import assert_close
 
 from hybridkin import ForceTendonChain, calibrate
-from hybridkin.chains.force_tendons import _Shape
+from hybridkin.chains._equilibrium import Shape
 
 DOWN = torch.tensor([0.3, -0.2, 1.0])
 
@@ -85,13 +85,13 @@ def test_the_shape_has_least_energy():
     statics = body._statics()
     arcs = body._arcs_of_rows(forces())
     assert_close(
-        _Shape(statics, arcs, forces()).imbalance, torch.zeros_like(arcs), rtol=0, atol=1e-12
+        Shape(statics, arcs, forces()).imbalance, torch.zeros_like(arcs), rtol=0, atol=1e-12
     )
-    energy = _Shape(statics, arcs, forces()).energy
+    energy = Shape(statics, arcs, forces()).energy
     random = torch.Generator().manual_seed(1)
     for size in (1e-4, 1e-2):
         step = size * torch.randn(arcs.shape, generator=random, dtype=torch.float64)
-        assert (_Shape(statics, arcs + step, forces()).energy > energy).all()
+        assert (Shape(statics, arcs + step, forces()).energy > energy).all()
 
 
 def test_derivatives_of_the_energy():
@@ -99,10 +99,10 @@ def test_derivatives_of_the_energy():
     random = torch.Generator().manual_seed(2)
     step = torch.randn(18, 5, generator=random, dtype=torch.float64)
     arcs = statics.rest[:, None] + 0.3 * step
-    by_torch = torch.func.grad(lambda shape: _Shape(statics, shape, forces()).energy.sum())(arcs)
-    assert_close(_Shape(statics, arcs, forces()).imbalance, by_torch)
-    second = torch.func.jacrev(lambda shape: _Shape(statics, shape, forces()).imbalance)(arcs)
-    assert_close(_Shape(statics, arcs, forces()).hessian, torch.einsum("injn->nij", second))
+    by_torch = torch.func.grad(lambda shape: Shape(statics, shape, forces()).energy.sum())(arcs)
+    assert_close(Shape(statics, arcs, forces()).imbalance, by_torch)
+    second = torch.func.jacrev(lambda shape: Shape(statics, shape, forces()).imbalance)(arcs)
+    assert_close(Shape(statics, arcs, forces()).hessian, torch.einsum("injn->nij", second))
 
 
 def test_turning_base_and_gravity_turns_the_tip():
