@@ -20,6 +20,7 @@ from hybridkin.chains._arcs import WorkOfGravity, segments_of
 LEAST_LENGTH = 0.1  # of an arc, relative to its rest length
 _MOST_STEPS = 300
 _TOLERANCE = 1e-10  # imbalance relative to the loads
+_SIDE = 2e-6  # relative load that decides to which side a body falls; 16 roundings of float32
 _FLAT = 1e-9  # relative curvature of the energy below which a shape is not stable
 _ENOUGH = 1e-4  # least decrease of the energy, relative to that of the linear model
 
@@ -154,16 +155,12 @@ class _Step:
     is_stuck: Tensor  # (N,), bool: no way down, but not stable either
 
 
-def shapes_of_least_energy(
-    statics: Statics, forces: Tensor, start: Tensor, side: float
-) -> Found:
+def shapes_of_least_energy(statics: Statics, forces: Tensor, start: Tensor) -> Found:
     """Return shapes at minima of the energy, from arcs (3 A, N) on for forces (N, n).
 
     Newton steps; where the energy is not convex, or such a step did not lower it, damped steps
     along the axes of its curvature, downhill along each of them. Every step lowers the energy, or
     the imbalance where the energy changes by rounding alone.
-
-    `side` is the relative load that decides to which side a body falls.
     """
     unit = statics.unit
     n = len(unit)
@@ -174,7 +171,7 @@ def shapes_of_least_energy(
     )
     valid = forces.isfinite().all(1)
     found.outcome[~valid] = Outcome.INVALID
-    live = _started(statics, forces, start, side).take(valid)
+    live = _started(statics, forces, start).take(valid)
     for _ in range(_MOST_STEPS):
         if not len(live.row):
             break
@@ -193,7 +190,7 @@ def shapes_of_least_energy(
     return found
 
 
-def _started(statics: Statics, forces: Tensor, start: Tensor, side: float) -> _Live:
+def _started(statics: Statics, forces: Tensor, start: Tensor) -> _Live:
     """Return all rows at their start."""
     loads = statics.loads(forces)
     size = (start.mT / statics.unit).norm(dim=1)
@@ -204,7 +201,7 @@ def _started(statics: Statics, forces: Tensor, start: Tensor, side: float) -> _L
         row=torch.arange(len(forces), device=forces.device),
         forces=forces,
         tol=tol,
-        side=torch.maximum(side * loads, tol),
+        side=torch.maximum(_SIDE * loads, tol),
         damping=torch.zeros_like(loads),
         arcs=start.mT,
         energy=shape.energy,

@@ -30,7 +30,6 @@ from hybridkin.chains.markers import MarkedChain, Marker
 __all__ = ["ForceTendonChain"]
 
 _MOST_ARCS = 50  # of a segment
-_SIDE = 1e-10  # relative load that decides to which side a body falls
 _WHY = {
     Outcome.BUCKLED: "buckled: in {rows} no load decides to which side the body falls",
     Outcome.COMPRESSED: (
@@ -423,9 +422,7 @@ class ForceTendonChain(ArcChain):
         last = self._last
         if last is not None and torch.equal(last.q, q):
             start = last.arcs
-        # The geometry is as precise as it is stored: its rounding decides nothing.
-        side = max(_SIDE, 16.0 * torch.finfo(self.base.dtype).eps)
-        found = shapes_of_least_energy(statics, chain.forces(q), start, side)
+        found = shapes_of_least_energy(statics, chain.forces(q), start)
         if last is None:
             chain._warn(q, found.outcome)
         else:

@@ -31,6 +31,7 @@ from hybridkin._core.kernel_numbers import (
     IK_WEIGHTS,
 )
 from hybridkin._core.model import Portable
+from hybridkin._core.named_rows import without_warnings
 from hybridkin._core.plan import NoKernel, Plan
 from hybridkin.ik._half_spaces import HalfSpaces
 from hybridkin.ik.tasks import PointsTask, PoseTask, PositionTask, Task, Tolerance
@@ -387,7 +388,8 @@ class StepSettings(Portable):
         if len(q) == 0:
             x = q.new_zeros(0, *self.task.shape)
             return x, q.new_zeros(0, sum(self.task.parts), q.shape[1])
-        x, J = self.task.evaluate(q)
+        with without_warnings():  # a status says what is wrong
+            x, J = self.task.evaluate(q)
         return x, self.in_plane(J)
 
     def preferred(self, q: Tensor) -> Tensor:
