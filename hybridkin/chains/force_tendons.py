@@ -17,6 +17,7 @@ from hybridkin._core.stored import Layout, Restore, Stored
 from hybridkin.chains._checks import filled, float_dtype, numeric, stiffnesses
 from hybridkin.chains._equilibrium import (
     LEAST_LENGTH,
+    Found,
     Outcome,
     Shape,
     Statics,
@@ -316,6 +317,18 @@ class ForceTendonChain(ArcChain):
                 f"{n_negative} of {len(rows)} rows with a negative one."
             )
 
+        def outcome_of(rows: Tensor) -> tuple[Tensor]:
+            return (self._found(rows.double()).outcome[:, None],)
+
+        with torch.no_grad():
+            (outcome,) = in_blocks(outcome_of, rows)
+        messages = self._missing(rows, outcome[:, 0])
+        if messages:
+            raise ValueError(
+                f"`{name}` must hold forces at which the body has a shape, got {messages[0]} Leave "
+                "these rows out, or make the body stiffer or lighter."
+            )
+
     def _lost_radii(self, taper: Tensor) -> Tensor:
         """Return the relative loss of outer radii (..., S, k) up to the middle of each arc."""
         k = self.arcs_per_segment
@@ -417,40 +430,43 @@ class ForceTendonChain(ArcChain):
         """Return what `_shapes` returns side by side (N, ...), for entries of the geometry."""
         geometry = dict(zip(self._entries, entries, strict=True))
         chain = self.with_geometry(**geometry)
-        statics = chain._statics().at(q)
-        start = statics.rest[:, None].expand(-1, len(q))
+        found = chain._found(q)
+        first = first_row()
         last = self._last
-        if last is not None and torch.equal(last.q, q):
-            start = last.arcs
-        found = shapes_of_least_energy(statics, chain.forces(q), start)
-        if last is None:
-            chain._warn(q, found.outcome)
-        else:
+        if last is not None:
             last.q = q
             last.arcs = found.arcs
+        elif first is not None:
+            for message in chain._missing(q, found.outcome, first):
+                warnings.warn(f"{message} Results are NaN there.", stacklevel=2)
         is_known = found.outcome == Outcome.AT_REST
         parts = [found.arcs.mT, found.compliance.flatten(1), is_known[:, None].to(q)]
         return torch.cat(parts, dim=1)
 
-    def _warn(self, q: Tensor, outcome: Tensor) -> None:
-        """Warn of rows q (N, n) without a shape, unless they are trials."""
-        first = first_row()
-        if first is None or (outcome == Outcome.AT_REST).all():
-            return
-        for reason, words in _WHY.items():
+    def _found(self, q: Tensor) -> Found:
+        """Return the results of searches for rows q (N, n), float64."""
+        statics = self._statics().at(q)
+        start = statics.rest[:, None].expand(-1, len(q))
+        last = self._last
+        if last is not None and torch.equal(last.q, q):
+            start = last.arcs
+        return shapes_of_least_energy(statics, self.forces(q), start)
+
+    def _missing(self, q: Tensor, outcome: Tensor, first: int = 0) -> list[str]:
+        """Return why rows q (N, n), numbered from `first` on, have no shape: one text a reason."""
+        messages = []
+        for reason, why in _WHY.items():
             places = (outcome == reason).nonzero()[:, 0].tolist()
             if places:
                 rows = named_rows([first + place for place in places])
-                why = words.format(rows=rows)
                 example = [float(f"{value:.6g}") for value in q[places[0]].tolist()]
-                warnings.warn(
-                    f"{why} (q of the first: {example}); they have no shape, and results are "
-                    f"NaN. The body {self._body()}.",
-                    stacklevel=2,
+                messages.append(
+                    f"{why.format(rows=rows)} (first q: {example}). {self._body()}"
                 )
+        return messages
 
     def _body(self) -> str:
-        """Return words about the weight and stiffness of the body, for messages."""
+        """Return a sentence about the weight and stiffness of the body, for messages."""
         statics = self._statics()
         along = float(statics.down[2])
         pose = "stands on its base" if along < 0.0 else "hangs from its base"
@@ -460,8 +476,8 @@ class ForceTendonChain(ArcChain):
         )
         axial = float(self.axial_stiffness.min())
         return (
-            f"{pose} (gravity along its axis: {along:.3g}), sum(W) L^2 / EI = {ratio:.3g}, "
-            f"least EA = {axial:.3g} N"
+            f"The body {pose} (gravity along its axis: {along:.3g}) with sum(W) L^2 / EI = "
+            f"{ratio:.3g} and EA of at least {axial:.3g} N."
         )
 
     @classmethod

@@ -137,7 +137,8 @@ class Search:
 
     def _restart(self, best: Found, q: Tensor, restarts: int) -> None:
         """Search open rows from further starts, a few of them at a time."""
-        is_open = (self._cost(best) > _DONE) & torch.isfinite(best.error)
+        wanted = torch.isfinite(torch.cat([q, best.target.flatten(1)], dim=1)).all(1)
+        is_open = (self._cost(best) > _DONE) & wanted
         for rows in is_open.nonzero()[:, 0].split(_ROWS):
             if rows.numel() == 0:
                 break
@@ -249,7 +250,7 @@ class Search:
         best.n_iter[rows] += ends.n_iter.view(-1, n_starts).sum(1)
         best.n_starts[rows] += n_starts
         # The best end of every row; the counts are those of the row.
-        cost = self._cost(ends).nan_to_num(torch.inf).view(-1, n_starts)
+        cost = self._cost(ends).view(-1, n_starts)
         first = n_starts * torch.arange(len(rows), device=rows.device)
         ends = ends.take(first + cost.argmin(1))
         ends.n_iter = best.n_iter[rows]
@@ -258,10 +259,14 @@ class Search:
         best.put(rows[better], ends.take(better))
 
     def _cost(self, ends: Found) -> Tensor:
-        """Return the error, or -1 for rows reached outside the domain, -2 for inside."""
+        """Return the error, or -1 for rows reached outside the domain, -2 for inside.
+
+        Infinite where there is no tip.
+        """
         inside = self.settings.task.in_domain(ends.q)
         reached = torch.where(inside, _DONE, _OUTSIDE)
-        return torch.where(ends.reached, reached, ends.error)
+        error = ends.error.nan_to_num(torch.inf, torch.inf)
+        return torch.where(ends.reached, reached, error)
 
     def _point(self, q: Tensor, target: Tensor) -> Point:
         x, J = self.settings.evaluate(q)
