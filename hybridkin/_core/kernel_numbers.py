@@ -48,6 +48,9 @@ HK_POSE_FEATURES = 3
 HK_WHOLE_STEPS = 8  # then one tendon at a time, which always terminates
 HK_MOST_TURNS = 12  # 2 to this power bounds the steps if rounding prevents the end
 
+# Shortest elastic arc, relative to its rest length; shorter ones are NaN.
+HK_LEAST_LENGTH = 0.1
+
 # Guards of a correction.
 HK_FULL = 1.0  # distance from the training rows up to which the weight is 1
 HK_FULL_LEVERAGE = 3.0  # the same for a leverage

@@ -15,9 +15,9 @@ import torch
 from torch import Tensor
 
 from hybridkin._core.arrays import identity
+from hybridkin._core.kernel_numbers import HK_LEAST_LENGTH
 from hybridkin.chains._arcs import WorkOfGravity, segments_of
 
-LEAST_LENGTH = 0.1  # of an arc, relative to its rest length
 _MOST_STEPS = 300
 _TOLERANCE = 1e-10  # imbalance relative to the loads
 _SIDE = 2e-6  # relative load that decides to which side a body falls; 16 roundings of float32
@@ -30,7 +30,7 @@ class Outcome(IntEnum):
 
     AT_REST = 0
     BUCKLED = 1  # a saddle, or a circle of shapes: no load decides the side
-    COMPRESSED = 2  # at rest, but an arc is shorter than `LEAST_LENGTH`
+    COMPRESSED = 2  # at rest, but an arc is shorter than `HK_LEAST_LENGTH`
     NOT_FOUND = 3
     INVALID = 4  # forces that are not finite
 
@@ -169,9 +169,9 @@ def shapes_of_least_energy(statics: Statics, forces: Tensor, start: Tensor) -> F
         forces.new_zeros(len(forces), n, n),
         torch.full_like(forces[:, 0], Outcome.NOT_FOUND, dtype=torch.long),
     )
-    valid = forces.isfinite().all(1)
-    found.outcome[~valid] = Outcome.INVALID
-    live = _started(statics, forces, start).take(valid)
+    found.outcome[~forces.isfinite().all(1)] = Outcome.INVALID
+    live = _started(statics, forces, start)
+    live = live.take(live.imbalance.norm(dim=1).isfinite() & live.tol.isfinite())
     for _ in range(_MOST_STEPS):
         if not len(live.row):
             break
@@ -266,7 +266,7 @@ def _move(statics: Statics, live: _Live, way: Tensor) -> None:
 def _record(found: Found, statics: Statics, live: _Live) -> None:
     """Put shapes at rest into the results, unless an arc is too short."""
     lengths, *_ = live.arcs.chunk(3, dim=1)
-    least = LEAST_LENGTH * statics.rest.chunk(3)[0]
+    least = HK_LEAST_LENGTH * statics.rest.chunk(3)[0]
     long_enough = (lengths >= least).all(1)
     found.outcome[live.row[~long_enough]] = Outcome.COMPRESSED
     if not long_enough.all():

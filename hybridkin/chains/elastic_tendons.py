@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from operator import is_
@@ -9,13 +10,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from hybridkin._core.arrays import Numbers, Transform
+from hybridkin._core.arrays import Numbers, Transform, as_array
+from hybridkin._core.blocks import in_blocks
+from hybridkin._core.kernel_numbers import HK_LEAST_LENGTH
+from hybridkin._core.named_rows import first_row, without_warnings
 from hybridkin._core.plan import Plan
+from hybridkin._core.plausible import PlausibleRows
 from hybridkin._core.stored import Layout, Stored
 from hybridkin.chains import _slack
 from hybridkin.chains._checks import filled, float_dtype, stiffnesses
+from hybridkin.chains._elastic_body import COMPRESSED, ElasticBody, why_not
 from hybridkin.chains.arc_chain import (
     STRUCTURE,
     ArcChain,
@@ -101,7 +107,7 @@ class _Table(NamedTuple):
         return self.state == state and all(map(is_, self.shaping, shaping))
 
 
-class ElasticTendonChain(ArcChain):
+class ElasticTendonChain(ElasticBody):
     """Tip position of an elastic backbone with tendons that can pull but not push.
 
     A shape a = (length changes, bending vectors of all segments) stretches the tendons by
@@ -401,14 +407,53 @@ class ElasticTendonChain(ArcChain):
         _, places, responses = self._find(rows)
         maps = responses.shape.index_select(0, places)
         shape = _slack.applied(maps, _slack.extended(rows))
-        return self._arcs_of(shape), maps[..., :-1].permute(1, 2, 0)
+        return self._arcs_of(shape, rows), maps[..., :-1].permute(1, 2, 0)
 
-    def _arcs_of(self, shape: Tensor) -> Tensor:
-        """Return the arcs (3 S, N) of shapes (N, 3 S), which hold changes of length."""
-        straight = nn.functional.pad(
-            self.get_buffer("lengths"), (0, 2 * self.n_segments)
-        )
-        return (shape + straight.to(shape)).mT.contiguous()
+    def _arcs_of(self, shape: Tensor, rows: Tensor) -> Tensor:
+        """Return the arcs (3 S, N) of shapes (N, 3 S), which hold changes of length.
+
+        The length of an arc that would be too short is NaN, with a warning.
+        """
+        rest = self.get_buffer("lengths").to(shape)
+        changes, bendings = shape.split([self.n_segments, 2 * self.n_segments], dim=1)
+        lengths = rest + changes
+        is_short = lengths < HK_LEAST_LENGTH * rest
+        _slack.WithoutDerivative.apply(self._warn, rows.detach(), is_short)
+        lengths = torch.where(is_short, torch.nan, lengths)
+        return torch.cat([lengths, bendings], dim=1).mT.contiguous()
+
+    def _warn(self, rows: Tensor, is_short: Tensor) -> Tensor:
+        first = first_row()
+        if first is not None:
+            why = why_not(COMPRESSED, rows, is_short.any(1), first)
+            if why is not None:
+                warnings.warn(f"{why} Results are NaN there.", stacklevel=2)
+        return is_short
+
+    def contradiction(self, q: Tensor, name: str = "q") -> str | None:
+        """Return a warning if the tendons compress the body too much, which then has no shape."""
+        rows = self._rows(q)
+        with torch.no_grad(), without_warnings():
+            (arcs,) = in_blocks(lambda q: (self._arcs_of_rows(q).mT,), rows)
+        is_short = rows.isfinite().all(1) & arcs.isnan().any(1)
+        why = why_not(COMPRESSED, rows, is_short)
+        return None if why is None else f"`{name}` has no tip: {why}"
+
+    def plausible_rows(self) -> PlausibleRows:
+        """Return bounds of rows that need no warning about their units or short arcs.
+
+        At balance the energy is at most that of the rest shape: a change of length d of an arc
+        with axial stiffness k has ``k d^2 <= n e^2``, with the largest stretch e there.
+        """
+        bounds = super().plausible_rows()
+        softest = (self.axial_stiffness.sqrt() * self.get_buffer("lengths")).amin()
+        most = (1.0 - HK_LEAST_LENGTH) * softest / self.n_actuators**0.5
+        shape = torch.cat([torch.zeros_like(self.radii), *self.rest_bends.T])
+        preloaded = (self.tendon_zeros + self._readings() @ shape).abs()
+        least = torch.finfo(most.dtype).tiny ** 0.5
+        weights = torch.diag(self.gains / (most - preloaded).clamp(min=least))
+        both = np.vstack([bounds.weights, as_array(weights.detach())])
+        return PlausibleRows(bounds.rest, both)
 
     def _arcs_and_change(
         self, rows: Tensor, tangents: Mapping[str, Tensor]
@@ -447,4 +492,4 @@ class ElasticTendonChain(ArcChain):
             effects, causes = zip(*effects_and_causes, strict=True)
             return torch.cat(effects, dim=-1) @ torch.cat(causes, dim=-1).mT
 
-        return self._arcs_of(shape), change
+        return self._arcs_of(shape, rows), change

@@ -12,11 +12,11 @@ from torch import Tensor
 
 from hybridkin._core.arrays import Numbers, Transform, whole
 from hybridkin._core.blocks import in_blocks
-from hybridkin._core.named_rows import first_row, named_rows, without_warnings
+from hybridkin._core.named_rows import first_row
 from hybridkin._core.stored import Layout, Restore, Stored
 from hybridkin.chains._checks import filled, float_dtype, numeric, stiffnesses
+from hybridkin.chains._elastic_body import COMPRESSED, ElasticBody, why_not
 from hybridkin.chains._equilibrium import (
-    LEAST_LENGTH,
     Found,
     Outcome,
     Shape,
@@ -33,9 +33,7 @@ __all__ = ["ForceTendonChain"]
 _MOST_ARCS = 50  # of a segment
 _WHY = {
     Outcome.BUCKLED: "buckled: in {rows} no load decides to which side the body falls",
-    Outcome.COMPRESSED: (
-        f"compressed: in {{rows}} an arc is shorter than {LEAST_LENGTH:g} of its rest length"
-    ),
+    Outcome.COMPRESSED: COMPRESSED,
     Outcome.NOT_FOUND: "not at rest: in {rows} the search found no shape of least energy",
 }
 
@@ -48,7 +46,7 @@ class _LastShapes:
     arcs: Tensor
 
 
-class ForceTendonChain(ArcChain):
+class ForceTendonChain(ElasticBody):
     """Tip position of a heavy, tapered elastic body whose tendons are pulled with given forces.
 
     q holds the tendon forces [N]. Each segment is divided into arcs of constant curvature and equal
@@ -278,23 +276,6 @@ class ForceTendonChain(ArcChain):
         """Return no warning: forces have no plausible size that the geometry gives."""
         return []
 
-    def domain_distance(self, q: Tensor) -> Tensor:
-        """Return how far the most compressed arc is on its way to its least length, (...).
-
-        At most 1 inside the domain; NaN where the body has no shape. Differentiable.
-        """
-        rows = self._rows(q)
-        with without_warnings():
-            (distance,) = in_blocks(self._compression, rows)
-        return distance.reshape(q.shape[:-1])
-
-    def _compression(self, rows: Tensor) -> tuple[Tensor]:
-        lengths, *_ = self._arcs_of_rows(rows).chunk(3)
-        rest = (self.lengths / self.arcs_per_segment).to(lengths)
-        rest = rest.repeat_interleave(self.arcs_per_segment)[:, None]
-        shortened = (1.0 - lengths / rest) / (1.0 - LEAST_LENGTH)
-        return (shortened.amax(0).clamp(min=0.0)[:, None],)
-
     def plausible_rows(self) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Return None: every force is plausible."""
 
@@ -455,14 +436,10 @@ class ForceTendonChain(ArcChain):
     def _missing(self, q: Tensor, outcome: Tensor, first: int = 0) -> list[str]:
         """Return why rows q (N, n), numbered from `first` on, have no shape: one text a reason."""
         messages = []
-        for reason, why in _WHY.items():
-            places = (outcome == reason).nonzero()[:, 0].tolist()
-            if places:
-                rows = named_rows([first + place for place in places])
-                example = [float(f"{value:.6g}") for value in q[places[0]].tolist()]
-                messages.append(
-                    f"{why.format(rows=rows)} (first q: {example}). {self._body()}"
-                )
+        for reason, words in _WHY.items():
+            why = why_not(words, q, outcome == reason, first)
+            if why is not None:
+                messages.append(f"{why} {self._body()}")
         return messages
 
     def _body(self) -> str:

@@ -389,10 +389,10 @@ class HybridModule(Hybrid):
         return total, trust
 
     def _distance(self, q: Tensor) -> Tensor:
-        """Return the largest distance of any guard, and of the groups, at rows q, (N, 1)."""
+        """Return the largest distance of the robot, guards and groups at rows q, (N, 1)."""
         guards = [correction.guard for _, correction in self._parts()]
         farthest = q.new_zeros(len(q))
-        for measure in (*guards, self.tested):
+        for measure in (self.mechanical, *guards, self.tested):
             if measure is not None:
                 farthest = torch.maximum(farthest, measure.domain_distance(q))
         return farthest[:, None]

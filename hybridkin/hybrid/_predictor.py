@@ -105,7 +105,8 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 "HybridForwardModel(..., coverage=0.9); this one was fitted without."
             )
         x, distance = self._evaluated(partial(self._tips, distance=True, enough=1.0), X)
-        inside = (distance <= 1.0) & self._are_states_seen(X)
+        has_tip = np.isfinite(x).reshape(len(x), -1).all(axis=1)
+        inside = (distance <= 1.0) & has_tip & self._are_states_seen(X)
         return x, self.radius_.at(inside).astype(x.dtype)
 
     def predict_mechanical(self, X: object) -> NDArray:
@@ -168,8 +169,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         inside : ndarray of bool of shape (N,)
             Without a guard all True, except along those directions.
         """
-        distance = partial(self._tips, value=False, distance=True, enough=1.0)
-        inside = self._evaluated(distance, X, warn=False)[0] <= 1.0
+        inside = self._evaluated(self._distances, X, warn=False)[0] <= 1.0
         return inside & self._are_states_seen(X)
 
     def effective(self, X: object) -> NDArray:
@@ -265,6 +265,16 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         rows = torch.from_numpy(q)
         messages = [*chain.unit_messages(rows, "X"), chain.contradiction(rows, "X")]
         return [message for message in messages if message is not None]
+
+    def _distances(self, q: NDArray) -> tuple[NDArray]:
+        """Return the distance from the domain of rows q (N, n): infinite without a shape."""
+        (distance,) = self._tips(q, value=False, distance=True, enough=1.0)
+        plausible = self._plausible_rows
+        if self._chain is not None and plausible is not None and not plausible.hold(q):
+            with torch.no_grad():
+                of_chain = self._chain.domain_distance(torch.from_numpy(q))
+            distance = np.maximum(distance, of_chain.numpy())
+        return (distance,)
 
     def _are_states_seen(self, X: object) -> NDArray[np.bool_]:
         """Return whether the log had the states inside of the hysteresis (N,)."""

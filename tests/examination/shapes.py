@@ -1,9 +1,9 @@
 """Shapes of random heavy bodies: at rest and stable wherever there is a number.
 
 Bodies of one to three unequal segments, upright, hanging, horizontal and in random directions, with
-sum(W) L^2 / EI from 0.1 to 100, and rows of forces: none, equal ones, tiny ones, some slack tendons,
-up to three radians of bend. Seed 0. Energy, gradient and Hessian are computed once more here, by
-torch from the positions of the weights along products of transforms.
+sum(W) L^2 / EI from 0.1 to 100, and rows of forces: none, equal ones, tiny ones, some tendons
+slack, up to three radians of bend. Seed 0. Energy, gradient and Hessian are computed once more here,
+by torch from the positions of the weights along products of transforms.
 """
 
 from __future__ import annotations
@@ -233,7 +233,9 @@ def examine(full: bool) -> Iterator[Line]:
     for pose in POSES:
         imbalance, curvature, shortest = np.array(numbers[pose]).T
         n, worst, least = len(imbalance), imbalance.max(), curvature.min()
-        yield Line(f"{pose}: at rest", f"{n} rows, imbalance at most {worst:.1e}", bool(worst < 1e-9))
+        yield Line(
+            f"{pose}: at rest", f"{n} rows, imbalance at most {worst:.1e}", bool(worst < 1e-9)
+        )
         yield Line(f"{pose}: stable", f"curvature at least {least:.1e}", bool(least > 0.0))
         yield Line(f"{pose}: arcs", f"at least {shortest.min():.3f}", bool(shortest.min() >= LEAST))
         words = ", ".join(f"{count} {reason}" for reason, count in sorted(refused[pose].items()))

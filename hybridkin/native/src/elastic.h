@@ -166,7 +166,7 @@ HK_INLINE void HK(settle)(HK(elastic_t) e, const V *q, const HK(inside) * in, V 
     }
 }
 
-/* The arcs z (3 tip) of q. */
+/* The arcs z (3 tip) of q; NaN as the length of one that would be too short. */
 HK_INLINE void HK(elastic_arcs)(HK(elastic_t) e, const V *q, const HK(inside) * in, V *z) {
     V t[3 * HK_MAX_S];
     HK(settle)(e, q, in, t);
@@ -176,6 +176,10 @@ HK_INLINE void HK(elastic_arcs)(HK(elastic_t) e, const V *q, const HK(inside) * 
             z[i * e.tip + k] = t[3 * k + i] * own[HK_SHARE] + own[HK_REST + i];
             if (k) z[i * e.tip + k] = z[i * e.tip + k] - t[3 * k - 3 + i] * own[HK_BEHIND];
         }
+    for (int k = 0; k < e.tip; k++) {
+        const V least = SPLAT(R(HK_LEAST_LENGTH) * e.segments[HK_SEGMENT * k + HK_REST]);
+        z[k] = SELECT(z[k] >= least, z[k], SPLAT(R(NAN)));
+    }
 }
 
 /* J (rows, n) += C dz/dq, for C (rows, 3 tip): one balance of forces per row. */

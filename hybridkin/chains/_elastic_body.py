@@ -1,0 +1,41 @@
+"""Base class of elastic bodies, which have no shape where an arc would be too short."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from hybridkin._core.blocks import in_blocks
+from hybridkin._core.kernel_numbers import HK_LEAST_LENGTH
+from hybridkin._core.named_rows import named_rows, without_warnings
+from hybridkin.chains.arc_chain import ArcChain
+
+COMPRESSED = (
+    f"compressed: in {{rows}} an arc is below {HK_LEAST_LENGTH:g} of its rest length"
+)
+
+
+class ElasticBody(ArcChain):
+    """A chain of arcs in balance: NaN where it has no shape, outside of the domain."""
+
+    def domain_distance(self, q: Tensor) -> Tensor:
+        """Return 0 where the body has a shape and infinity where it has none, shape (...)."""
+
+        def distance(rows: Tensor) -> tuple[Tensor]:
+            has_shape = self._arcs_of_rows(rows).isfinite().all(0)
+            inside = 0.0 * rows.sum(1)
+            return (torch.where(has_shape, inside, torch.inf)[:, None],)
+
+        with without_warnings():
+            (distances,) = in_blocks(distance, self._rows(q))
+        return distances.reshape(q.shape[:-1])
+
+
+def why_not(words: str, q: Tensor, is_missing: Tensor, first: int = 0) -> str | None:
+    """Return `words` with the missing rows of q (N, n), numbered from `first` on; None if none."""
+    places = is_missing.nonzero()[:, 0].tolist()
+    if not places:
+        return None
+    rows = named_rows([first + place for place in places])
+    example = [float(f"{value:.6g}") for value in q[places[0]].tolist()]
+    return f"{words.format(rows=rows)} (first q: {example})."
