@@ -165,6 +165,9 @@ class ElasticTendonChain(ElasticBody):
     rule), which always terminates. For up to twelve tendons the linear responses of all sets of
     taut tendons are stored at first use; for more tendons they are computed row by row.
 
+    Where an arc would be shorter than a tenth of its rest length, results are NaN, with a warning
+    that names the row, and the row is outside of the domain (`in_domain`).
+
     Derivatives are those of the present set of taut tendons. If a tendon is just becoming taut,
     they are the one-sided derivatives towards the taut side.
 

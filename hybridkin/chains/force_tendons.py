@@ -102,9 +102,23 @@ class ForceTendonChain(ElasticBody):
 
     Notes
     -----
-    Newton's method on the energy of every row; derivatives follow from the implicit function
-    theorem. Heavy bodies can have several stable shapes; the one returned is reached from the rest
-    shape. The force of a tendon is the same along its path: no friction.
+    A search on the energy of every row starts at the rest shape and only goes downhill; derivatives
+    follow from the implicit function theorem. Heavy bodies can have several stable shapes; the one
+    returned is reached from the rest shape. The force of a tendon is the same along its path: no
+    friction.
+
+    A returned shape is at rest, to 1e-10 of the tendon forces and the weight with their moments,
+    and stable. A row without such a shape is NaN, with a warning that names it, and outside of the
+    domain (`in_domain`); in a log it is an error. There are two reasons.
+
+    "buckled": the body falls, and no load decides to which side. A straight, uniform body that
+    stands on its base falls where its weight times length squared is more than 7.84 times its
+    bending stiffness. A tendon, a rest bend or a tilt decides the side if its moment is more than
+    some millionths of weight times length. Then the shape is the fallen one on that side. It
+    depends continuously on q, except between sides, and `J` is large near them. A real body may
+    stay on the other side.
+
+    "compressed": an arc is shorter than a tenth of its rest length.
 
     `calibrate` can also fit "marker_offsets", the offsets of the markers in the frames of their
     places [m]. Forces identify the tendon radii only together with weight and stiffness: give the

@@ -2,7 +2,7 @@
 
 Bodies of one to three unequal segments, upright, hanging, horizontal and in random directions, with
 sum(W) L^2 / EI from 0.1 to 100, and rows of forces: none, equal ones, tiny ones, some tendons
-slack, up to three radians of bend. Seed 0. Energy, gradient and Hessian are computed once more here,
+slack, up to three radians of bend. Seed 0. Energy, gradient and Hessian are computed anew here,
 by torch from the positions of the weights along products of transforms.
 """
 
