@@ -18,7 +18,9 @@ from hybridkin._core.arrays import identity
 from hybridkin._core.kernel_numbers import HK_LEAST_LENGTH
 from hybridkin.chains._arcs import WorkOfGravity, segments_of
 
-_MOST_STEPS = 300
+_MOST_STEPS = (
+    1000  # a body that falls to one side and is pulled to another turns slowly
+)
 _TOLERANCE = 1e-10  # imbalance relative to the loads
 _SIDE = 2e-6  # relative load that decides to which side a body falls; 16 roundings of float32
 _FLAT = 1e-9  # relative curvature of the energy below which a shape is not stable
@@ -178,7 +180,11 @@ def shapes_of_least_energy(statics: Statics, forces: Tensor, start: Tensor) -> F
         size = live.imbalance.norm(dim=1)
         step = _downhill(live)
         at_rest = (size <= live.tol) & step.is_stable
-        found.outcome[live.row[step.is_stuck]] = Outcome.BUCKLED
+        stuck = live.take(step.is_stuck)
+        why = torch.where(
+            _is_short(statics, stuck), Outcome.COMPRESSED, Outcome.BUCKLED
+        )
+        found.outcome[stuck.row] = why
         if at_rest.any():
             _record(found, statics, live.take(at_rest))
         going = ~(at_rest | step.is_stuck)
@@ -265,14 +271,19 @@ def _move(statics: Statics, live: _Live, way: Tensor) -> None:
 
 def _record(found: Found, statics: Statics, live: _Live) -> None:
     """Put shapes at rest into the results, unless an arc is too short."""
-    lengths, *_ = live.arcs.chunk(3, dim=1)
-    least = HK_LEAST_LENGTH * statics.rest.chunk(3)[0]
-    long_enough = (lengths >= least).all(1)
-    found.outcome[live.row[~long_enough]] = Outcome.COMPRESSED
-    if not long_enough.all():
-        live = live.take(long_enough)
+    is_short = _is_short(statics, live)
+    found.outcome[live.row[is_short]] = Outcome.COMPRESSED
+    if is_short.any():
+        live = live.take(~is_short)
     eye = identity(live.hessian.shape[1], live.hessian).expand_as(live.hessian)
     inverse, _ = torch.linalg.solve_ex(live.hessian, eye)
     found.outcome[live.row] = Outcome.AT_REST
     found.arcs[:, live.row] = live.arcs.mT
     found.compliance[live.row] = statics.unit[:, None] * inverse * statics.unit
+
+
+def _is_short(statics: Statics, live: _Live) -> Tensor:
+    """Return which shapes (N,) have an arc that is too short."""
+    lengths, *_ = live.arcs.chunk(3, dim=1)
+    rest, *_ = statics.rest.chunk(3)
+    return (lengths < HK_LEAST_LENGTH * rest).any(1)

@@ -24,7 +24,7 @@ from hybridkin import ForceTendonChain
 
 ROWS = 8  # rows of forces for each body
 LEAST = 0.1  # length of an arc, relative to its rest length
-REASONS = {"buckled", "compressed"}
+REASONS = {"buckled", "compressed", "not at rest"}
 POSES = {"upright": 0.4, "hanging": 0.3, "horizontal": 0.1, "random": 0.2}
 
 
