@@ -5,23 +5,30 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridkin._core.kernel_numbers import HK_CREEP_ROUNDING
 from hybridkin.native.hysteresis import Stage
 
 
 def follow_in_numpy(
-    stages: list[Stage], rows: NDArray, steps: NDArray, state: NDArray, lead: bool
+    stages: list[Stage],
+    rows: NDArray,
+    steps: NDArray,
+    state: NDArray,
+    lead: bool,
+    rounding: float,
 ) -> NDArray:
     """Return rows (T, n) after the hysteresis; the state becomes that after the last row.
 
-    The arguments are those of `native.hysteresis.follow`, in the precision of the rows.
+    The arguments are those of `native.hysteresis.follow`.
     """
     parts = []
     first = 0
     for stage in stages:
         last = first + abs(stage.size) + 1
-        kind = _Plays if stage.size > 0 else _Creep
-        parts.append(kind(stage, state[first : last + 1]))
+        inside = state[first : last + 1]
+        if stage.size > 0:
+            parts.append(_Plays(stage, inside))
+        else:
+            parts.append(_Creep(stage, inside, rounding))
         first = last
     results = np.empty_like(rows)
     for t, row in enumerate(rows):
@@ -52,11 +59,9 @@ class _Plays(_Part):
 
     def __init__(self, stage: Stage, state: NDArray) -> None:
         super().__init__(state)
-        most = np.finfo(state.dtype).max / 4  # wider ones never move a tendon
-        half, slopes = stage.numbers
-        self.half = np.minimum(half, most).astype(state.dtype)
-        self.slopes = slopes.astype(state.dtype)
-        self.weights = np.diff(self.slopes, axis=0, prepend=0.0).astype(state.dtype)
+        self.half, self.slopes = stage.numbers
+        self.weights = np.diff(self.slopes, axis=0, prepend=0.0)
+        self.lag = (self.weights * self.half).sum(axis=0)
 
     def follow(self, seconds: float) -> None:
         """Follow the command."""
@@ -67,22 +72,24 @@ class _Plays(_Part):
         """Return the command (n,) for a result (n,), and follow it.
 
         Along a direction play k moves from the command ``begins[k]`` on, at the result
-        ``levels[k]``.
+        ``levels[k]``. Both ascend, also after rounding: then the piece that holds the goal has a
+        slope, and the command is within it.
         """
         side = np.sign(goal - self.result)
+        to = side * goal
         begins = side * self.inside + self.half
-        levels = np.empty_like(begins)
-        levels[0] = side * self.result
-        levels[1:] = levels[0] + np.cumsum(
-            self.slopes[:-1] * np.diff(begins, axis=0), 0
-        )
-        moving = (levels < side * goal).sum(axis=0) - 1  # the widest one
-        at = moving, np.arange(len(goal))
-        beyond = (side * goal - levels[at]) / self.slopes[at]
-        ahead = side * (begins[at] + beyond)
-        with_all = goal + side * (self.weights * self.half).sum(axis=0)
-        ahead = np.where(moving == len(levels) - 1, with_all, ahead)
-        command = np.where(side == 0.0, self.command, ahead)
+        begins[0] = np.maximum(begins[0], side * self.command)
+        begins = np.maximum.accumulate(begins, axis=0)
+        rises = self.slopes[:-1] * np.diff(begins, axis=0)
+        levels = np.cumsum(np.vstack([[side * self.result], rises]), axis=0)
+        n_moving = (levels < to).sum(axis=0)
+        at = n_moving - 1, np.arange(len(goal))
+        ends = np.vstack([begins[1:], np.full_like(goal, np.inf)])
+        with np.errstate(divide="ignore", invalid="ignore"):  # where nothing is to move
+            ahead = begins[at] + (to - levels[at]) / self.slopes[at]
+        ahead = np.where(n_moving == len(levels), to + self.lag, ahead)
+        ahead = np.clip(ahead, begins[at], ends[at])
+        command = np.where(n_moving == 0, self.command, side * ahead)
         self._move(command)
         self.result[:] = goal
         return command
@@ -93,12 +100,12 @@ class _Plays(_Part):
 
 
 class _Creep(_Part):
-    """Creep with the gains (J, n) and the time constants (J,)."""
+    """Creep with the gains (J, n) and the time constants (J,); see `follow` for `rounding`."""
 
-    def __init__(self, stage: Stage, state: NDArray) -> None:
+    def __init__(self, stage: Stage, state: NDArray, rounding: float) -> None:
         super().__init__(state)
-        gains, self.times = stage.numbers
-        self.gains = gains.astype(state.dtype)
+        self.gains, self.times = stage.numbers
+        self.rounding = rounding
 
     def follow(self, seconds: float) -> None:
         """Follow the command after some seconds."""
@@ -112,21 +119,22 @@ class _Creep(_Part):
         # y = (1 - sum of shares) q + shares @ slow, with the shares that have not come yet.
         shares = self.gains * late
         at_once = 1.0 - shares.sum(axis=0)
-        moved = (goal - (shares * self.inside).sum(axis=0)) / at_once
-        # Rounding is no reversal, after which a backlash before this stage would jump.
+        slow = (shares * self.inside).sum(axis=0)
+        # Rounding is no reversal, after which a backlash before this stage would jump, and a share
+        # at once that is only rounding moves nothing.
         size = np.abs(goal) + (shares * np.abs(self.inside)).sum(axis=0)
-        rounding = HK_CREEP_ROUNDING * np.finfo(goal.dtype).eps * size / at_once
-        still = np.abs(moved - self.command) <= rounding
-        command = np.where(still, self.command, moved)
+        change = goal - slow - at_once * self.command
+        moves = (np.abs(change) > self.rounding * size) & (at_once > self.rounding)
+        command = np.where(moves, (goal - slow) / at_once, self.command)
+        self.result[:] = np.where(moves, goal, at_once * command + slow)
         self._move(command, late)
-        self.result[:] = goal
         return command
 
     def _late(self, seconds: float) -> NDArray:
         """Return what is left (J, 1) of a change after some seconds."""
         with np.errstate(over="ignore", under="ignore"):  # far longer or shorter times
             late = np.exp(-seconds / self.times)
-        return late[:, None].astype(self.gains.dtype)
+        return late[:, None]
 
     def _move(self, command: NDArray, late: NDArray) -> None:
         self.inside[:] = command + late * (self.inside - command)

@@ -11,7 +11,15 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from hybridkin._core.arrays import Numbers, check_shape, labels, real_array
+from hybridkin._core.arrays import (
+    LARGEST,
+    Numbers,
+    check_shape,
+    countable,
+    labels,
+    real_array,
+)
+from hybridkin._core.kernel_numbers import HK_CREEP_ROUNDING
 from hybridkin.chains._stages import follow_in_numpy
 from hybridkin.native.hysteresis import Stage, follow, stage_numbers
 from hybridkin.native.library import available
@@ -80,7 +88,10 @@ class HysteresisOperator(ABC):
     ) -> tuple[Any, Any]:
         """Return the commands that give the effective changes y: the inverse of `apply`.
 
-        An actuator without creep whose effective change stays the same keeps its command.
+        Of several commands that give the same, where a slope is zero, it is the nearest to the last
+        one: an actuator without creep whose effective change stays the same keeps its command. A
+        command that could only move an actuator by rounding, as almost all of its motion creeps,
+        stays too. Rows in float32 are computed in float64.
 
         Parameters
         ----------
@@ -135,7 +146,7 @@ class HysteresisOperator(ABC):
         effective = np.empty_like(rows)
         for motion, steps in _motions(rows, groups, time):
             effective[motion], _ = self.apply(rows[motion], dt=steps)
-        return _like(effective, q)
+        return _like(effective, q, rows.dtype)
 
     def inner_states(
         self, q: NDArray, groups: ArrayLike, time: ArrayLike | None = None
@@ -173,13 +184,13 @@ class HysteresisOperator(ABC):
         lead: bool = False,
     ) -> tuple[Any, Any]:
         """Return effective changes (or with `lead` commands), and the last state."""
-        rows = np.array(real_array(motion, name), order="C")
+        given = real_array(motion, name)
+        rows = np.array(given, np.float64, order="C")
         check_shape(rows, name, ("T", self._size))
         n = rows.shape[1]
         if not n:
             raise ValueError(f"`{name}` must hold at least one actuator, got none.")
-        if not np.isfinite(rows).all():
-            raise ValueError(f"`{name}` must be finite, got NaN or infinity.")
+        _check_finite(rows, name)
         if dt is None:
             dt = 0.0
             if self.creeps and (len(rows) > 1 or state is not None):
@@ -191,12 +202,11 @@ class HysteresisOperator(ABC):
         steps = _checked_steps(dt, len(rows))
         stages = self.stages(n)
         last = self._start(rows, name, state, stage_numbers(stages).n_rows)
-        follow_rows = follow_in_numpy
-        if rows.dtype == np.float64 and available():
-            follow_rows = follow
+        follow_rows = follow if available() else follow_in_numpy
+        rounding = HK_CREEP_ROUNDING * float(np.finfo(given.dtype).eps)
         if len(rows):
-            rows = follow_rows(stages, rows, steps, last, lead)
-        return _like(rows, motion), _like(last, motion)
+            rows = follow_rows(stages, rows, steps, last, lead, rounding)
+        return _like(rows, motion, given.dtype), _like(last, motion, given.dtype)
 
     def _start(
         self, rows: NDArray, name: str, state: Numbers | None, n_rows: int
@@ -207,10 +217,9 @@ class HysteresisOperator(ABC):
                 need = "must hold at least one row if `state` is not given"
                 raise ValueError(f"`{name}` {need}.")
             return np.tile(rows[0], (n_rows, 1))
-        start = np.array(real_array(state, "state"), rows.dtype, order="C")
+        start = np.array(real_array(state, "state"), np.float64, order="C")
         check_shape(start, "state", (n_rows, rows.shape[1]), f"as {self!r} returns it")
-        if not np.isfinite(start).all():
-            raise ValueError(f"`state` must be finite, got {state!r:.200}.")
+        _check_finite(start, "state")
         return start
 
 
@@ -265,8 +274,19 @@ def _checked_steps(dt: ArrayLike, n_rows: int) -> NDArray:
     return np.broadcast_to(steps, n_rows)
 
 
-def _like(values: NDArray, caller: NDArray | Tensor) -> Any:
-    """Return values as a tensor if the caller gave one."""
+def _check_finite(values: NDArray, name: str) -> None:
+    """Raise if numbers are not finite."""
+    if not countable(values).all():
+        raise ValueError(
+            f"`{name}` must be finite, got NaN or infinity (more than {LARGEST:g} counts as "
+            "infinite)."
+        )
+
+
+def _like(values: NDArray, caller: NDArray | Tensor, dtype: np.dtype) -> Any:
+    """Return values in a precision, within its range, as a tensor if the caller gave one."""
+    largest = min(float(np.finfo(dtype).max), np.nextafter(LARGEST, 0.0))
+    rounded = values.clip(-largest, largest).astype(dtype)
     if isinstance(caller, Tensor):
-        return torch.tensor(values, device=caller.device)
-    return values
+        return torch.tensor(rounded, device=caller.device)
+    return rounded

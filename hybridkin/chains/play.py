@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from hybridkin._core.arrays import real_array
+from hybridkin._core.arrays import LARGEST, real_array
 from hybridkin.chains.hysteresis import HysteresisOperator
 from hybridkin.native.hysteresis import Stage
 
@@ -61,5 +61,10 @@ class PlayOperator(HysteresisOperator):
 
     def stages(self, n: int) -> list[Stage]:
         """Return the operator of n actuators as one stage of one play."""
-        half = np.broadcast_to(self.width / 2, (1, n))
+        half = np.broadcast_to(half_widths(self.width), (1, n))
         return [Stage(1, (half, np.ones((1, n))))]
+
+
+def half_widths(widths: NDArray) -> NDArray:
+    """Return half of the widths of plays, as far as they count: no command moves wider ones."""
+    return np.minimum(0.5 * widths, 2.0 * LARGEST)

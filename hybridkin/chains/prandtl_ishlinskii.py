@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hybridkin._core.arrays import real_array
+from hybridkin._core.arrays import LARGEST, countable, real_array
 from hybridkin.chains.hysteresis import HysteresisOperator
-from hybridkin.chains.play import PlayOperator
+from hybridkin.chains.play import PlayOperator, half_widths
 from hybridkin.native.hysteresis import Stage
 
 __all__ = ["PrandtlIshlinskiiOperator"]
@@ -19,7 +19,7 @@ class PrandtlIshlinskiiOperator(HysteresisOperator):
     With the results P_k of play operators of K widths, ``y = P_K + sum_k s_k (P_k - P_{k+1})``.
     After a reversal the first play moves first. While plays 1 to k move, y moves s_k times as far
     as the command; once all move, just as far. One play of width w has the slopes 0 below w and 1
-    above it.
+    above it. A single width without slopes is that play.
 
     Parameters
     ----------
@@ -62,11 +62,11 @@ class PrandtlIshlinskiiOperator(HysteresisOperator):
                 f"`widths` must be ascending finite numbers, zero or more, got {widths!r:.200}."
             )
         shape = f"({len(self.widths) - 1},)"
-        valid = _are_valid(self.slopes, (1, 2))
+        valid = _are_valid(self.slopes, (1, 2)) and countable(self.slopes).all()
         if not valid or len(self.slopes) + 1 != len(self.widths):
             raise ValueError(
                 f"`slopes` must have shape {shape}, or one such column for each actuator, and be "
-                f"finite, zero or more, got {slopes!r:.200}."
+                f"zero or more and below {LARGEST:g}, got {slopes!r:.200}."
             )
 
         # Bounds y = P_1 + sum_k (s_k - 1) (P_k - P_{k+1}).
@@ -85,8 +85,8 @@ class PrandtlIshlinskiiOperator(HysteresisOperator):
     def stages(self, n: int) -> list[Stage]:
         """Return the operator of n actuators as one stage of all plays."""
         slopes = np.ones((len(self.widths), n))  # the last are 1
-        slopes[:-1] = self.slopes.reshape(len(self.slopes), -1)
-        half = np.broadcast_to(0.5 * self.widths[:, None], slopes.shape)
+        slopes[:-1] = self.slopes if self.slopes.ndim == 2 else self.slopes[:, None]
+        half = np.broadcast_to(half_widths(self.widths)[:, None], slopes.shape)
         return [Stage(len(half), (half, slopes))]
 
     def _inside(self, q: NDArray, steps: NDArray | None) -> NDArray:

@@ -319,7 +319,7 @@ def _code(plan: Plan, controller: _Controller | None, dtype: str) -> Entries:
     if dtype == "float32":
         lines.insert(0, "#define HK_FLOAT")
 
-    data = plan.data.astype(dtype)
+    data = _in_range(plan.data, dtype)
     return {
         "DEFINES": "\n".join(lines),
         "CODE": literals(plan.code),
@@ -331,6 +331,13 @@ def _code(plan: Plan, controller: _Controller | None, dtype: str) -> Entries:
         "OPERATIONS": f"{_operations(plan):,}",
         **step,
     }
+
+
+def _in_range(values: NDArray, dtype: str) -> NDArray:
+    """Return numbers in a dtype; finite ones stay finite, such as widths that never end."""
+    largest = float(np.finfo(dtype).max)
+    finite = np.isfinite(values)
+    return np.where(finite, values.clip(-largest, largest), values).astype(dtype)
 
 
 def _step_code(plan: Plan, task: _Task, n_spaces: int) -> Entries:

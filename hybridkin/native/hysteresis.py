@@ -75,7 +75,12 @@ def stage_numbers(stages: list[Stage]) -> StageNumbers:
 
 
 def follow(
-    stages: list[Stage], rows: NDArray, steps: NDArray, state: NDArray, lead: bool
+    stages: list[Stage],
+    rows: NDArray,
+    steps: NDArray,
+    state: NDArray,
+    lead: bool,
+    rounding: float,
 ) -> NDArray:
     """Return rows (T, n) after the hysteresis; the state becomes that after the last row.
 
@@ -84,13 +89,16 @@ def follow(
     stages : list of Stage
         The operator.
     rows : ndarray of shape (T, n)
-        Commands, or effective changes if `lead`; contiguous float64.
+        Commands, or effective changes if `lead`; contiguous float64, below 1e75 in size.
     steps : ndarray of shape (T,)
         Time since the row before [s].
     state : ndarray of shape (R, n)
         The state before the first row, contiguous.
     lead : bool
         Whether to return commands for effective changes instead of the reverse.
+    rounding : float
+        Rounding of the rows, relative to their size: smaller changes are no reversals of what is
+        before creep.
     """
     described = stage_numbers(stages)
     code = np.array(described.code, dtype=np.int32)
@@ -98,5 +106,5 @@ def follow(
     seconds = np.array(steps)
     arrays = (code, described.numbers, seconds, rows, state, results)
     places = [address(array) for array in arrays]
-    opened_library().hk_hysteresis_rows(*rows.shape, lead, *places)
+    opened_library().hk_hysteresis_rows(*rows.shape, lead, rounding, *places)
     return results

@@ -115,7 +115,7 @@ def _fault(opened: ctypes.CDLL) -> str:
     opened.hk_ik_tick.argtypes = [pointer]
     opened.hk_evaluate.restype = None
     opened.hk_hysteresis_rows.restype = None
-    sizes = [ctypes.c_int64, ctypes.c_int32, ctypes.c_int32]
+    sizes = [ctypes.c_int64, ctypes.c_int32, ctypes.c_int32, ctypes.c_double]
     opened.hk_hysteresis_rows.argtypes = [*sizes, *[pointer] * 6]
     if not _is_right(opened):
         return "computes wrong numbers"

@@ -146,10 +146,10 @@ HK_API int32_t hk_evaluate_row(const hk_row *row, const real *q, int32_t asked, 
 
 /* Rows (rows, n) through hysteresis, see hysteresis.h: commands, or with `lead` what the actuators are
    to do, `seconds` (rows) after the row before. The results are what they do, or the commands. */
-HK_API void hk_hysteresis_rows(int64_t rows, int32_t n, int32_t lead, const int32_t *code,
-                               const real *numbers, const real *seconds, const real *given,
-                               real *state, real *results) {
-    const hk_hysteresis h = {code, numbers, n};
+HK_API void hk_hysteresis_rows(int64_t rows, int32_t n, int32_t lead, real rounding,
+                               const int32_t *code, const real *numbers, const real *seconds,
+                               const real *given, real *state, real *results) {
+    const hk_hysteresis h = {code, numbers, n, rounding};
     const real *y = state + (code[HK_STATE_ROWS] - 1) * n;
     for (int64_t r = 0; r < rows; r++, given += n, results += n) {
         for (int j = 0; j < n; j++) *(lead ? results + j : state + j) = given[j];

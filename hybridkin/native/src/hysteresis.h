@@ -16,7 +16,10 @@ typedef struct {
     const int32_t *code;
     const real *numbers;
     int n;
+    real rounding; /* of a result of creep, relative to its parts */
 } hk_hysteresis;
+
+static inline real hk_larger(real a, real b) { return a > b ? a : b; }
 
 static inline int hk_stage_rows(int count) { return count < 0 ? -count : count; }
 
@@ -43,26 +46,29 @@ static inline void hk_plays_apply(int n, int count, const real *half, const real
 
 /* The sums y (n) become `goal` (n), and that the commands for them; u (n) are the commands before.
    Along the direction of an actuator the plays begin to move in the order of their widths, and y is
-   piecewise linear in u. */
+   piecewise linear in u. The pieces ascend, also after rounding: then the one that holds the goal has
+   a slope, and the command is within it. */
 static inline void hk_plays_command(int n, int count, const real *half, const real *slopes,
                                     const real *u, real *plays, real *y, real *goal) {
     for (int j = 0; j < n; j++) {
         const real to = goal[j], side = to > y[j] ? R(1.0) : R(-1.0);
-        real from = side * plays[j] + half[j], level = side * y[j];
-        real lag = slopes[j] * half[j], slope = slopes[j];
+        real from = hk_larger(side * plays[j] + half[j], side * u[j]), end = from;
+        real level = side * y[j], lag = slopes[j] * half[j], slope = slopes[j];
         int at = j + n;
         for (; at < count * n; at += n) {
-            const real begin = side * plays[at] + half[at], next = level + slope * (begin - from);
+            end = hk_larger(side * plays[at] + half[at], from);
+            const real next = level + slope * (end - from);
             if (!(next < side * to)) break;
-            from = begin, level = next;
+            from = end, level = next;
             lag += (slopes[at] - slope) * half[at], slope = slopes[at];
         }
         if (to == y[j])
             goal[j] = u[j];
-        else if (at < count * n)
-            goal[j] = side * (from + (side * to - level) / slope);
-        else /* all of them move */
-            goal[j] = to + side * lag;
+        else if (at < count * n) {
+            const real ahead = from + (side * to - level) / slope;
+            goal[j] = side * (ahead < end ? ahead : end);
+        } else /* all of them move */
+            goal[j] = side * hk_larger(side * to + lag, from);
         y[j] = to;
     }
     for (int at = 0; at < count * n; at += n)
@@ -88,20 +94,22 @@ static inline void hk_creep_apply(int n, int count, const real *gains, const rea
 
 /* As `hk_plays_command`. */
 static inline void hk_creep_command(int n, int count, const real *gains, const real *times,
-                                    real seconds, const real *u, real *slow, real *y, real *goal) {
+                                    real seconds, real rounding, const real *u, real *slow, real *y,
+                                    real *goal) {
     real late[HK_MAX_CREEPS];
     hk_late(count, times, seconds, late);
     for (int j = 0; j < n; j++) {
-        real at_once = R(1.0), left = goal[j], size = goal[j] < R(0.0) ? -goal[j] : goal[j];
+        real at_once = R(1.0), from = R(0.0), size = hk_larger(goal[j], -goal[j]);
         for (int i = 0; i < count; i++) {
             const real share = gains[n * i + j] * late[i], part = share * slow[n * i + j];
-            at_once -= share, left -= part, size += part < R(0.0) ? -part : part;
+            at_once -= share, from += part, size += hk_larger(part, -part);
         }
-        /* Rounding is no reversal, after which a backlash before this stage would jump. */
-        const real moved = left / at_once, change = moved - u[j];
-        const real rounding = HK_CREEP_ROUNDING * HK_EPS * size / at_once;
-        y[j] = goal[j];
-        goal[j] = (change < R(0.0) ? -change : change) > rounding ? moved : u[j];
+        /* Rounding is no reversal, after which a backlash before this stage would jump, and a share
+           at once that is only rounding moves nothing. */
+        const real stay = from + at_once * u[j], change = goal[j] - stay;
+        const int moves = at_once > rounding && hk_larger(change, -change) > rounding * size;
+        y[j] = moves ? goal[j] : stay;
+        goal[j] = moves ? (goal[j] - from) / at_once : u[j];
     }
     for (int i = 0; i < count; i++, slow += n)
         for (int j = 0; j < n; j++) slow[j] = goal[j] + late[i] * (slow[j] - goal[j]);
@@ -141,7 +149,7 @@ static inline void hk_hysteresis_command(const hk_hysteresis *h, real seconds, r
         if (count > 0)
             hk_plays_command(n, count, a, a + size, u, inside, y, goal);
         else
-            hk_creep_command(n, -count, a, a + size, seconds, u, inside, y, goal);
+            hk_creep_command(n, -count, a, a + size, seconds, h->rounding, u, inside, y, goal);
         y = u;
     }
     for (int j = 0; j < n; j++) state[j] = goal[j];

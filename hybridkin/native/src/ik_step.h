@@ -76,7 +76,8 @@ static inline ik_settings ik_settings_of(const int32_t *code, const real *data, 
         .normals = c + 2 * n,
         .spaces = c + (2 + n_normals) * n,
         .offsets = c + (2 + n_normals) * n + more[3] * m,
-        .hysteresis = {more + IK_STAGES, c + (2 + n_normals) * n + more[3] * (m + 1), n},
+        .hysteresis = {more + IK_STAGES, c + (2 + n_normals) * n + more[3] * (m + 1), n,
+                       HK_CREEP_ROUNDING * HK_EPS},
     };
     return ik;
 }
@@ -244,8 +245,6 @@ static HK_NOINLINE void ik_limited_step(const ik_settings *ik, const real *J, co
     default: IK_OF(ik->m, ik_limited_step_of, ik->n, ik, J, v, slides, trust, s);
     }
 }
-
-static inline real ik_larger(real a, real b) { return a > b ? a : b; }
 
 /* The largest first step for which steps that shrink by `change` stop within `way`. */
 static inline real ik_stopping(real way, real change) {
@@ -496,7 +495,7 @@ static void ik_clear_slack(const ik_settings *ik, real *J) {
     real size[HK_MAX_N], largest = R(0.0);
     for (int j = 0; j < ik->n; j++) {
         size[j] = ik_column(ik, J, j);
-        largest = ik_larger(size[j], largest);
+        largest = hk_larger(size[j], largest);
     }
     for (int j = 0; j < ik->n; j++)
         if (ik->pulls[j] != R(0.0) && size[j] <= IK_SLACK * largest)
@@ -562,10 +561,10 @@ static void ik_arrive(const ik_settings *ik, const real *q, const real *x, const
     ik_end end = {.J = ik_slot(ik, IK_END)}, pulled = {.J = ik_slot(ik, IK_END + 1)};
     IK_OF(m, ik_rows_of, n, J, s->dq, promised);
     for (int j = 0; j < n; j++) end.dq[j] = s->dq[j];
-    ik_approach(ik, q, x, promised, ik_larger(R(0.5) * ik_norm(m, promised), slip), s, &end);
+    ik_approach(ik, q, x, promised, hk_larger(R(0.5) * ik_norm(m, promised), slip), s, &end);
     for (int i = 0; i < m; i++) left[i] = v[i] - promised[i] + end.missing[i];
     const real rounding = R(1.0) + HK_MATH(sqrt)(HK_EPS); /* a slack tendon does not move the tip */
-    const real most = ik_norm(m, left), close = ik_larger(R(0.5) * ik_norm(m, v), slip);
+    const real most = ik_norm(m, left), close = hk_larger(R(0.5) * ik_norm(m, v), slip);
     for (real share = R(1.0); most > close && share > IK_LEAST_PULL; share *= IK_PULL_RATIO) {
         ik_copy_end(ik, &end, &pulled);
         if (!ik_pull_in(ik, s, share, &pulled)) break;
@@ -674,7 +673,7 @@ static inline int ik_is_rotation(const real *T) {
         for (int j = 0; j <= i; j++) {
             real product = i == j ? R(-1.0) : R(0.0);
             for (int l = 0; l < 3; l++) product += T[4 * l + i] * T[4 * l + j];
-            off = ik_larger(ik_abs(product), off);
+            off = hk_larger(ik_abs(product), off);
         }
     }
     const real det = T[0] * (T[5] * T[10] - T[6] * T[9]) - T[1] * (T[4] * T[10] - T[6] * T[8]) +
@@ -701,7 +700,7 @@ static inline void ik_try_ends(const ik_settings *ik, const ik_state *now, real 
     ik_try(ik, now, seconds, high, ends->upper);
     for (int j = 0; j < ik->n; j++) {
         ends->lower[j] -= y[j];
-        ends->upper[j] = ik_larger(ends->upper[j] - y[j], ends->lower[j]);
+        ends->upper[j] = hk_larger(ends->upper[j] - y[j], ends->lower[j]);
     }
 }
 
