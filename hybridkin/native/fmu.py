@@ -17,6 +17,7 @@ from xml.etree.ElementTree import Element, SubElement, indent, tostring
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridkin._core.arrays import LARGEST
 from hybridkin._core.files import check_outputs, write_file
 from hybridkin._core.texts import xml_text
 from hybridkin._core.version import __version__
@@ -37,6 +38,27 @@ _PROCESSORS = {"AMD64": "x86_64", "arm64": "aarch64"}
 _SUFFIXES = {"linux": ".so", "darwin": ".dylib", "win32": ".dll"}
 _LIMITS = {"q_min": "low", "q_max": "high", "dq_max": "speed", "ddq_max": "accel"}
 _TIME = 0  # value reference
+_WHO_SETS = {"input": "ALWAYS", "output": "NEVER", "parameter": "ALWAYS"}
+_LEAST = np.finfo(float).tiny  # above zero
+_MOST = float(np.nextafter(LARGEST, 0.0))
+
+
+class Need(NamedTuple):
+    """What the numbers of a variable must be: in words, and as their least and largest value."""
+
+    words: str
+    low: float
+    high: float
+
+
+_NEEDS = {
+    "q_min": Need("numbers", -np.inf, np.inf),
+    "q_max": Need("numbers", -np.inf, np.inf),
+    "dq_max": Need("positive", _LEAST, np.inf),
+    "ddq_max": Need("positive", _LEAST, np.inf),
+}
+_START = Need(f"finite, below {LARGEST:g}", -_MOST, _MOST)
+_MEMORY = Need("zero or a time in s", 0.0, np.finfo(float).max)
 
 
 class Variable(NamedTuple):
@@ -54,6 +76,10 @@ class Variable(NamedTuple):
         Its dimensions; () for a number.
     start : ndarray or None
         Value before the user sets one; None for outputs.
+    need : Need or None
+        What its numbers must be; None for inputs, which may be anything.
+    variability : {"", "tunable", "fixed"}
+        Of a parameter, whether it may change after the initialization.
     """
 
     name: str
@@ -61,6 +87,8 @@ class Variable(NamedTuple):
     about: str
     shape: tuple[int, ...]
     start: NDArray | None = None
+    need: Need | None = None
+    variability: str = ""
 
     @property
     def size(self) -> int:
@@ -172,19 +200,26 @@ def _variables(project: CProject) -> list[Variable]:
         ]
     target = np.ravel(project.controller.tracker(project.home).x)
     width = target.shape
+    home = project.home
     rows = (plan.n_outputs,)
-    gain, beta, *_ = project.controller.settings.kernel_rates()
-    number = np.array
+    gain, beta, dt, _ = project.controller.settings.kernel_rates()
+    rate = 1.0 / dt
+    gain = rate if gain < 0.0 else gain
+    beta = min(beta, rate)
+    most = (1.0 + 1e-9) * rate
+    by_rate = f"up to {rate:.6g} 1/s, which is 1 / period"
+    need_gain = Need(f"positive and {by_rate}", _LEAST, most)
+    need_beta = Need(f"zero or {by_rate}", 0.0, most)
     variables = [
         Variable(
             "target", "input", str(project.entries["ABOUT_TARGET"]), width, target
         ),
         Variable("velocity", "input", "of the target [m/s]", rows, np.zeros(rows)),
         Variable("measured", "input", "tip, or NaN", width, np.full(width, np.nan)),
-        Variable("start", "parameter", "command at rest", (n,), project.home),
-        Variable("gain", "parameter", "of the error [1/s]", (), number(gain)),
-        Variable("beta", "parameter", "of the posture [1/s]", (), number(beta)),
-        Variable("memory", "parameter", "of measurements [s]", (), number(0.0)),
+        Variable("start", "parameter", "command at rest", (n,), home, _START, "fixed"),
+        _tunable("gain", "of the error [1/s]", gain, need_gain),
+        _tunable("beta", "of the posture [1/s]", beta, need_beta),
+        _tunable("memory", "of measurements [s]", 0.0, _MEMORY),
         Variable("command", "output", project.about_q, (n,)),
         Variable("tip", "output", "of the model at the command, as target", width),
         Variable("error", "output", "distance to the target [m]", ()),
@@ -196,13 +231,30 @@ def _variables(project: CProject) -> list[Variable]:
     for limit, values in zip(_LIMITS, project.limits, strict=True):
         if np.isfinite(values).all():
             about = f"{_LIMITS[limit]} of q, in its unit and s"
-            variables.append(Variable(limit, "parameter", about, (n,), values))
+            variables.append(_tunable(limit, about, values, _NEEDS[limit]))
     return variables
+
+
+def _tunable(name: str, about: str, start: NDArray | float, need: Need) -> Variable:
+    """Return a parameter that may change between steps."""
+    values = np.asarray(start)
+    return Variable(name, "parameter", about, values.shape, values, need, "tunable")
 
 
 def _place(variable: Variable) -> str:
     """Return the name in C of where a variable begins."""
     return f"V_{variable.name.upper()}"
+
+
+def _in_table(variable: Variable, begin: int) -> str:
+    """Return the entry of a variable in the table of the C code."""
+    who = "BEFORE" if variable.variability == "fixed" else _WHO_SETS[variable.causality]
+    low, high, words = "0.0", "0.0", "NULL"
+    if variable.need is not None:
+        low, high = literals(np.array(variable.need[1:])).strip(",\n ").split(", ")
+        words = f'"{variable.need.words}"'
+    numbers = f"{begin}, {variable.size}, {who}, {low}, {high}"
+    return f'{{"{variable.name}", {numbers}, {words}}}'
 
 
 def _entries(variables: list[Variable]) -> dict[str, str]:
@@ -213,8 +265,7 @@ def _entries(variables: list[Variable]) -> dict[str, str]:
     begin = 0
     for variable in variables:
         offsets.append(f"{_place(variable)} = {begin}")
-        may_be_set = int(variable.start is not None)
-        table.append(f"{{{begin}, {variable.size}, {may_be_set}}}")
+        table.append(_in_table(variable, begin))
         start = np.zeros(variable.size) if variable.start is None else variable.start
         starts.append(np.ravel(start))
         begin += variable.size
@@ -252,6 +303,9 @@ def _description(project: CProject, variables: list[Variable], token: str) -> by
     if project.controller is not None:
         _, _, dt, _ = project.controller.settings.kernel_rates()
         unit.set("fixedInternalStepSize", repr(dt))
+    categories = SubElement(root, "LogCategories")
+    about = "what was refused, and why"
+    SubElement(categories, "Category", name="logStatusError", description=about)
     listed = SubElement(root, "ModelVariables")
     structure = SubElement(root, "ModelStructure")
     SubElement(
@@ -271,8 +325,8 @@ def _description(project: CProject, variables: list[Variable], token: str) -> by
             causality=variable.causality,
             description=xml_text(variable.about),
         )
-        if variable.causality == "parameter":
-            entry.set("variability", "tunable")
+        if variable.variability:
+            entry.set("variability", variable.variability)
         if variable.start is not None:
             numbers = (repr(float(number)) for number in np.ravel(variable.start))
             entry.set("start", " ".join(numbers).replace("nan", "NaN"))

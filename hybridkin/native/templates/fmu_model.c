@@ -5,6 +5,11 @@ static void start_unit(instance_t *unit) {
     values[V_DOMAIN_DISTANCE] = @NAME@_domain(values + V_Q);
 }
 
+static int check_together(const instance_t *unit) {
+    (void)unit;
+    return FMI_OK;
+}
+
 static int step_unit(instance_t *unit, double step) {
     (void)step;
     start_unit(unit);

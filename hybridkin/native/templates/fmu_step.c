@@ -22,16 +22,35 @@ static void start_unit(instance_t *unit) {
     unit->values[V_STATUS] = 0.0;
 }
 
-/* As many periods as fit into the step, with the limits and gains of the instance. */
+/* The settings, with the limits and gains of the instance. */
+static ik_settings settings_of(const instance_t *unit, real *work) {
+    const double *values = unit->values;
+    ik_settings ik = ik_settings_of(code, data, @ROOT@, work);
+@PARAMETERS@
+    ik.gain = values[V_GAIN];
+    ik.beta = values[V_BETA];
+    return ik;
+}
+
+/* Check parameters against each other, which an importer sets one by one. */
+static int check_together(const instance_t *unit) {
+    real work[STEP_WORK];
+    const ik_settings ik = settings_of(unit, work);
+    for (int j = 0; ik.flags & IK_LIMITED && j < @N@; j++)
+        if (!(ik.low[j] <= ik.high[j]))
+            return refused(unit, "q_min must not exceed q_max, got %g and %g", ik.low[j],
+                           ik.high[j]);
+    return FMI_OK;
+}
+
+/* As many periods as fit into the step. */
 static int step_unit(instance_t *unit, double step) {
     const double *values = unit->values;
     const double periods = floor(step / @DT@ + 0.5);
     real work[STEP_WORK];
-    ik_settings ik = ik_settings_of(code, data, @ROOT@, work);
-    if (periods < 1.0 || fabs(step - periods * @DT@) > 1e-6 * step) return FMI_ERROR;
-@PARAMETERS@
-    ik.gain = values[V_GAIN];
-    ik.beta = values[V_BETA];
+    const ik_settings ik = settings_of(unit, work);
+    if (!(periods >= 1.0 && periods <= 1e9 && fabs(step - periods * @DT@) <= 1e-6 * step))
+        return refused(unit, "a step must be a multiple of %g s, got %g s", @DT@, step);
     unit->state.memory = values[V_MEMORY];
     /* Without a measurement, and without a memory of the last one, the tip is that of the model. */
     const double *measured = values + V_MEASURED;
