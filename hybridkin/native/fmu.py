@@ -39,7 +39,7 @@ _SUFFIXES = {"linux": ".so", "darwin": ".dylib", "win32": ".dll"}
 _LIMITS = {"q_min": "low", "q_max": "high", "dq_max": "speed", "ddq_max": "accel"}
 _TIME = 0  # value reference
 _WHO_SETS = {"input": "ALWAYS", "output": "NEVER", "parameter": "ALWAYS"}
-_LEAST = np.finfo(float).tiny  # above zero
+_LEAST = float(np.nextafter(0.0, 1.0))  # above zero
 _MOST = float(np.nextafter(LARGEST, 0.0))
 
 
@@ -113,6 +113,9 @@ def export_fmu(
     without limits, 1 limits restricted it, 2 held, because an input is not finite), with hysteresis
     effective (what the actuators do), and as parameters the start, the limits, gain, beta and
     memory. A step of the simulation must be a multiple of its period.
+
+    Parameters are checked as in Python. All but the start may change between steps. A call that is
+    refused returns fmi3Error, logs the reason (category logStatusError), and changes nothing.
 
     Parameters
     ----------

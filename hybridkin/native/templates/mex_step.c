@@ -11,7 +11,10 @@ static void reset(mxArray *out[], const mxArray *argument) {
     const double *given = numbers(argument, @N@, "@NAME@('reset', q): q must hold @N@ numbers.");
     @NAME@_state state;
     @REAL@ q[@N@];
-    for (int j = 0; j < @N@; j++) q[j] = (@REAL@)given[j];
+    for (int j = 0; j < @N@; j++) {
+        q[j] = (@REAL@)given[j];
+        if (!isfinite(q[j])) mexErrMsgIdAndTxt("@NAME@:argument", "@NAME@('reset', q): q must be finite.");
+    }
     @NAME@_reset(&state, q);
     out[0] = packed(&state);
 }
