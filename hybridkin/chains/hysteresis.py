@@ -15,7 +15,6 @@ from hybridkin._core.arrays import (
     LARGEST,
     Numbers,
     check_shape,
-    countable,
     labels,
     real_array,
 )
@@ -190,7 +189,7 @@ class HysteresisOperator(ABC):
         n = rows.shape[1]
         if not n:
             raise ValueError(f"`{name}` must hold at least one actuator, got none.")
-        _check_finite(rows, name)
+        rows = _finite(rows, name)
         if dt is None:
             dt = 0.0
             if self.creeps and (len(rows) > 1 or state is not None):
@@ -219,8 +218,7 @@ class HysteresisOperator(ABC):
             return np.tile(rows[0], (n_rows, 1))
         start = np.array(real_array(state, "state"), np.float64, order="C")
         check_shape(start, "state", (n_rows, rows.shape[1]), f"as {self!r} returns it")
-        _check_finite(start, "state")
-        return start
+        return _finite(start, "state")
 
 
 def _motions(
@@ -274,18 +272,16 @@ def _checked_steps(dt: ArrayLike, n_rows: int) -> NDArray:
     return np.broadcast_to(steps, n_rows)
 
 
-def _check_finite(values: NDArray, name: str) -> None:
-    """Raise if numbers are not finite."""
-    if not countable(values).all():
-        raise ValueError(
-            f"`{name}` must be finite, got NaN or infinity (more than {LARGEST:g} counts as "
-            "infinite)."
-        )
+def _finite(values: NDArray, name: str) -> NDArray:
+    """Return numbers as far as sums of them are finite; raise if they are not."""
+    if not np.isfinite(values).all():
+        raise ValueError(f"`{name}` must be finite, got NaN or infinity.")
+    return values.clip(-LARGEST, LARGEST)
 
 
 def _like(values: NDArray, caller: NDArray | Tensor, dtype: np.dtype) -> Any:
     """Return values in a precision, within its range, as a tensor if the caller gave one."""
-    largest = min(float(np.finfo(dtype).max), np.nextafter(LARGEST, 0.0))
+    largest = min(float(np.finfo(dtype).max), float(LARGEST))
     rounded = values.clip(-largest, largest).astype(dtype)
     if isinstance(caller, Tensor):
         return torch.tensor(rounded, device=caller.device)

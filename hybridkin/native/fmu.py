@@ -17,7 +17,6 @@ from xml.etree.ElementTree import Element, SubElement, indent, tostring
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridkin._core.arrays import LARGEST
 from hybridkin._core.files import check_outputs, write_file
 from hybridkin._core.texts import xml_text
 from hybridkin._core.version import __version__
@@ -40,7 +39,7 @@ _LIMITS = {"q_min": "low", "q_max": "high", "dq_max": "speed", "ddq_max": "accel
 _TIME = 0  # value reference
 _WHO_SETS = {"input": "ALWAYS", "output": "NEVER", "parameter": "ALWAYS"}
 _LEAST = float(np.nextafter(0.0, 1.0))  # above zero
-_MOST = float(np.nextafter(LARGEST, 0.0))
+_MOST = float(np.finfo(float).max)
 
 
 class Need(NamedTuple):
@@ -57,8 +56,8 @@ _NEEDS = {
     "dq_max": Need("positive", _LEAST, np.inf),
     "ddq_max": Need("positive", _LEAST, np.inf),
 }
-_START = Need(f"finite, below {LARGEST:g}", -_MOST, _MOST)
-_MEMORY = Need("zero or a time in s", 0.0, np.finfo(float).max)
+_START = Need("finite", -_MOST, _MOST)
+_MEMORY = Need("zero or a time in s", 0.0, _MOST)
 
 
 class Variable(NamedTuple):

@@ -89,7 +89,7 @@ def follow(
     stages : list of Stage
         The operator.
     rows : ndarray of shape (T, n)
-        Commands, or effective changes if `lead`; contiguous float64, below 1e75 in size.
+        Commands, or effective changes if `lead`; contiguous float64, at most 1e75 in size.
     steps : ndarray of shape (T,)
         Time since the row before [s].
     state : ndarray of shape (R, n)

@@ -180,11 +180,22 @@ def test_one_width_is_a_play():
                 np.testing.assert_allclose(found, wanted, rtol=0.0, atol=1e-15)
 
 
-@pytest.mark.parametrize("size", [1e76, 1e308, np.inf, np.nan])
-def test_numbers_too_large_to_compute_with_count_as_infinite(size):
-    operator = PrandtlIshlinskiiOperator([0.0, 1.0], [0.5])
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("size", [1e30, 1e75, 1e154, 1e308, np.inf, np.nan])
+def test_finite_numbers_have_finite_results_and_others_are_refused(size, dtype):
+    operator = HysteresisSeries(
+        [PrandtlIshlinskiiOperator([0.0, 1.0, 1e300], [0.5, 0.0]), CreepOperator([0.9], [1.0])]
+    )
+    with np.errstate(over="ignore"):
+        far = np.array([[0.0], [size], [-size], [1.0]], dtype)
+    _, state = operator.apply(far[:1])
     for run, name in ((operator.apply, "q"), (operator.command, "y")):
-        with pytest.raises(ValueError, match=f"`{name}` must be finite"):
-            run(np.array([[size]]))
-    with pytest.raises(ValueError, match="`state` must be finite"):
-        operator.apply(np.zeros((1, 1)), np.full((4, 1), size))
+        if np.isfinite(far).all():
+            rows, end = run(far, state, 1.0)
+            assert np.isfinite(rows).all()
+            assert np.isfinite(run(far, end, 1.0)[0]).all()
+        else:
+            with pytest.raises(ValueError, match=f"`{name}` must be finite"):
+                run(far, state, 1.0)
+            with pytest.raises(ValueError, match="`state` must be finite"):
+                run(far[:1], np.full_like(state, far[1, 0]), 1.0)
