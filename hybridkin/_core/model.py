@@ -301,7 +301,7 @@ class FunctionModel(ForwardModel):
     Parameters
     ----------
     function : nn.Module or callable
-        Works row by row.
+        Works row by row. A module computes in the dtype of its parameters.
     jacobian : callable, optional
         Maps q to dx/dq (..., m, n). Default: reverse mode.
     """
@@ -317,13 +317,13 @@ class FunctionModel(ForwardModel):
 
     def forward(self, q: Tensor) -> Tensor:
         """Return x of shape (..., m)."""
-        return _checked(self.function(q))
+        return _called(self.function, q)
 
     def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return x (..., m) and dx/dq (..., m, n)."""
         if self.derivative is None:
             return reverse_jacobian(self, q)
-        return self(q), _checked(self.derivative(q))
+        return self(q), _called(self.derivative, q)
 
 
 @runtime_checkable
@@ -443,13 +443,19 @@ def slopes(x: Tensor, leaf: Tensor, create_graph: bool = False) -> Tensor:
     return torch.stack(rows, dim=-2)
 
 
-def _checked(x: object) -> Tensor:
+def _called(function: Function, q: Tensor) -> Tensor:
+    """Return what a function gives for q; a module computes in the dtype of its parameters."""
+    dtype = q.dtype
+    if isinstance(function, nn.Module):
+        dtypes = (weight.dtype for weight in function.parameters())
+        dtype = next((kind for kind in dtypes if kind.is_floating_point), dtype)
+    x = function(q.to(dtype))
     if not isinstance(x, Tensor):
         raise TypeError(
             f"`model` must return torch tensors, got {type(x).__name__}; for NumPy functions use "
             "`tasks.PositionTask.from_numpy(function, jacobian)`."
         )
-    return x
+    return x if dtype == q.dtype else x.to(q.dtype)
 
 
 def _described(module: nn.Module | None) -> Stored | None:

@@ -477,6 +477,8 @@ class HybridForwardModel(HybridPredictor):
         mechanical = self.mechanical_model
         if mechanical is not None:
             mechanical = as_forward_model(copy.deepcopy(mechanical))
+            # A function does not tell how many, but its rows do.
+            mechanical.n_actuators = mechanical.n_actuators or rows.X.shape[1]
         names = ()
         if isinstance(mechanical, Chain):
             check_unscaled("X", rows.X, "actuator vectors [m or rad]")

@@ -495,6 +495,7 @@ class _CoreTask(Task):
         self.check = task.check
         self.difference = task.difference
         self.distances = task.distances
+        self.positions = task.positions
         self.evaluate = core.evaluate
         self._programs = programs
 

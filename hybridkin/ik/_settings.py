@@ -261,6 +261,8 @@ class StepSettings(Portable):
         low, high = self.box(target.double())
         largest = torch.maximum(low.abs(), high.abs()).clamp(max=LARGEST)
         positions = self.task.positions(target)
+        if positions.shape[-1] == 0:
+            return positions.new_zeros(len(positions))
         missed = self.task.models[0].misses(positions, largest)
         worst_point = missed[..., None].flatten(1).amax(-1)
         return worst_point * min(self.task.units)

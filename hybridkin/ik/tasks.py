@@ -29,7 +29,7 @@ Tolerance: TypeAlias = float | tuple[float, ...]
 class Task:
     """A controlled quantity: x(q), its Jacobian, and the error of x to a target in m rows.
 
-    A subclass sets the attributes and defines `evaluate` and `difference`.
+    A subclass sets `shape`, `parts`, `units` and `models`, and defines `evaluate` and `difference`.
 
     Attributes
     ----------
@@ -105,8 +105,11 @@ class Task:
         return error.norm(dim=-1).view(-1, k)
 
     def positions(self, x: Tensor) -> Tensor:
-        """Return the positions in x ``(..., *shape)`` [m]."""
-        return x[..., :3, 3] if self.has_rotation else x
+        """Return the positions of the models in x ``(..., *shape)`` [m], (..., 0) if unknown.
+
+        They tell which targets no configuration can reach.
+        """
+        return x.flatten(x.ndim - len(self.shape))[..., :0]
 
     def check(self, x_target: Tensor, name: str) -> None:
         """Raise if targets ``(..., *shape)`` are not valid, e.g. their rotations."""
@@ -235,6 +238,10 @@ class PositionTask(Task):
         """Return x_target - x."""
         return x_target - x
 
+    def positions(self, x: Tensor) -> Tensor:
+        """Return x."""
+        return x
+
 
 class PoseTask(Task):
     """Task to bring the tip to a pose, position and orientation: six rows.
@@ -298,6 +305,10 @@ class PoseTask(Task):
         R = x_target[..., :3, :3] @ x[..., :3, :3].mT
         turn = self.units[1] * rotation_vector(R)
         return torch.cat([displacement, turn], dim=-1)
+
+    def positions(self, x: Tensor) -> Tensor:
+        """Return the positions of poses (..., 4, 4), shape (..., 3)."""
+        return x[..., :3, 3]
 
     def distances(self, x: Tensor, x_target: Tensor) -> Tensor:
         """Return distances of x to targets, with chords instead of angles of rotations."""
@@ -394,9 +405,19 @@ class PointsTask(Task):
         weights = x.new_tensor(self.units)[:, None]
         return (weights * (x_target - x)).flatten(-2)
 
+    def positions(self, x: Tensor) -> Tensor:
+        """Return the points, x."""
+        return x
+
 
 def as_task(model: object) -> Task:
     """Return a task unchanged, and for a model the task to bring its tip to a point."""
+    if isinstance(model, (list, tuple)) and any(isinstance(a, Task) for a in model):
+        raise TypeError(
+            f"`model` must be one task, got {len(model)} of them; for several points of a backbone "
+            "use tasks.PointsTask, for position and orientation tasks.PoseTask, for anything else "
+            "a subclass of tasks.Task."
+        )
     return model if isinstance(model, Task) else PositionTask(model)
 
 

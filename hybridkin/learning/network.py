@@ -204,6 +204,7 @@ class ELM(LeverageModule):
         check_vectors(q, n_inputs, "q", f"this ELM was fitted on {n_inputs} inputs")
         # Merging the scaling into W and b would lose digits if the range is narrow.
         u = (q - self.input_center.to(q)) / self.input_scale.to(q)
+        u = u + 0.0 * u  # NaN where infinite, as in the kernels
         W = self.input_weights.to(q)
         b = self.input_bias.to(q)
         if out is None:
