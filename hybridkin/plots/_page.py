@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable
-from contextlib import redirect_stdout
 from typing import Any
 
 import numpy as np
 from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 
+from hybridkin._core.page_server import page_server, stop
 from hybridkin._core.texts import visible
 from hybridkin.plots._canvas import COLORS
 from hybridkin.plots._scene import Line, Scene
@@ -28,19 +27,16 @@ def page(
 ) -> str:
     """Return the page as HTML that needs no other file."""
     try:
-        import viser
+        server = page_server("127.0.0.1", 0)
     except ImportError as error:
         raise ImportError(
             '`path` ends in .html, which needs viser: pip install "hybridkin[view]", or '
             "save as .gif or .mp4."
         ) from error
-    with redirect_stdout(io.StringIO()):  # it prints, also if not verbose
-        server = viser.ViserServer("127.0.0.1", 0, verbose=False)
     try:
         return _recorded(server, scene, fps, progress)
     finally:
-        with redirect_stdout(io.StringIO()):
-            server.stop()
+        stop(server)
 
 
 def _recorded(

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import io
 import itertools
 import time
 from collections.abc import Callable
-from contextlib import redirect_stdout
 from pathlib import Path
 from threading import Event, Thread
 from typing import Any
@@ -15,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Self
 
+from hybridkin._core.page_server import page_server, stop
 from hybridkin._core.texts import csv_table, markdown, visible
 from hybridkin.chains.chain import Chain
 from hybridkin.datasets import Log
@@ -66,7 +65,8 @@ def view(
         Limits of position, speed and acceleration [unit of q, s]. Default: those of the model and
         its description; else the range of the log, and one second for the whole range.
     host : str, default="127.0.0.1"
-        Address to listen to. The default can be reached from this machine alone.
+        Address to listen to. The default can be reached from this machine alone, and by no page
+        but this one.
     port : int, default=8080
         Port; the next free one if it is taken.
 
@@ -79,6 +79,8 @@ def view(
     ------
     ImportError
         Without viser.
+    RuntimeError
+        If this version of viser cannot be kept from pages of others.
     TypeError
         If the model has no mechanical part that can be drawn.
     ValueError
@@ -137,17 +139,13 @@ class LiveView:
         port: int,
     ) -> None:
         try:
-            import viser
+            self._server = page_server(host, port, label="hybridkin")
         except ImportError as error:
             raise ImportError(
                 'a live view needs viser: pip install "hybridkin[view]".'
             ) from error
         self.robot = robot
         self.ticks_per_second = 0.0
-        with redirect_stdout(io.StringIO()):  # it prints, also if not verbose
-            self._server = viser.ViserServer(
-                host, port, verbose=False, label="hybridkin"
-            )
         self.address = f"http://{host}:{self._server.get_port()}"
         self._wake = Event()
         self._closed = False
@@ -224,8 +222,7 @@ class LiveView:
             self._closed = True
             self._wake.set()
             self._thread.join()
-            with redirect_stdout(io.StringIO()):
-                self._server.stop()
+            stop(self._server)
 
     def wait(self) -> None:
         """Wait until the view is closed, or Ctrl-C; an error of the drawing is raised here."""
@@ -249,6 +246,7 @@ class LiveView:
         """Add words, sliders and buttons."""
         gui = self._server.gui
         robot = self.robot
+        gui.configure_theme(show_share_button=False)  # it would not be heard
         self._words = gui.add_markdown("")
         self._add_sliders()
         with gui.add_folder("Show", expand_by_default=len(self._switched) > 1):
