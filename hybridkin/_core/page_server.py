@@ -146,7 +146,7 @@ def _deaf(receive: Callable[[], Any]) -> Callable[[], Any]:
     return until_closed
 
 
-def _is_ours(raw: object) -> bool:
+def _is_ours(raw: Any) -> bool:
     """Return whether a message is one of those that the page of a view sends."""
     from msgspec import msgpack
     from viser._messages import Message

@@ -77,7 +77,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return failed(f"error: {error}", 2, arguments.json)
     text = report.json() if arguments.json else report.plain()
     if report.paths and not arguments.json:
-        text = "\n  ".join([f"{text}\n\nWrote", *map(str, report.paths)])
+        text = "\n  ".join([f"{text}\n\nWrote", *map(visible, report.paths)])
     try:
         write(text, sys.stdout)
     except BrokenPipeError:  # `head` has what it wants
@@ -213,7 +213,8 @@ def _view(arguments: argparse.Namespace, stages: Stages) -> _Result:
     place = {"host": arguments.host, "port": arguments.port}
     with hybridkin.view(loaded, log, path=path, **vars(limits), **place) as shown_robot:
         address = shown_robot.address
-        stages.note(f"{loaded.name} is at {address}. Ctrl-C ends it.", important=True)
+        words = f"{visible(loaded.name)} is at {address}. Ctrl-C ends it."
+        stages.note(words, important=True)
         if not arguments.no_browser and "SSH_CONNECTION" not in os.environ:
             webbrowser.open(address)
         with contextlib.suppress(KeyboardInterrupt):
