@@ -237,7 +237,11 @@ class ForwardModel(PortableModule):
 
     def in_domain(self, q: Tensor) -> Tensor:
         """Return whether q lies inside the domain of the model, shape (...), bool."""
-        return self.domain_distance(q) <= 1.0
+        return (self.domain_distance(q) <= 1.0) & self.has_shape(q)
+
+    def has_shape(self, q: Tensor) -> Tensor:
+        """Return whether the robot has a shape at q, shape (...), bool: elastic ones may not."""
+        return torch.ones_like(q[..., 0], dtype=torch.bool)
 
     @property
     def plane(self) -> tuple[Tensor, Tensor] | None:

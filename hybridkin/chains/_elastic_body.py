@@ -16,19 +16,17 @@ COMPRESSED = (
 
 
 class ElasticBody(ArcChain):
-    """A chain of arcs in balance: NaN where it has no shape, outside of the domain."""
+    """A chain of arcs in balance; results are NaN where it has no shape."""
 
-    def domain_distance(self, q: Tensor) -> Tensor:
-        """Return 0 where the body has a shape and infinity where it has none, shape (...)."""
+    def has_shape(self, q: Tensor) -> Tensor:
+        """Return whether the body has a shape at q (..., n), shape (...), bool."""
 
-        def distance(rows: Tensor) -> tuple[Tensor]:
-            has_shape = self._arcs_of_rows(rows).isfinite().all(0)
-            inside = 0.0 * rows.sum(1)
-            return (torch.where(has_shape, inside, torch.inf)[:, None],)
+        def known(rows: Tensor) -> tuple[Tensor]:
+            return (self._arcs_of_rows(rows).isfinite().all(0)[:, None],)
 
-        with without_warnings():
-            (distances,) = in_blocks(distance, self._rows(q))
-        return distances.reshape(q.shape[:-1])
+        with torch.no_grad(), without_warnings():
+            (rows,) = in_blocks(known, self._rows(q))
+        return rows.reshape(q.shape[:-1])
 
 
 def why_not(words: str, q: Tensor, is_missing: Tensor, first: int = 0) -> str | None:

@@ -344,6 +344,12 @@ class HybridModule(Hybrid):
         """Return the largest distance from the training rows of guards and groups, (...)."""
         return in_blocks(lambda rows: (self._distance(rows),), q)[0][..., 0]
 
+    def has_shape(self, q: Tensor) -> Tensor:
+        """Return whether the mechanical model has a shape at q, shape (...), bool."""
+        if self.mechanical is None:
+            return super().has_shape(q)
+        return self.mechanical.has_shape(q)
+
     def _parts(self) -> list[tuple[float, TipCorrection]]:
         """Return pairs of weight and correction."""
         corrections = cast("list[TipCorrection]", [*self.corrections])
@@ -389,10 +395,10 @@ class HybridModule(Hybrid):
         return total, trust
 
     def _distance(self, q: Tensor) -> Tensor:
-        """Return the largest distance of the robot, guards and groups at rows q, (N, 1)."""
+        """Return the largest distance of any guard, and of the groups, at rows q, (N, 1)."""
         guards = [correction.guard for _, correction in self._parts()]
         farthest = q.new_zeros(len(q))
-        for measure in (self.mechanical, *guards, self.tested):
+        for measure in (*guards, self.tested):
             if measure is not None:
                 farthest = torch.maximum(farthest, measure.domain_distance(q))
         return farthest[:, None]

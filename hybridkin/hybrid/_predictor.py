@@ -270,10 +270,9 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """Return the distance from the domain of rows q (N, n): infinite without a shape."""
         (distance,) = self._tips(q, value=False, distance=True, enough=1.0)
         plausible = self._plausible_rows
-        if self._chain is not None and plausible is not None and not plausible.hold(q):
-            with torch.no_grad():
-                of_chain = self._chain.domain_distance(torch.from_numpy(q))
-            distance = np.maximum(distance, of_chain.numpy())
+        if self._chain is not None and not (plausible and plausible.hold(q)):
+            has_shape = self._chain.has_shape(torch.from_numpy(q))
+            distance = np.where(has_shape.numpy(), distance, np.inf)
         return (distance,)
 
     def _are_states_seen(self, X: object) -> NDArray[np.bool_]:

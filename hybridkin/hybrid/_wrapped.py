@@ -84,6 +84,10 @@ class Wrapped(PoseModel):
         """Return the distance from the training rows of what the other model gets, (...)."""
         return self.model.domain_distance(self._inner(q))
 
+    def has_shape(self, q: Tensor) -> Tensor:
+        """Return whether the other model has a shape, (...), bool."""
+        return self.model.has_shape(self._inner(q))
+
     def _inner(self, q: Tensor) -> Tensor:
         """Return what the other model gets for q."""
         return q
@@ -324,6 +328,10 @@ class Stacked(Hybrid):
         distances = [tip.domain_distance(q) for tip in self._tips()]
         return torch.stack(distances).amax(0)
 
+    def has_shape(self, q: Tensor) -> Tensor:
+        """Return whether the mechanical models of all markers have a shape, (...), bool."""
+        return torch.stack([tip.has_shape(q) for tip in self._tips()]).all(0)
+
     def _tips(self) -> list[Hybrid]:
         return cast("list[Hybrid]", [*self.tips])
 
@@ -430,6 +438,10 @@ class WithPose(Hybrid, PoseModel):
         """Return the largest distance from the training rows of guards and groups, (...)."""
         return self.learned.domain_distance(q)
 
+    def has_shape(self, q: Tensor) -> Tensor:
+        """Return whether the mechanical model has a shape, (...), bool."""
+        return self.mechanical.has_shape(q)
+
     def pose(self, q: Tensor) -> Tensor:
         """Return the tip's pose in the measuring frame, shape (..., 4, 4)."""
         return in_blocks(self._pose, q)[0]
@@ -486,6 +498,10 @@ class PoseRows(ForwardModel):
     def domain_distance(self, q: Tensor) -> Tensor:
         """Return the distance from the training rows, shape (...)."""
         return self.model.domain_distance(q)
+
+    def has_shape(self, q: Tensor) -> Tensor:
+        """Return whether the model has a shape, (...), bool."""
+        return self.model.has_shape(q)
 
 
 def in_columns(model: ForwardModel, output: str) -> ForwardModel:

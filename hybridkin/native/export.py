@@ -27,6 +27,7 @@ from hybridkin._core.kernel_numbers import (
     c_header,
 )
 from hybridkin._core.model import ForwardModel, as_forward_model
+from hybridkin._core.named_rows import without_warnings
 from hybridkin._core.plan import NoKernel, Plan
 from hybridkin._core.rotations import rotation
 from hybridkin._core.texts import c_comment, markdown
@@ -451,7 +452,7 @@ def _vectors(
     far = np.concatenate([usual, np.linspace(0.8, 5.0, 8), [math.nan]])
     rows = center + half * far[:, None] * rng.uniform(-1.0, 1.0, (17, len(half)))
     rows = rows.astype(dtype)
-    with torch.no_grad():
+    with torch.no_grad(), without_warnings():
         at = torch.from_numpy(rows.astype(float))
         pairs = [double.forward_and_jacobian(at) for double in doubles]
         x = torch.cat([x for x, _ in pairs], dim=1).numpy()

@@ -1,5 +1,7 @@
 """Heavy bodies and hard pulls: shapes are at rest and stable, or there is none and a reason."""
 
+import shutil
+import subprocess
 import sys
 import warnings
 from collections import Counter
@@ -18,7 +20,7 @@ from hybridkin import (
     InverseKinematics,
     calibrate,
 )
-from hybridkin.native import available
+from hybridkin.native import available, export_c
 from hybridkin.native.library import evaluate
 
 sys.path.append(str(Path(__file__).parents[1] / "examination"))
@@ -121,7 +123,7 @@ def test_no_arc_is_shorter_than_a_tenth():
     assert (body.in_domain(pull) == ~is_short).all()
 
 
-def test_rows_are_named_beyond_the_first_block_and_in_hybrids():
+def test_rows_are_named_beyond_the_first_block():
     body = ForceTendonChain([0.01], [0.1], 0.02, 20.0, arcs=1)
     q = torch.full((9000, 3), 0.5, dtype=torch.float64)
     q[8500] = 10.0
@@ -208,13 +210,30 @@ def test_elastic_tendons_do_not_turn_a_body_inside_out():
 
 def test_hybrids_name_compressed_rows():
     body = _elastic()
-    q = np.random.default_rng(0).uniform(-0.03, 0.03, (40, 3))
-    model = HybridForwardModel(body, "drop").fit(q, body(torch.from_numpy(q)).numpy())
+    rng = np.random.default_rng(0)
+    q = rng.uniform(-0.03, 0.03, (40, 3))
+    x = body(torch.from_numpy(q)).numpy() + 1e-4 * rng.normal(size=(40, 3))
+    model = HybridForwardModel(body, "drop").fit(q, x)
     far = np.vstack([q[:2], [[-0.15, -0.15, -0.15]]])
     with pytest.warns(UserWarning, match="compressed: in row 2 "):
         x = model.predict(far)
     assert np.isfinite(x).all(axis=1).tolist() == [True, True, False]
     assert model.in_domain(far).tolist() == [True, True, False]
+    adapted = silently(model.adapt, q[:8], x[:8] + 0.001)
+    for module in (model.module_, adapted.module_):
+        assert module.in_domain(torch.from_numpy(far)).tolist() == [True, True, False]
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
+@pytest.mark.slow
+def test_exported_c_agrees_on_compressed_rows(tmp_path):
+    ik = InverseKinematics(_elastic(), q_min=-0.2, q_max=0.05, dt=0.02, dq_max=0.5)
+    export_c(ik, tmp_path, name="robot")
+    sources = [tmp_path / "robot.c", tmp_path / "robot_test.c"]
+    program = tmp_path / "check"
+    subprocess.run(["cc", "-std=c99", "-O1", "-o", program, *sources, "-lm"], check=True)
+    checked = subprocess.run([program], capture_output=True, text=True, check=False)
+    assert checked.returncode == 0, checked.stdout
 
 
 def test_random_elastic_bodies_have_no_short_arc_and_plausible_rows_none():
