@@ -216,8 +216,8 @@ def test_hybrids_name_compressed_rows():
     model = HybridForwardModel(body, "drop").fit(q, x)
     far = np.vstack([q[:2], [[-0.15, -0.15, -0.15]]])
     with pytest.warns(UserWarning, match="compressed: in row 2 "):
-        x = model.predict(far)
-    assert np.isfinite(x).all(axis=1).tolist() == [True, True, False]
+        predicted = model.predict(far)
+    assert np.isfinite(predicted).all(axis=1).tolist() == [True, True, False]
     assert model.in_domain(far).tolist() == [True, True, False]
     adapted = silently(model.adapt, q[:8], x[:8] + 0.001)
     for module in (model.module_, adapted.module_):
