@@ -157,6 +157,71 @@ def test_creep_that_leaves_nothing_at_once_keeps_the_command(path, dtype, follow
     np.testing.assert_allclose(creep.apply(q, state, 0.0)[0], 1.0, rtol=1e-6)
 
 
+# Widths, slopes, a state and a goal where rounding makes a play begin before a narrower one.
+ROUNDED = {
+    "float64": (
+        [
+            0.0,
+            2.4999439376807972e-06,
+            3.268289654979436e-06,
+            7.559584646855175e-06,
+            9.561076596816487e-06,
+            9.695512590536306e-06,
+        ],
+        [2.5, 2.5, 0.0, 0.0, 10000.0],
+        [
+            0.00012130057232713488,
+            0.00012130057232713488,
+            0.00012255054429597526,
+            0.00012293471715462458,
+            0.00012508036465056245,
+            0.00012608111062554312,
+            0.00012614832862240302,
+            -0.0005501170020454155,
+        ],
+        -0.0005501170020454156,
+    ),
+    "float32": (
+        [
+            0.1797123716072571,
+            0.284147344928694,
+            0.39809227727691,
+            0.49920159056447627,
+            0.8440834602854704,
+            0.8587492846662481,
+        ],
+        [0.001, 0.001, 0.0, 1e-09, 0.0],
+        [
+            -0.4296039044857025,
+            -0.33974772691726685,
+            -0.28753024339675903,
+            -0.23055776953697205,
+            -0.1800031065940857,
+            -0.007562160491943359,
+            -0.00022926926612854004,
+            -0.0003384726296644658,
+        ],
+        -0.00033847265876829624,
+    ),
+}
+
+
+@pytest.mark.parametrize(("path", "dtype", "follow"), [(k, *v) for k, v in paths().items()])
+def test_a_slope_of_zero_gives_no_infinite_command(path, dtype, follow, monkeypatch):
+    monkeypatch.setattr(operators, "available", lambda: True)
+    monkeypatch.setattr(operators, "follow", follow)
+    widths, slopes, state, goal = ROUNDED[np.dtype(dtype).name]
+    hysteresis = PrandtlIshlinskiiOperator(widths, slopes)
+    before = np.array(state, dtype)[:, None]
+    goals = np.array([[goal], [0.0], [goal]], dtype)  # the later ones were infinite too
+    q, after = hysteresis.command(goals, before)
+    assert np.isfinite(q).all()
+    assert np.isfinite(after).all()
+    reached, _ = hysteresis.apply(q, before)
+    close = apart(hysteresis, 1, dtype, goals, q, before, after)
+    np.testing.assert_allclose(reached, goals, rtol=0.0, atol=close)
+
+
 def test_single_precision_is_double_precision_rounded():
     rng = np.random.default_rng(0)
     for _ in range(20):

@@ -77,7 +77,7 @@ def test_a_target_that_no_configuration_reaches_is_still_proven():
         (PointsTask(TRUNK, [2.0, 3.0]), np.stack([far, far], axis=1)),
     ):
         ik = InverseKinematics(task, **LIMITS)
-        assert (ik.settings.misses(torch.from_numpy(target)) > 7.0).all()
+        assert (ik.settings.misses(torch.from_numpy(target)) > 0.5).all()
         assert ik.solve(target).status == IKStatus.UNREACHABLE
 
 
