@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 
 import torch
@@ -14,6 +15,7 @@ from torch.autograd import grad
 
 from hybridkin._core.arrays import as_array
 from hybridkin._core.blocks import check_tensor
+from hybridkin._core.derived import KEPT, entries_of
 from hybridkin._core.html import html_table
 from hybridkin._core.stored import KINDS_OF_MODELS, Layout, Restore, Stored
 
@@ -41,8 +43,8 @@ class Portable:
 
     def __getstate__(self) -> dict[str, Any]:
         state = vars(self).copy()  # one copy: another thread may add its program
-        state.pop("_program", None)
-        state.pop("_lock", None)
+        for name in ("_program", "_lock", KEPT):
+            state.pop(name, None)
         return _portable(state)
 
     def __copy__(self) -> Self:
@@ -71,17 +73,24 @@ class _Pickled:
     def __init__(self, tensor: Tensor) -> None:
         self.array = tensor.numpy(force=True)
         self.device = str(tensor.device)
+        is_leaf = tensor.requires_grad and tensor.is_leaf  # a copy has no graph
+        self.learned = isinstance(tensor, nn.Parameter), is_leaf
 
-    def __reduce__(self) -> tuple[Callable[..., Tensor], tuple[NDArray, str]]:
-        return _restored, (self.array, self.device)
+    def __reduce__(self) -> tuple[Callable[..., Tensor], tuple[Any, ...]]:
+        if self.learned == (False, False):
+            return _restored, (self.array, self.device)
+        return _restored, (self.array, self.device, *self.learned)
 
 
-def _restored(array: NDArray, device: str) -> Tensor:
+def _restored(
+    array: NDArray, device: str, parameter: bool = False, requires_grad: bool = False
+) -> Tensor:
     tensor = torch.tensor(array, device="cpu")
-    try:
-        return tensor.to(device)
-    except (AssertionError, RuntimeError):  # this machine lacks the device
-        return tensor
+    with suppress(AssertionError, RuntimeError):  # this machine may lack the device
+        tensor = tensor.to(device)
+    if parameter:
+        return nn.Parameter(tensor, requires_grad)
+    return tensor.requires_grad_(requires_grad)
 
 
 class PortableModule(Portable, nn.Module):
@@ -92,6 +101,8 @@ class PortableModule(Portable, nn.Module):
 
     # no kind: it could only be stored as code.
     layout: ClassVar[Layout] = Layout("", {})
+    # Entries of states of earlier versions that are computed from the others now.
+    computed: ClassVar[tuple[str, ...]] = ()
 
     def stored(self) -> Stored:
         """Return the description of the module: kind, settings, arrays and parts.
@@ -107,13 +118,16 @@ class PortableModule(Portable, nn.Module):
         parts = {name: _described(self._modules.get(name)) for name in layout.parts}
         settings = {name: vars(self)[name] for name in layout.settings}
         arrays = {}
-        for name in layout.arrays:
-            buffer = self._buffers[name]
-            arrays[name] = None if buffer is None else buffer.detach()
+        for name, entry in zip(layout.arrays, self.entries(), strict=True):
+            arrays[name] = None if entry is None else entry.detach()
         stored = Stored.of(layout.kind, arrays, parts, **settings)
         for name in layout.derived:
-            stored.derived[name] = as_array(self.get_buffer(name).detach())
+            stored.derived[name] = as_array(getattr(self, name).detach())
         return stored
+
+    def entries(self) -> list[Tensor | None]:
+        """Return the entries of the state that describe the module, in the order of `layout`."""
+        return entries_of(self, [*self.layout.arrays])
 
     @classmethod
     def from_stored(cls, stored: Stored, restore: Restore) -> Self:
@@ -125,6 +139,13 @@ class PortableModule(Portable, nn.Module):
             part = stored.parts.get(name)
             arguments[name] = None if part is None else restore(part)
         return cls(**arguments)
+
+    def _load_from_state_dict(
+        self, state_dict: dict[str, Any], prefix: str, *others: Any
+    ) -> None:
+        for name in self.computed:
+            state_dict.pop(prefix + name, None)
+        super()._load_from_state_dict(state_dict, prefix, *others)
 
     if TYPE_CHECKING:  # attributes that no statement assigns are buffers
 
@@ -249,8 +270,11 @@ class ForwardModel(PortableModule):
         return None
 
     def frozen(self) -> Self:
-        """Return a copy, which does not change with this model."""
-        return copy.deepcopy(self)
+        """Return a copy without derivatives by its state, which does not change with this model."""
+        twin = copy.deepcopy(self)
+        for entry in (*twin.parameters(), *twin.buffers()):
+            entry.requires_grad_(False)
+        return twin
 
     # Serial coupling corrects a model at inner coordinates z between q and x. By default z is q.
 

@@ -24,13 +24,13 @@ class Layout(NamedTuple):
     kind : str
         Name of the class.
     arrays : dict of str to str
-        Buffers, with one letter per axis as in `Stored.tensors`.
+        The state, buffers or parameters, with one letter per axis as in `Stored.tensors`.
     settings : dict of str to type
         Plain attributes.
     parts : tuple of str
         Submodules, lists of them, or None.
     derived : tuple of str
-        Buffers computed from the others. Kernels use them; files do not contain them.
+        Tensors computed from the state. Kernels use them; files do not contain them.
     write_plan : callable, optional
         Called with a plan and a description of this kind: writes its node into the plan and returns
         the place. None: the class has no kernel.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import difflib
 import warnings
 from collections.abc import Sequence
@@ -252,7 +251,7 @@ def fit_geometry(
     one_of(loss, "loss", LOSSES)
     returns_tensors = isinstance(q, Tensor)
     device = chain.geometry()["base"].device
-    chain = copy.deepcopy(chain).cpu()  # the solver runs on the CPU, without a graph
+    chain = chain.frozen().cpu()  # the solver runs on the CPU, without a graph
     q, x, unit_messages = check_data(chain, q, x)
     if groups is not None:
         groups = labels(groups, len(q))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -175,7 +174,7 @@ def choose_geometry(
     """
     one_of(loss, "loss", LOSSES)
     nominal = chain
-    chain = copy.deepcopy(chain).cpu()
+    chain = chain.frozen().cpu()
     q, x, _ = check_data(chain, q, x)
     motions = None if groups is None else labels(groups, len(q))
     if weights is not None:

@@ -198,10 +198,6 @@ class ArcChain(MarkedChain):
         self._set_markers([(float(self.n_segments), 0.0, 0.0, 0.0)])
         return geometry
 
-    def _set_geometry(self, geometry: Mapping[str, Tensor | None]) -> None:
-        for name in self._entries:
-            self.register_buffer(name, geometry.get(name))
-
     def forward(self, q: Tensor) -> Tensor:
         """Return the tip position.
 

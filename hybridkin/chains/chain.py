@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from hybridkin._core.arrays import check_shape, countable
 from hybridkin._core.blocks import check_tensor, check_vectors, in_blocks
+from hybridkin._core.derived import KEPT, entries_of
 from hybridkin._core.html import numbers
 from hybridkin._core.model import PoseModel
 from hybridkin._core.plausible import PlausibleRows
@@ -27,7 +28,9 @@ _FAR = 50.0  # robot sizes; some extensible robots are long and thin
 class Chain(PoseModel):
     """A mechanical model of a robot: q -> tip position, with a geometry.
 
-    A subclass lists its geometry buffers in `_entries` and its other attributes in `_structure`.
+    Its state is its geometry: buffers, or parameters in their place. Whatever else `forward` needs
+    is `derived` from them. A subclass lists the entries in `_entries` and its other attributes in
+    `_structure`.
 
     Attributes
     ----------
@@ -71,8 +74,8 @@ class Chain(PoseModel):
 
     def geometry(self) -> dict[str, Tensor]:
         """Return the geometry by name, as in the constructor; entries that are None are omitted."""
-        entries = {name: self._buffers[name] for name in self._entries}
-        return {name: value for name, value in entries.items() if value is not None}
+        entries = zip(self._entries, entries_of(self, self._entries), strict=True)
+        return {name: value for name, value in entries if value is not None}
 
     def unit_of(self, name: str) -> str:
         """Return the unit of an entry of the geometry: "m", "rad", "-" or another one."""
@@ -110,11 +113,10 @@ class Chain(PoseModel):
         nn.Module.__init__(chain)
         for name in self._structure:
             chain.__dict__[name] = self.__dict__[name]
-        buffers = self._buffers | geometry
-        if set(geometry) <= {"base"}:  # no other buffer depends on it
-            chain._buffers.update(buffers)
-        else:
-            chain._set_geometry(buffers)
+        chain.__dict__[KEPT] = dict(self.__dict__.get(KEPT, {}))
+        chain._parameters.update(self._parameters)
+        chain._buffers.update(self._buffers)
+        chain._set_geometry(geometry)
         return chain
 
     def near_last_shapes(self) -> Self:
@@ -126,8 +128,14 @@ class Chain(PoseModel):
         return self
 
     def _set_geometry(self, geometry: Mapping[str, Tensor | None]) -> None:
-        """Register the buffers of `_entries` and those computed from them."""
-        raise NotImplementedError
+        """Register entries of the geometry, parameters as such and other tensors as buffers."""
+        for name, value in geometry.items():
+            if isinstance(value, nn.Parameter):
+                self._buffers.pop(name, None)
+                self.register_parameter(name, value)
+            else:
+                self._parameters.pop(name, None)
+                self.register_buffer(name, value)
 
     def geometry_jacobian(self, q: Tensor, tangents: Mapping[str, Tensor]) -> Tensor:
         """Return the derivative of the tip along P changes of the geometry, shape (..., 3, P).

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from hybridkin._core.arrays import Numbers, Transform, as_array, identity
 from hybridkin._core.blocks import in_blocks
+from hybridkin._core.derived import derived
 from hybridkin._core.plan import NoKernel, Plan
 from hybridkin._core.plausible import PlausibleRows
 from hybridkin._core.stored import Layout, Stored
@@ -40,6 +41,14 @@ _TENDONS = (
     ("radii", "base"),
     ("radii", "turns", "rest_bends", "base"),
     ("radii", "turns", "rest_bends", "lengths", "tool", "base"),
+)
+_SHAPING = (
+    "radii",
+    "angles",
+    "lengths",
+    "rest_bends",
+    "actuator_zeros",
+    "gains",
 )
 _CONTRADICTED = 0.3  # share of the readings that the arcs explain, in one segment
 _NOTICED = 0.1  # share of the radius: the reading of a bend of 0.1 rad
@@ -162,6 +171,7 @@ class ConstantCurvatureChain(ArcChain):
         derived=("arc_matrix", "arc_offset"),
         write_plan=_write_plan,
     )
+    computed = layout.derived
     _structure = (*ArcChain._structure, "bends", "stage")
 
     bends: tuple[int, ...]  # number of directions in which each segment bends
@@ -206,7 +216,7 @@ class ConstantCurvatureChain(ArcChain):
                 '`stage` must be None or "rotation"; "rotation" needs a first segment with one '
                 f"actuator and without a length, got {stage!r}."
             )
-        self._set_geometry({**geometry, "actuator_zeros": zeros})
+        self._set_geometry({"lengths": None, **geometry, "actuator_zeros": zeros})
 
     @property
     def default_parameters(self) -> tuple[str, ...]:
@@ -359,7 +369,8 @@ class ConstantCurvatureChain(ArcChain):
 
     def longest(self, largest: Tensor) -> Tensor:
         """Return the sum of the largest lengths of arcs and of the rigid parts."""
-        arcs = (self.arc_matrix.abs() * largest).sum(1) + self.arc_offset.abs()
+        matrix, offset = self._arc_map()
+        arcs = (matrix.abs() * largest).sum(1) + offset.abs()
         return arcs[: self.n_segments].sum() + self.rigid_length
 
     def _check_rows(self, rows: Tensor, name: str) -> None:
@@ -381,8 +392,9 @@ class ConstantCurvatureChain(ArcChain):
             kinds[0] = f"{self.stage} stage"
         return f"{' and '.join(dict.fromkeys(kinds))}, {super().extra_repr()}"
 
-    def _set_geometry(self, geometry: Mapping[str, Tensor | None]) -> None:
-        super()._set_geometry(geometry)
+    @derived(*_SHAPING)
+    def _arc_map(self) -> tuple[Tensor, Tensor]:
+        """Return the matrix (3 S, n) and the offset (3 S,) of the map from q to the arcs."""
         free = self._free_arcs()
         # Arcs in units with similar readings, bendings times radius: metres beside radians would
         # lose half of the digits.
@@ -396,8 +408,17 @@ class ConstantCurvatureChain(ArcChain):
         matrix = inverse * units[:, None] * self.gains
         lengths = self.radii[:0] if self.lengths is None else self.lengths
         rest = torch.cat([self._placed(lengths), *self.rest_bends.T])
-        self.register_buffer("arc_matrix", matrix)
-        self.register_buffer("arc_offset", rest - matrix @ self.actuator_zeros)
+        return matrix, rest - matrix @ self.actuator_zeros
+
+    @property
+    def arc_matrix(self) -> Tensor:
+        """The matrix (3 S, n) of the map from q to the arcs, before a stage turns them."""
+        return self._arc_map()[0]
+
+    @property
+    def arc_offset(self) -> Tensor:
+        """The offset (3 S,) of the map from q to the arcs."""
+        return self._arc_map()[1]
 
     def _free_arcs(self) -> Tensor:
         by_segment = self.angles.split(self.actuators_per_segment)
@@ -418,22 +439,19 @@ class ConstantCurvatureChain(ArcChain):
         return torch.stack(rms, dim=-1)
 
     def _arcs_and_slope(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        arcs = self._linear(rows)
-        matrix = self.arc_matrix.to(rows)
+        matrix, offset = self._arc_map()
+        matrix = matrix.to(rows)
+        arcs = torch.addmm(offset.to(rows)[:, None], matrix, rows.T)
         if self.stage is None:
             return arcs, matrix
         return turned_by_first(arcs, matrix[..., None])
 
-    def _linear(self, rows: Tensor) -> Tensor:
-        """Return the arcs (3 S, N) of rows (N, n) before the stage turns them by length 0."""
-        offset = self.arc_offset.to(rows)[:, None]
-        return torch.addmm(offset, self.arc_matrix.to(rows), rows.T)
-
     def _arcs_and_change(
         self, rows: Tensor, tangents: Mapping[str, Tensor]
     ) -> tuple[Tensor, Change]:
-        by_matrix, by_rest = self._changes_of_map(tangents)  # (P, 3 S, n), (P, 3 S)
-        arcs = self._linear(rows)
+        matrix, offset = self._arc_map()
+        arcs = torch.addmm(offset.to(rows)[:, None], matrix.to(rows), rows.T)
+        by_matrix, by_rest = self._changes_of_map(matrix, tangents)
         by_rows = torch.tensordot(rows, by_matrix, ([1], [2]))  # pyright: ignore[reportArgumentType]
         slope = by_rows + by_rest  # (N, P, 3 S)
         slope = slope.permute(2, 1, 0)
@@ -441,8 +459,10 @@ class ConstantCurvatureChain(ArcChain):
             arcs, slope = turned_by_first(arcs, slope)
         return arcs, lambda by_arcs: by_arcs @ slope.permute(2, 0, 1)
 
-    def _changes_of_map(self, tangents: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """Return the changes (P, ...) of `arc_matrix` and `arc_offset`.
+    def _changes_of_map(
+        self, matrix: Tensor, tangents: Mapping[str, Tensor]
+    ) -> tuple[Tensor, Tensor]:
+        """Return the changes (P, 3 S, n) and (P, 3 S) of `arc_matrix` and `arc_offset`.
 
         For M, the pseudo-inverse of the readings B of the free arcs F, the change is that of Golub
         & Pereyra, SIAM J. Numer. Anal. 10 (1973), eq. 4.12.
@@ -450,7 +470,8 @@ class ConstantCurvatureChain(ArcChain):
         changes = self._all_changes(tangents)
         like = changes["radii"]
         gains = self.gains.to(like)
-        M = self.arc_matrix.to(like) / gains
+        matrix = matrix.to(like)
+        M = matrix / gains
         F = self._free_arcs().to(like)
         B = self._readings().to(like)
         dB = (
@@ -467,7 +488,7 @@ class ConstantCurvatureChain(ArcChain):
         d_matrix = dM * gains + M * changes["gains"][:, None]
         d_lengths = self._placed(changes.get("lengths", like[:, :0]))
         d_rest = torch.cat([d_lengths, *changes["rest_bends"].unbind(-1)], dim=1)
-        d_zeros = changes["actuator_zeros"] @ self.arc_matrix.to(like).mT
+        d_zeros = changes["actuator_zeros"] @ matrix.mT
         return d_matrix, d_rest - d_zeros - d_matrix @ self.actuator_zeros.to(like)
 
     @classmethod

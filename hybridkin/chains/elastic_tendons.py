@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
-from operator import is_
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,6 +12,7 @@ from torch import Tensor
 
 from hybridkin._core.arrays import Numbers, Transform, as_array
 from hybridkin._core.blocks import in_blocks
+from hybridkin._core.derived import derived
 from hybridkin._core.kernel_numbers import HK_LEAST_LENGTH
 from hybridkin._core.named_rows import first_row, without_warnings
 from hybridkin._core.plan import Plan
@@ -93,18 +92,6 @@ def _write_plan(plan: Plan, stored: Stored) -> int:
     return plan.node(
         "elastic", len(x), 3, numbers, n_arcs, n_segments, equal_count, *counts
     )
-
-
-class _Table(NamedTuple):
-    """Stored responses of all sets of taut tendons, and the state they were computed for."""
-
-    shaping: list[Tensor]
-    state: list[object]
-    responses: _slack.Responses
-
-    def holds(self, shaping: list[Tensor], state: list[object]) -> bool:
-        """Return whether the geometry is still the same."""
-        return self.state == state and all(map(is_, self.shaping, shaping))
 
 
 class ElasticTendonChain(ElasticBody):
@@ -195,7 +182,6 @@ class ElasticTendonChain(ElasticBody):
         STRUCTURE,
         write_plan=_write_plan,
     )
-    _structure = (*ArcChain._structure, "_table")
 
     def __init__(
         self,
@@ -241,7 +227,6 @@ class ElasticTendonChain(ElasticBody):
         zeros = filled(tendon_zeros, "tendon_zeros", dtype, (self.n_actuators,))
         geometry |= stiffnesses(bending_stiffness, axial_stiffness, dtype, S)
         geometry["tendon_zeros"] = zeros
-        self._table: _Table | None = None
         self._set_geometry(geometry)
 
     @classmethod
@@ -341,9 +326,6 @@ class ElasticTendonChain(ElasticBody):
         """Return which tendons are slack, a bool tensor of the shape of q."""
         return ~self._balance(self._rows(q)).taut.reshape(q.shape)
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {**super().__getstate__(), "_table": None}
-
     def _elasticity(self) -> _slack.Elasticity:
         bend = 1.0 / self.radii
         bending = self.bending_stiffness
@@ -358,27 +340,15 @@ class ElasticTendonChain(ElasticBody):
         )
 
     def _all_responses(self, rows: Tensor) -> _slack.Responses:
-        """Return the responses of all sets of taut tendons, stored until the geometry changes."""
-        shaping = [self.get_buffer(name) for name in _SHAPING]
-        for part in shaping:
-            # Not stored: a graph serves one backward pass, inference tensors have no version.
-            if part.is_inference() or (part.requires_grad and torch.is_grad_enabled()):
-                return self._new_responses(rows)
-        versions = [part._version for part in shaping]
-        state = [rows.dtype, rows.device, *versions]
-        if self._table is None or not self._table.holds(shaping, state):
-            self._table = _Table(shaping, state, self._new_responses(rows))
-        return self._table.responses
-
-    def _new_responses(self, rows: Tensor) -> _slack.Responses:
         """Return the responses of all sets of taut tendons, in the dtype of rows."""
+        return self._table(rows.dtype, rows.device)
+
+    @derived(*_SHAPING)
+    def _table(self, dtype: torch.dtype, device: torch.device) -> _slack.Responses:
         codes = torch.arange(2**self.n_actuators, device=self.radii.device)
-        in_inference = torch.is_inference_mode_enabled()
-        # Later derivatives cannot use tensors of the inference mode.
-        with torch.inference_mode(False) if in_inference else nullcontext():
-            taut = _slack.as_mask(codes, self.n_actuators)
-            responses = _slack.responses_of(taut, self._elasticity().to(torch.float64))
-            return _slack.Responses(*(part.to(rows) for part in responses))
+        taut = _slack.as_mask(codes, self.n_actuators)
+        responses = _slack.responses_of(taut, self._elasticity().to(torch.float64))
+        return _slack.Responses(*(part.to(device, dtype) for part in responses))
 
     def _find(self, rows: Tensor) -> tuple[Tensor, Tensor, _slack.Responses]:
         """Return the sets of taut tendons (N,) as bits, their places in responses, and those."""
@@ -417,7 +387,7 @@ class ElasticTendonChain(ElasticBody):
 
         The length of an arc that would be too short is NaN, with a warning.
         """
-        rest = self.get_buffer("lengths").to(shape)
+        rest = self.lengths.to(shape)
         changes, bendings = shape.split([self.n_segments, 2 * self.n_segments], dim=1)
         lengths = rest + changes
         is_short = lengths < HK_LEAST_LENGTH * rest
@@ -449,7 +419,7 @@ class ElasticTendonChain(ElasticBody):
         with axial stiffness k has ``k d^2 <= n e^2``, with the largest stretch e there.
         """
         bounds = super().plausible_rows()
-        softest = (self.axial_stiffness.sqrt() * self.get_buffer("lengths")).amin()
+        softest = (self.axial_stiffness.sqrt() * self.lengths).amin()
         most = (1.0 - HK_LEAST_LENGTH) * softest / self.n_actuators**0.5
         shape = torch.cat([torch.zeros_like(self.radii), *self.rest_bends.T])
         preloaded = (self.tendon_zeros + self._readings() @ shape).abs()

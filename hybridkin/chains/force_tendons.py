@@ -296,9 +296,9 @@ class ForceTendonChain(ElasticBody):
     def _set_markers(self, markers: Sequence[Marker]) -> None:
         super()._set_markers(markers)
         offsets = [offset for _, *offset in self.markers]
-        like = self._buffers.get("base")
+        like = getattr(self, "base", None)
         if like is not None:  # None while the chain is built
-            self.register_buffer("marker_offsets", like.new_tensor(offsets))
+            self._set_geometry({"marker_offsets": like.new_tensor(offsets)})
 
     def _beside(self, like: Tensor) -> Tensor:
         return self.marker_offsets.to(like).mT[..., None]

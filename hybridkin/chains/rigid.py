@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from os import PathLike
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from hybridkin._core.arrays import Numbers, Transform
+from hybridkin._core.derived import derived
 from hybridkin._core.plan import NoKernel, Plan
 from hybridkin._core.stored import Layout, Restore, Stored
 from hybridkin._core.units import degrees_message, millimetres_message, warn_millimetres
@@ -58,7 +59,7 @@ def _write_plan(plan: Plan, stored: Stored) -> int:
     before = stored.array("base")
     numbers = []
     origins = stored.derived["origins_at_zero"]
-    for origin, axis in zip(origins, stored.array("axes"), strict=True):
+    for origin, axis in zip(origins, stored.derived["unit_axes"], strict=True):
         farthest = np.eye(3)[np.abs(axis).argmin()]
         side = np.cross(axis, farthest)
         side = side / np.linalg.norm(side)
@@ -75,6 +76,31 @@ def _write_plan(plan: Plan, stored: Stored) -> int:
         numbers.append(couplings)
     n = couplings.shape[1]
     return plan.node("rigid", n, 3, numbers, n_joints, coupled, *slides)
+
+
+class _Links(NamedTuple):
+    """What `forward` needs of the joints and of the tip, derived from the geometry."""
+
+    motions: Tensor  # (n_joints, 3, 4, 4), see `joint_motions`
+    axes: Tensor  # (n_joints, 3), of length 1
+    end: Tensor  # (4, 4)
+    slides: Tensor  # (n_joints,), bool
+
+    def to(self, like: Tensor) -> _Links:
+        """Return it in the dtype and on the device of a tensor."""
+        numbers = [part.to(like) for part in self[:3]]
+        return _Links(*numbers, self.slides.to(like.device))
+
+    def columns(self, frames: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the tip (3, N), its derivatives and the joint axes (n_joints, 3, N).
+
+        `frames` are those of `moving_frames`.
+        """
+        tip = torch.tensordot(self.end[:, 3], frames[-1], 1)
+        axes = (self.axes[..., None, None] * frames[1:, :3]).sum(1)
+        turning = torch.linalg.cross(axes, tip - frames[1:, 3], dim=1)
+        sliding = axes + (tip - tip)  # NaN in a row of NaN
+        return tip, torch.where(self.slides[:, None, None], sliding, turning), axes
 
 
 class RigidChain(Chain):
@@ -142,9 +168,10 @@ class RigidChain(Chain):
         "rigid",
         dict.fromkeys(_arrays, ""),
         {"kinds": list, "names": list},
-        derived=("origins_at_zero", "end"),
+        derived=("origins_at_zero", "unit_axes", "end"),
         write_plan=_write_plan,
     )
+    computed = ("origins_at_zero", "end", "motions", "slides")
 
     def __init__(
         self,
@@ -183,7 +210,6 @@ class RigidChain(Chain):
         self.names = _strings(names, "names", [f"joint_{k + 1}" for k in range(n)])
         if not set(self.kinds) <= set(_KINDS):
             raise ValueError(f"`kinds` must be among {_KINDS}, got {self.kinds}.")
-        slides = [kind == "prismatic" for kind in self.kinds]
         if tip is None:
             tip = np.eye(4)
         geometry = {
@@ -195,7 +221,6 @@ class RigidChain(Chain):
             "base": pose(base, "base", torch.float64),
             "joint_zeros": filled(joint_zeros, "joint_zeros", torch.float64, (n,)),
             "couplings": couplings,
-            "slides": torch.tensor(slides, dtype=torch.bool, device=axes.device),
         }
         self._set_geometry(geometry)
         self.to(dtype)
@@ -411,22 +436,44 @@ class RigidChain(Chain):
         return {**super().geometry(), "links": self.origins[:, :3, 3]}
 
     def _set_geometry(self, geometry: Mapping[str, Tensor | None]) -> None:
-        buffers = dict(geometry)
-        links = buffers.pop("links", None)
-        for name, value in buffers.items():
-            self.register_buffer(name, value)
+        entries = dict(geometry)
+        links = entries.pop("links", None)
         if links is not None:
-            self.origins = _with_positions(self.origins, links)
-        motions = joint_motions(self.origins, self.axes, self.slides)
-        self.register_buffer("motions", motions)
+            entries["origins"] = _with_positions(self.origins, links)
+        super()._set_geometry(entries)
 
-        # The frames of the joints at q = 0, and the tip in that of the last joint.
-        z = -self.couplings @ self.joint_zeros
-        u1, u2 = joint_coefficients(z[:, None, None], self.slides[:, None, None])
-        still, by_u1, by_u2 = motions.unbind(1)
-        self.register_buffer("origins_at_zero", still + u1 * by_u1 + u2 * by_u2)
+    @derived("origins", "axes", "tip", "tool")
+    def _links(self) -> _Links:
+        slides = self.slides
+        axes = self.unit_axes
+        motions = joint_motions(self.origins, axes, slides)
+        return _Links(motions, axes, self.end, slides)
+
+    @property
+    def slides(self) -> Tensor:
+        """Which joints (n_joints,) are prismatic, bool."""
+        slides = [kind == "prismatic" for kind in self.kinds]
+        return torch.tensor(slides, dtype=torch.bool, device=self.axes.device)
+
+    @property
+    def unit_axes(self) -> Tensor:
+        """The axes of the joints (n_joints, 3) of length 1, in the joints' frames."""
+        return self.axes / self.axes.norm(dim=1, keepdim=True)
+
+    @property
+    def end(self) -> Tensor:
+        """Pose of the tip in the moving frame of the last joint, shape (4, 4)."""
         tool = self.tip[:3, :3] @ self.tool + self.tip[:3, 3]
-        self.register_buffer("end", _with_positions(self.tip, tool))
+        return _with_positions(self.tip, tool)
+
+    @property
+    def origins_at_zero(self) -> Tensor:
+        """Poses of the frames of the joints at q = 0, shape (n_joints, 4, 4)."""
+        motions, _, _, slides = self._links()
+        z = -self.couplings @ self.joint_zeros
+        u1, u2 = joint_coefficients(z[:, None, None], slides[:, None, None])
+        still, by_u1, by_u2 = motions.unbind(1)
+        return still + u1 * by_u1 + u2 * by_u2
 
     @property
     def default_parameters(self) -> tuple[str, ...]:
@@ -436,7 +483,7 @@ class RigidChain(Chain):
     @property
     def limits(self) -> dict[str, Tensor]:
         """The limits of the joints, as tensors of shape (n,)."""
-        return {name: self.get_buffer(name) for name in ("q_min", "q_max", "dq_max")}
+        return {"q_min": self.q_min, "q_max": self.q_max, "dq_max": self.dq_max}
 
     @property
     def reach(self) -> Tensor:
@@ -476,13 +523,14 @@ class RigidChain(Chain):
 
     def from_coordinates(self, z: Tensor) -> Tensor:
         """Return the tip (N, 3) at joint positions z (N, n_joints)."""
-        u1, u2 = joint_coefficients(z, self.slides.to(z.device))
-        end = self.end.to(z)[:, 3]
-        return carried_tip(u1, u2, self.motions.to(z), end, self.base.to(z)).T
+        links = self._links().to(z)
+        u1, u2 = joint_coefficients(z, links.slides)
+        return carried_tip(u1, u2, links.motions, links.end[:, 3], self.base.to(z)).T
 
     def from_coordinates_and_jacobian(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """Return the tip (N, 3) and its Jacobian by the joint positions (N, 3, n_joints)."""
-        tip, linear, _ = self._columns(self._frames(z))
+        links = self._links().to(z)
+        tip, linear, _ = links.columns(self._frames(z, links))
         return tip.T, linear.permute(2, 1, 0)
 
     def forward(self, q: Tensor) -> Tensor:
@@ -520,11 +568,12 @@ class RigidChain(Chain):
 
     def _pose_and_columns(self, rows: Tensor) -> tuple[Tensor, Tensor]:
         z = self._joints(rows)
-        frames = self._frames(z)
-        _, linear, axes = self._columns(frames)
-        angular = torch.where(self.slides.to(z.device)[:, None, None], 0.0, axes)
+        links = self._links().to(z)
+        frames = self._frames(z, links)
+        _, linear, axes = links.columns(frames)
+        angular = torch.where(links.slides[:, None, None], 0.0, axes)
         columns = torch.cat([linear, angular], dim=1)
-        pose = as_poses(frames[-1:])[:, 0] @ self.end.to(z)
+        pose = as_poses(frames[-1:])[:, 0] @ links.end
         return pose, columns.permute(2, 1, 0)
 
     def poses(self, q: Tensor) -> Tensor:
@@ -546,9 +595,12 @@ class RigidChain(Chain):
 
     def _joint_poses(self, q: Tensor) -> Tensor:
         """Return the poses (..., n_joints + 1, 4, 4) of the base and of all joints' frames."""
-        (poses,) = self._by_rows(
-            lambda rows: (as_poses(self._frames(self._joints(rows))),), q
-        )
+
+        def of_rows(rows: Tensor) -> tuple[Tensor]:
+            z = self._joints(rows)
+            return (as_poses(self._frames(z, self._links().to(z))),)
+
+        (poses,) = self._by_rows(of_rows, q)
         return poses
 
     def pose(self, q: Tensor) -> Tensor:
@@ -600,22 +652,10 @@ class RigidChain(Chain):
         z, _ = self.coordinates(rows)
         return z
 
-    def _frames(self, z: Tensor) -> Tensor:
+    def _frames(self, z: Tensor, links: _Links) -> Tensor:
         """Return the `moving_frames` at joint positions (N, n_joints), (n_joints + 1, 4, 3, N)."""
-        u1, u2 = joint_coefficients(z, self.slides.to(z.device))
-        return moving_frames(u1, u2, self.motions.to(z), self.base.to(z))
-
-    def _columns(self, frames: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the tip (3, N), its derivatives and the joint axes (n_joints, 3, N).
-
-        `frames` are those of `moving_frames`.
-        """
-        tip = torch.tensordot(self.end.to(frames)[:, 3], frames[-1], 1)
-        axes = (self.axes.to(frames)[..., None, None] * frames[1:, :3]).sum(1)
-        turning = torch.linalg.cross(axes, tip - frames[1:, 3], dim=1)
-        slides = self.slides.to(frames.device)[:, None, None]
-        sliding = axes + (tip - tip)  # NaN in a row of NaN
-        return tip, torch.where(slides, sliding, turning), axes
+        u1, u2 = joint_coefficients(z, links.slides)
+        return moving_frames(u1, u2, links.motions, self.base.to(z))
 
 
 def _with_positions(poses: Tensor, positions: Tensor) -> Tensor:

@@ -209,7 +209,7 @@ def _write_plan(plan: Plan, stored: Stored) -> int:
         entries += [acts_inside[-1], *_places_of(plan, correction)]
     weights = stored.array("weights")
     left = 1.0 - weights[acts_inside].sum()  # weight of f beside inner corrections
-    numbers = [weights, [left * (left > _ROUNDING), any(acts_inside)]]
+    numbers = [weights, [left * (abs(left) > _ROUNDING), any(acts_inside)]]
     n, m = plan.lengths(base if base >= 0 else entries[1])
     return plan.node(
         "hybrid", n, m, numbers, base, drift, tested, len(weights), *entries
@@ -350,11 +350,10 @@ class HybridModule(Hybrid):
             return super().has_shape(q)
         return self.mechanical.has_shape(q)
 
-    def _parts(self) -> list[tuple[float, TipCorrection]]:
-        """Return pairs of weight and correction."""
+    def _parts(self) -> list[tuple[Tensor, TipCorrection]]:
+        """Return pairs of weight () and correction."""
         corrections = cast("list[TipCorrection]", [*self.corrections])
-        # Not tolist: before torch 2.5 it does not work in functional transforms.
-        return [*zip(map(float, self.weights), corrections, strict=True)]
+        return [*zip(self.weights.unbind(), corrections, strict=True)]
 
     def _inside(self, q: Tensor) -> Inside | None:
         """Return the mechanical model inside at rows q, where a correction acts there."""
@@ -420,15 +419,19 @@ class HybridModule(Hybrid):
                     trust.slope + weight * fading.slope,
                 )
         if self.drift is not None:
-            total = _plus(total, 1.0, *trust.times(*self.drift.forward_and_jacobian(q)))
+            whole = torch.ones_like(self.weights[0])
+            total = _plus(
+                total, whole, *trust.times(*self.drift.forward_and_jacobian(q))
+            )
         assert total is not None, "a hybrid needs a mechanical model or a correction"
         return total
 
 
 def _plus(
-    total: tuple[Tensor, Tensor] | None, weight: float, x: Tensor, J: Tensor
+    total: tuple[Tensor, Tensor] | None, weight: Tensor, x: Tensor, J: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return a sum plus the weighted x and J."""
     if total is None:
         return weight * x, weight * J
-    return torch.add(total[0], x, alpha=weight), torch.add(total[1], J, alpha=weight)
+    weight = weight.to(x)
+    return torch.addcmul(total[0], x, weight), torch.addcmul(total[1], J, weight)

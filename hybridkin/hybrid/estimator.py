@@ -476,7 +476,7 @@ class HybridForwardModel(HybridPredictor):
         """Return the settings as a specification, with a copy of the mechanical model."""
         mechanical = self.mechanical_model
         if mechanical is not None:
-            mechanical = as_forward_model(copy.deepcopy(mechanical))
+            mechanical = as_forward_model(copy.deepcopy(mechanical)).frozen()
             # A function does not tell how many, but its rows do.
             mechanical.n_actuators = mechanical.n_actuators or rows.X.shape[1]
         names = ()

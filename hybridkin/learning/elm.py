@@ -126,7 +126,7 @@ class FittedNetwork(MultiOutputMixin, RegressorMixin, BaseEstimator):
         check_is_fitted(self, "module_")
         X = check_inputs(self, X)
         elm = self.module_
-        size = BLOCK_ELEMENTS // max(elm.output_weights.shape[0], elm.tangent.shape[1])
+        size = BLOCK_ELEMENTS // max(elm.output_weights.shape[0], len(elm.input_bias))
         with torch.no_grad():
             q = copied(X, elm.input_center.device, np.float64)
             block_size = self.block_size or rows_at_once(max(1, size), q.device)
@@ -388,7 +388,7 @@ class ELMRegressor(FittedNetwork):
         readout, self.noise_variance_, self.solver_ = fit_readout(
             stats, n_features, alpha, self.fit_intercept
         )
-        layer = {name: elm.get_buffer(name).cpu() for name in LAYER}
+        layer = {name: getattr(elm, name).detach().cpu() for name in LAYER}
         module = ELM(elm.activation, **layer, **readout)
         return self._hold(module.to(device_named(self.device)), stats)
 
@@ -410,7 +410,7 @@ class ELMRegressor(FittedNetwork):
         self._stats = stats
         self.n_samples_seen_ = stats.n
         for name in LAYER + READOUT:
-            setattr(self, f"{name}_", module.get_buffer(name).numpy(force=True))
+            setattr(self, f"{name}_", getattr(module, name).numpy(force=True))
         return self
 
     def stored(self):

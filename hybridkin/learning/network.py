@@ -8,6 +8,7 @@ from torch import nn
 
 from hybridkin._core.arrays import one_of
 from hybridkin._core.blocks import check_vectors, in_blocks
+from hybridkin._core.derived import derived
 from hybridkin._core.kernel_numbers import ACTIVATIONS as KERNELS
 from hybridkin._core.kernel_numbers import HK_GROUP
 from hybridkin._core.model import ForwardModel
@@ -166,6 +167,7 @@ class ELM(LeverageModule):
         {"activation": str},
         write_plan=write_network,
     )
+    computed = ("tangent",)
 
     def __init__(self, activation="logistic", **arrays):
         super().__init__()
@@ -183,16 +185,23 @@ class ELM(LeverageModule):
             raise ValueError(
                 f"{n_hidden} hidden neurons cannot have {n_features} features"
             )
-        # J = T @ sigma' with T = w_out (x) w_in
-        w_in = self.input_weights / self.input_scale
-        w_out = self.output_weights[:n_hidden]
-        self.register_buffer("tangent", (w_out.T[:, None] * w_in.T).flatten(0, 1))
 
     @classmethod
     def from_stored(cls, stored, restore):
         """Return the module built from a description; that of an old file has no prior."""
         arrays = {"leverage_prior": np.zeros(()), **stored.arrays}
         return super().from_stored(replace(stored, arrays=arrays), restore)
+
+    @derived("input_weights", "input_scale", "output_weights")
+    def _tangent(self):
+        w_in = self.input_weights / self.input_scale
+        w_out = self.output_weights[: len(w_in)]
+        return ((w_out.T[:, None] * w_in.T).flatten(0, 1),)
+
+    @property
+    def tangent(self):
+        """T (m n, H) of the Jacobian T @ sigma', with T = w_out (x) w_in."""
+        return self._tangent()[0]
 
     def extra_repr(self):
         """Return the layer sizes and the activation, for printing."""
@@ -235,8 +244,9 @@ class ELM(LeverageModule):
         slope = ACTIVATIONS[self.activation][1](a, s)
         columns = (self.tangent.to(s) @ slope.T).T
         J = columns.unflatten(-1, (len(self.intercept), -1))
-        direct = self.output_weights[s.shape[-1] :]
-        if len(direct):
+        weights = self.output_weights
+        if len(weights) > s.shape[-1]:  # with a direct link
+            direct = weights[s.shape[-1] :]
             J = J + (direct.T / self.input_scale).to(s)
         return J
 

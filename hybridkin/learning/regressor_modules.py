@@ -16,6 +16,7 @@ from torch.autograd.function import once_differentiable
 
 from hybridkin._core.arrays import copied
 from hybridkin._core.blocks import in_blocks
+from hybridkin._core.derived import derived
 from hybridkin._core.model import Fitted, ForwardModel, as_forward_model
 from hybridkin._core.plan import Plan
 from hybridkin._core.stored import Layout, Stored
@@ -155,8 +156,8 @@ class AffineModule(ForwardModel):
 
 def _write_polynomial(plan: Plan, stored: Stored) -> int:
     """Write the node of a polynomial: for each monomial the places of its powers in a table."""
-    powers = stored.array("powers").astype(int)
-    readout = stored.array("readout")
+    powers = stored.derived["monomials"]
+    readouts = stored.derived["readouts"]
     n_monomials, n = powers.shape
     degrees = int(powers.max()) + 1
     plan.limit("powers", n * degrees)
@@ -165,9 +166,10 @@ def _write_polynomial(plan: Plan, stored: Stored) -> int:
         (inputs,) = exponents.nonzero()
         factors += [len(inputs), *(inputs * degrees + exponents[inputs])]
     scaling = stored.array("center"), 1.0 / stored.array("scale")
-    numbers = [*scaling, np.column_stack([readout, stored.derived["slope"]])]
+    n_outputs = stored.array("readout").shape[1]
+    numbers = [*scaling, readouts]
     return plan.node(
-        "polynomial", n, readout.shape[1], numbers, n_monomials, degrees, *factors
+        "polynomial", n, n_outputs, numbers, n_monomials, degrees, *factors
     )
 
 
@@ -190,38 +192,62 @@ class PolynomialModule(ForwardModel):
     layout = Layout(
         "polynomial",
         {"powers": "pn", "readout": "pm", "center": "n", "scale": "n"},
-        derived=("slope",),
+        derived=("monomials", "readouts"),
         write_plan=_write_polynomial,
     )
+    computed = ("slope",)
 
     def __init__(
         self, powers: ArrayLike, readout: ArrayLike, center: ArrayLike, scale: ArrayLike
     ) -> None:
         super().__init__()
-        exponents = np.asarray(powers)
-        coef = np.asarray(readout)
+        _register(self, powers=powers, readout=readout, center=center, scale=scale)
+        self.n_actuators = self.powers.shape[1]
+        self.n_outputs = self.readout.shape[1]
+        self._monomials_and_readouts()  # checks the powers
+
+    @derived("powers", "readout", "scale")
+    def _monomials_and_readouts(self) -> tuple[Tensor, Tensor]:
+        """Return the exponents (D, n) of all monomials, and their readouts (D, m + m n).
+
+        These are the distinct monomials of the polynomial and of its derivatives. The readouts are
+        that of the polynomial, then that of its Jacobian.
+        """
+        exponents = self.powers.numpy(force=True)
         if not np.isin(exponents, range(_MOST_POWER)).all():
             raise ValueError(f"'powers' must hold whole numbers below {_MOST_POWER}")
-        self.n_actuators = exponents.shape[1]
-        self.n_outputs = coef.shape[1]
         # Monomial k has a derivative along input j: another monomial.
         k, j = np.nonzero(exponents)
         lower = exponents[k] - np.eye(self.n_actuators)[j]
-        both = np.vstack([exponents, lower])
+        both = np.vstack([exponents, lower]).astype(int)
         distinct, place = np.unique(both, axis=0, return_inverse=True)
-        of_monomial, of_slope = np.split(place.reshape(-1), [len(exponents)])
-        # The readouts of the polynomial and of its Jacobian.
-        values = np.zeros((len(distinct), self.n_outputs))
-        np.add.at(values, of_monomial, coef)
-        slopes = np.zeros((len(distinct), self.n_actuators, self.n_outputs))
-        np.add.at(slopes, (of_slope, j), exponents[k, j][:, None] * coef[k])
-        by_output = slopes.swapaxes(1, 2) / np.asarray(scale)
-        _register(self, powers=distinct, readout=values, center=center, scale=scale)
-        _register(self, slope=by_output.reshape(len(distinct), -1))
+        places = torch.from_numpy(place.reshape(-1)).to(self.readout.device)
+        of_monomial, of_slope = places.split([len(exponents), len(k)])
+
+        none = self.readout.new_zeros(len(distinct), self.n_outputs)
+        values = none.index_add(0, of_monomial, self.readout)
+        each = torch.eye(self.n_actuators, dtype=none.dtype, device=none.device)
+        by_input = (self.powers[k, j, None] * each[j] / self.scale)[:, None]
+        by_monomial = (self.readout[k, :, None] * by_input).flatten(1)
+        slopes = none.new_zeros(len(distinct), by_monomial.shape[1])
+        slopes = slopes.index_add(0, of_slope, by_monomial)
+        monomials = torch.from_numpy(distinct).to(none.device)
+        return monomials, torch.cat([values, slopes], dim=1)
+
+    @property
+    def monomials(self) -> Tensor:
+        """Exponents of the distinct monomials of the polynomial and its derivatives, (D, n)."""
+        return self._monomials_and_readouts()[0]
+
+    @property
+    def readouts(self) -> Tensor:
+        """Readouts (D, m + m n) of these monomials: of the polynomial, then of its Jacobian."""
+        return self._monomials_and_readouts()[1]
 
     def forward(self, q: Tensor) -> Tensor:
         """Return the polynomial, shape (..., m)."""
-        return self._monomials(q) @ self.readout.to(q)
+        monomials, readouts = self._monomials_and_readouts()
+        return self._features(q, monomials) @ readouts[:, : self.n_outputs].to(q)
 
     def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return the polynomial (..., m) and its Jacobian (..., m, n) from the same features."""
@@ -229,20 +255,20 @@ class PolynomialModule(ForwardModel):
         return x, J
 
     def _forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        phi = self._monomials(q)
-        J = phi @ self.slope.to(q)
-        return phi @ self.readout.to(q), J.unflatten(-1, (-1, q.shape[-1]))
+        monomials, readouts = self._monomials_and_readouts()
+        phi = self._features(q, monomials)
+        value, slope = (phi @ readouts.to(q)).tensor_split([self.n_outputs], dim=-1)
+        return value, slope.unflatten(-1, (-1, q.shape[-1]))
 
-    def _monomials(self, q: Tensor) -> Tensor:
+    def _features(self, q: Tensor, monomials: Tensor) -> Tensor:
         u = (q - self.center.to(q)) / self.scale.to(q)
-        phi = torch.ones_like(u[..., :1]).expand(*u.shape[:-1], len(self.powers))
-        powers = self.powers.long()
+        phi = torch.ones_like(u[..., :1]).expand(*u.shape[:-1], len(monomials))
         of_each = [torch.ones_like(u)]
-        for _ in range(int(powers.max())):
+        for _ in range(int(monomials.max())):
             of_each.append(of_each[-1] * u)
         table = torch.stack(of_each, dim=-1)
         for j in range(u.shape[-1]):
-            phi = phi * table[..., j, :].index_select(-1, powers[:, j])
+            phi = phi * table[..., j, :].index_select(-1, monomials[:, j])
         return phi
 
 
@@ -276,6 +302,7 @@ class KernelModule(ForwardModel):
         {"rows": "kn", "weights": "km", "bias": "m", "center": "n", "scale": "n"},
         write_plan=_write_kernel,
     )
+    computed = ("tangent",)
 
     def __init__(
         self,
@@ -291,10 +318,13 @@ class KernelModule(ForwardModel):
         n_rows, self.n_actuators = at.shape
         self.n_outputs = heights.shape[1]
         self._block = max(1, _KERNEL_BLOCK // n_rows)
-        tangent = (heights[:, :, None] * at[:, None, :]).reshape(n_rows, -1)
         bias = np.broadcast_to(bias, self.n_outputs)
         _register(self, rows=at, weights=heights, bias=bias, center=center, scale=scale)
-        _register(self, tangent=tangent)
+
+    @derived("rows", "weights")
+    def _tangent(self) -> tuple[Tensor]:
+        """Return the products (N, m n) of weights and rows."""
+        return ((self.weights[:, :, None] * self.rows[:, None]).flatten(1),)
 
     def forward(self, q: Tensor) -> Tensor:
         """Return the sum, shape (..., m)."""
@@ -320,7 +350,8 @@ class KernelModule(ForwardModel):
     def _forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         u, kernel = self._kernel(q)
         value = kernel @ self.weights.to(q)
-        towards = (kernel @ self.tangent.to(q)).unflatten(-1, (-1, q.shape[-1]))
+        (tangent,) = self._tangent()
+        towards = (kernel @ tangent.to(q)).unflatten(-1, (-1, q.shape[-1]))
         J = (towards - value[..., None] * u[..., None, :]) / self.scale.to(q)
         return value + self.bias.to(q), J
 

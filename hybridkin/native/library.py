@@ -465,8 +465,7 @@ def _described_tensors(modules: list[torch.nn.Module]) -> list[Tensor]:
     tensors = []
     for module in modules:
         if isinstance(module, PortableModule):
-            for name in (*module.layout.arrays, *module.layout.derived):
-                tensors.append(module._buffers.get(name))
+            tensors += module.entries()
     return [a for a in tensors if a is not None]
 
 
