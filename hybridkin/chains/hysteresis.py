@@ -27,6 +27,8 @@ from hybridkin.native.library import available
 class HysteresisOperator(ABC):
     """Hysteresis between commanded and effective changes; the operator itself has no state.
 
+    An operator does not change: its arrays are read-only, and its attributes are set once.
+
     The result depends on the order of the commands, with creep on their times as well. The state is
     passed and returned, so several robots or branches of a plan can share one operator. Its rows
     are the last command, what is inside of the operator (plays, slow states), and the last result,
@@ -46,6 +48,19 @@ class HysteresisOperator(ABC):
     kind: str
     width: NDArray
     creeps = False
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name in vars(self):
+            raise AttributeError(
+                f"`{name}` of a {type(self).__name__} cannot change; make a new operator."
+            )
+        if isinstance(value, np.ndarray):
+            value.flags.writeable = False
+        super().__setattr__(name, value)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        for name, value in state.items():
+            setattr(self, name, value)
 
     @property
     def parts(self) -> tuple[HysteresisOperator, ...]:
