@@ -200,8 +200,8 @@ def labels(groups: ArrayLike | Tensor, n_rows: int, name: str = "groups") -> NDA
 
 
 def as_array(a: Numbers) -> np.ndarray:
-    """Return a tensor or array as a NumPy array."""
-    return a.cpu().numpy() if isinstance(a, Tensor) else np.asarray(a)
+    """Return a tensor, without its graph, or an array as a NumPy array."""
+    return a.numpy(force=True) if isinstance(a, Tensor) else np.asarray(a)
 
 
 def identity(n: int, like: Tensor) -> Tensor:

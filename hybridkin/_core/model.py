@@ -143,8 +143,9 @@ class PortableModule(Portable, nn.Module):
     def _load_from_state_dict(
         self, state_dict: dict[str, Any], prefix: str, *others: Any
     ) -> None:
-        for name in self.computed:
-            state_dict.pop(prefix + name, None)
+        for key in [*state_dict]:
+            if key.removeprefix(prefix).split(".")[0] in self.computed:
+                del state_dict[key]
         super()._load_from_state_dict(state_dict, prefix, *others)
 
     if TYPE_CHECKING:  # attributes that no statement assigns are buffers

@@ -21,12 +21,12 @@ def joint_motions(origins: Tensor, axes: Tensor, slides: Tensor) -> Tensor:
     # Rodrigues: the rotation is 1 + K^2 + sin q K - cos q K^2; K is 0 for a prismatic joint.
     K = cross_matrix(turning_axes)
     K_squared = K @ K
-    motions = origins.new_zeros(len(axes), 3, 4, 4)
-    motions[:, 0, :3, :3] = identity(3, axes) + K_squared
-    motions[:, 1, :3, :3] = K
-    motions[:, 2, :3, :3] = -K_squared
-    motions[:, 1, :3, 3] = sliding_axes
-    motions[:, 0, 3, 3] = 1.0
+    turns = torch.stack([identity(3, axes) + K_squared, K, -K_squared], dim=1)
+    shifts = torch.stack([0.0 * axes, sliding_axes, 0.0 * axes], dim=1)
+    upper = torch.cat([turns, shifts[..., None]], dim=-1)
+    last = torch.zeros_like(upper[:, :, :1])
+    last[:, 0, 0, 3] = 1.0
+    motions = torch.cat([upper, last], dim=2)
     return origins[:, None] @ motions
 
 

@@ -425,7 +425,12 @@ class RigidChain(Chain):
                 is_limit = name in ("q_min", "q_max", "dq_max")
                 arrays[name] = stored.array(name, finite=not is_limit)
         dtype = torch.from_numpy(arrays["base"]).dtype
-        return cls(**arrays, **settings, dtype=dtype)
+        arm = cls(**arrays, **settings, dtype=dtype)
+        # The constructor rounds poses and axes; the state is what the file holds.
+        arm._set_geometry(
+            {name: torch.tensor(a, dtype=dtype) for name, a in arrays.items()}
+        )
+        return arm
 
     def geometry(self) -> dict[str, Tensor]:
         """Return the geometry by name.

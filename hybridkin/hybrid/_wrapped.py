@@ -17,6 +17,7 @@ from hybridkin._core.plan import CHAINS, NoKernel, Plan
 from hybridkin._core.rotations import rotation, rotation_vector
 from hybridkin._core.stored import Layout, Stored
 from hybridkin.chains.chain import Chain
+from hybridkin.chains.markers import MarkedChain
 from hybridkin.hybrid._guards import GroupDistance, Plane
 from hybridkin.hybrid._module import Hybrid, HybridModule, TipCorrection
 from hybridkin.learning.regressor_modules import AffineModule
@@ -246,7 +247,7 @@ class Stacked(Hybrid):
     Parameters
     ----------
     mechanical : MarkedChain or None
-        The chain of all markers.
+        The chain of all markers; it follows from the others.
     tips : sequence of HybridModule
         The hybrid of every marker, on the chain of that marker alone.
     """
@@ -254,13 +255,29 @@ class Stacked(Hybrid):
     layout = Layout(
         "stacked", {}, parts=("mechanical", "tips"), write_plan=_write_stacked
     )
+    computed = ("mechanical",)
 
-    def __init__(self, mechanical: ForwardModel | None, tips: Sequence[Hybrid]) -> None:
+    def __init__(self, mechanical: object, tips: Sequence[Hybrid]) -> None:
         super().__init__()
-        self.mechanical = mechanical
         self.tips = nn.ModuleList(tips)
         self.n_actuators = tips[0].n_actuators
         self.n_outputs = 3 * len(tips)
+
+    @property
+    def mechanical(self) -> MarkedChain | None:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """The chain of all markers, with the geometry of the tip's."""
+        chain = self.tip_model.mechanical
+        if not isinstance(chain, MarkedChain):
+            return None
+        chains = cast("list[MarkedChain]", [tip.mechanical for tip in self._tips()])
+        return chain._marked([chain.markers[-1] for chain in chains])
+
+    def stored(self) -> Stored:
+        """Return the description of the model, with the chain of all markers."""
+        stored = super().stored()
+        if self.mechanical is not None:
+            stored.parts["mechanical"] = self.mechanical.stored()
+        return stored
 
     @property
     def tip_model(self) -> Hybrid:

@@ -6,26 +6,26 @@ constructed with the same state. Derivatives by the state are those of differenc
 """
 
 import copy
+import itertools
+import os
 import pickle
 import threading
-import warnings
 
 import numpy as np
 import pytest
 import torch
 from mechanical_models import CHAINS
-from saved_models import FOLDER, models, tendon_chain
+from operators import operators
+from saved_models import models, trunk, trunk_log
 from torch.autograd import forward_ad
 from torch.func import functional_call, jacfwd, jacrev, vmap
+from torch.testing import assert_close
 
 from hybridkin import (
     ConstantCurvatureChain,
-    ElasticTendonChain,
+    ELMRegressor,
     ForceTendonChain,
     HybridForwardModel,
-    PlayOperator,
-    PrandtlIshlinskiiOperator,
-    RigidChain,
     load_model,
     native,
     save_model,
@@ -35,7 +35,10 @@ from hybridkin.hybrid.description import restorer
 from hybridkin.learning.regressor_modules import KernelModule, PolynomialModule
 from hybridkin.saving._file import packed, unpacked
 
-FORCES = np.linspace(0.1, 0.5, 9).reshape(3, 3)
+IN_FULL = "EXAMPLES" in os.environ  # in the examination
+pytestmark = pytest.mark.filterwarnings("ignore:.*torch.jit.script:DeprecationWarning")
+
+FORCES = np.linspace(0.1, 0.5, 3)[None]
 POWERS = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [2, 0, 1], [0, 1, 3], [2, 0, 1]]
 
 
@@ -48,34 +51,43 @@ def smooth():
     return {"polynomial": (polynomial, q), "kernel": (kernel, q)}
 
 
+def balanced():
+    """A network that learned of balanced pairs of tendons, constant elsewhere."""
+    rng = np.random.default_rng(0)
+    chain = ConstantCurvatureChain([0.006, 0.005], lengths=[0.08, 0.07], n_actuators=2)
+    pulls = rng.uniform(-0.004, 0.004, (30, 2))
+    q = np.stack([pulls[:, 0], -pulls[:, 0], pulls[:, 1], -pulls[:, 1]], axis=1)
+    x = chain(torch.from_numpy(q)).numpy() + 75.0 * q[:, :1] ** 2 * [1.0, 2.0, 3.0]
+    return HybridForwardModel(chain, ELMRegressor(4, random_state=0)).fit(q, x).module_, q[:3]
+
+
+def marked():
+    """Two markers, each with its correction."""
+    q, x, groups = trunk_log()
+    chain = trunk().with_markers([(0, 0.5), (0, 1.0)])
+    x = np.hstack([0.4 * x, x])
+    return HybridForwardModel(chain, "linear").fit(q, x, groups=groups).module_, q[:3]
+
+
 def all_models():
     """Return modules of all kinds, with rows of q."""
-    force = ForceTendonChain([0.01], [0.1], 0.02, 200.0, weight=0.5, taper=0.3, arcs=3)
+    force = ForceTendonChain([0.01], [0.1], 0.02, 200.0, weight=0.5, taper=0.3, arcs=2)
     found = {**CHAINS, **smooth(), "force": (force, FORCES)}
+    found |= {"balanced": balanced(), "two markers": marked()}
     for name, (model, q) in models().items():
         module = getattr(model, "module_", model)
         found.setdefault(f"saved {name}", (module, q[:3]))
     return found
 
 
-@pytest.fixture(scope="module")
-def modules():
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return all_models()
-
-
-SMALL = [*CHAINS, "polynomial", "kernel", "force"]
-SAVED = [f"saved {path.stem}" for path in sorted(FOLDER.glob("*.safetensors"))]
-NAMES = [*SMALL, *(pytest.param(name, marks=pytest.mark.slow) for name in SAVED)]
+SMALL = ["trunk", "polynomial", "kernel"]  # the others are drawn from
 
 
 def changed(name, entry, rng):
     """Return another valid value of an entry: poses stay rigid, powers whole."""
     if entry.shape[-2:] == (4, 4) and name.endswith(("base", "tip", "origins", "motion")):
-        motion = torch.eye(4, dtype=entry.dtype)
-        motion[:3] = torch.tensor([[0.8, -0.6, 0, 0.01], [0.6, 0.8, 0, 0.02], [0, 0, 1, -0.03]])
-        return entry @ motion
+        motion = [[0.8, -0.6, 0, 0.01], [0.6, 0.8, 0, 0.02], [0, 0, 1, -0.03], [0, 0, 0, 1]]
+        return entry @ torch.tensor(motion, dtype=entry.dtype)
     if name.endswith("powers"):
         return entry.flip(1)
     relative = torch.from_numpy(rng.uniform(-0.03, 0.0, entry.shape)).to(entry)
@@ -88,12 +100,19 @@ def owner(module, name):
     return module.get_submodule(path), last
 
 
+def with_entry(module, name, value):
+    """Return the state of a module with another entry, also where a part is shared."""
+    state = module.state_dict()
+    place = state[name].data_ptr()
+    return {key: value.clone() if a.data_ptr() == place else a for key, a in state.items()}
+
+
 def loaded(module, name, value):
-    module.load_state_dict({**module.state_dict(), name: value})
+    module.load_state_dict(with_entry(module, name, value))
 
 
 def assigned(module, name, value):
-    module.load_state_dict({**module.state_dict(), name: value.clone()}, assign=True)
+    module.load_state_dict(with_entry(module, name, value), assign=True)
 
 
 def in_place(module, name, value):
@@ -167,11 +186,9 @@ def newly_constructed(module):
 
 def twin_with(module, name, value):
     """Return a module with another state, newly constructed."""
-    twin = copy.deepcopy(module)
+    twin = copy.deepcopy(module)  # which has computed nothing
     part, last = owner(twin, name)
     part._buffers[last] = value
-    for same, _ in list(twin.named_modules(remove_duplicate=False)):
-        assert same is not module
     return newly_constructed(twin)
 
 
@@ -180,33 +197,235 @@ def tolerance(module):
     return 1e-4 if single else 1e-10
 
 
-def test_the_table_holds_every_kind(modules):
-    kinds = {"drift", "list"}
-    for module, _ in modules.values():
+def check_entry(module, q, name, ways):
+    """Check that a module with another entry is what a new one with that state is."""
+    value = changed(name, module.state_dict()[name], np.random.default_rng(0))
+    reference = twin_with(module, name, value)
+    expected, tol = answers(reference, q), tolerance(module)
+    for way in ways:
+        twin = copy.deepcopy(module)
+        twin.forward_and_jacobian(torch.from_numpy(q))  # which keeps what it computes
+        native.evaluate(twin, q, jacobian=True)
+        way(twin, name, value)
+        try:
+            agree(answers(twin, q), expected, tol)
+            if way in (as_parameter, learned):
+                agree(answers(pickle.loads(pickle.dumps(twin)), q), expected, tol)
+            assert packed(twin.stored())[0] == packed(reference.stored())[0]
+        except AssertionError as error:
+            raise AssertionError(f"{name} {way.__name__}: {error}") from None
+    twin = copy.deepcopy(module)  # entries of parts that share a tensor are its own there
+    given = functional_call(twin, {name: value}, (torch.from_numpy(q),))
+    agree({"x": given.numpy()}, {"x": expected["x"]}, tol)
+
+
+@pytest.mark.parametrize("kind", SMALL)
+def test_every_entry_changed_in_every_way(kind):
+    module, q = {**CHAINS, **smooth()}[kind]
+    for name in module.state_dict():
+        check_entry(module, q, name, WAYS)
+
+
+@pytest.mark.slow
+def test_every_entry_of_every_module():
+    """Each in one way; the examination tries all of them."""
+    every = all_models()
+    kinds, tested = set(), 0
+    ways = itertools.cycle(WAYS)
+    for module, q in every.values():
         kinds |= {part.layout.kind for part in module.modules() if hasattr(part, "layout")}
-    table = {"linear_features", "hidden_features", "markers_module"}  # in larger models
-    assert {*KINDS_OF_MODELS} - kinds <= table | {"with_markers", "blend", "tip_hybrids"}
+        for name in module.state_dict():
+            check_entry(module, q[:2], name, WAYS if IN_FULL else [next(ways)])
+            tested += 1
+    assert {*KINDS_OF_MODELS} <= kinds
+    print(f"{tested} entries of {len(every)} modules")  # noqa: T201, counted by the examination
 
 
-@pytest.mark.parametrize("kind", NAMES)
-def test_every_entry_of_the_state_changes_the_module(modules, kind, tmp_path):
-    module, q = modules[kind]
+TRUNK = ConstantCurvatureChain([0.02, 0.018])
+LENGTHS = torch.from_numpy(np.random.default_rng(1).uniform(0.1, 0.12, (4, 6)))
+OTHER = torch.tensor([0.03, 0.02]).double()
+
+
+def test_other_radii_are_another_robot(tmp_path):
+    """All keys match, so the module is the other robot, and so is its file."""
+    chain, other = copy.deepcopy(TRUNK), ConstantCurvatureChain(OTHER)
+    chain.load_state_dict(other.state_dict())
+    save_model(chain, tmp_path / "model")
+    for twin in (chain, load_model(tmp_path / "model")):
+        assert_close(twin(LENGTHS), other(LENGTHS), rtol=0, atol=1e-14)
+    assert (chain(LENGTHS) - TRUNK(LENGTHS)).norm(dim=1).max() > 0.01
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["trunk", "tendons", "pair", "rotation", "elastic", "arm"])
+def test_derivatives_by_the_state_are_those_of_differences(kind):
+    module, q = CHAINS[kind]
     rng = np.random.default_rng(0)
-    tol = tolerance(module)
+    rows = torch.from_numpy(q + 1e-4 * rng.normal(size=q.shape))  # no tendon is just taut
     for name, entry in module.state_dict().items():
-        value = changed(name, entry, rng)
-        expected = answers(twin_with(module, name, value), q)
-        for way in WAYS:
-            if way is by_numpy and not owner(module, name)[0]._buffers:
-                continue
-            twin = copy.deepcopy(module)
-            agree(answers(twin, q), answers(module, q), tol)
-            way(twin, name, value)
-            try:
-                agree(answers(twin, q), expected, tol)
-                agree(answers(copy.deepcopy(twin), q), expected, tol)
-                agree(answers(newly_constructed(twin), q), expected, tol)
-            except AssertionError as error:
-                raise AssertionError(f"{name} {way.__name__}: {error}") from None
-        given = functional_call(module, {name: value}, (torch.from_numpy(q),))
-        agree({"x": given.numpy()}, {"x": expected["x"]}, tol)
+        if name in ("q_min", "q_max", "dq_max"):
+            continue
+        scale = float(entry.abs().max()) or 1e-2
+        way = scale * torch.from_numpy(rng.normal(size=entry.shape))
+
+        def tips(value, name=name):
+            return functional_call(module, {name: value}, (rows,))
+
+        steps = 1e-6 * way
+        differences = (tips(entry + steps) - tips(entry - steps)) / 2e-6
+        twin = copy.deepcopy(module)
+        leaf = twin.get_buffer(name).requires_grad_()
+        twin(rows)[..., 0].sum().backward()
+        (along,) = jacfwd(lambda t, tips=tips, e=entry, w=way: tips(e + t * w))(torch.zeros(1))[
+            None
+        ]
+        with forward_ad.dual_level():
+            dual = tips(forward_ad.make_dual(entry, way))
+            tangent = forward_ad.unpack_dual(dual).tangent
+        tangent = torch.zeros_like(rows[:, :3]) if tangent is None else tangent
+        by_batch = vmap(tips)(torch.stack([entry, entry + steps]))
+        size = 1e-7 * max(1.0, float(differences.abs().max()))
+        assert_close((leaf.grad * way).sum(), differences[..., 0].sum(), rtol=1e-6, atol=9 * size)
+        assert_close((jacrev(tips)(entry) * way).flatten(2).sum(2), differences, rtol=0, atol=size)
+        assert_close(along[..., 0], differences, rtol=0, atol=size)
+        assert_close(tangent, differences, rtol=0, atol=size)
+        assert_close(by_batch[1], tips(entry + steps), rtol=0, atol=1e-12)
+        assert_close(module(rows), by_batch[0], rtol=0, atol=1e-12)
+
+
+def test_an_optimizer_finds_the_geometry():
+    chain = TRUNK.with_geometry(radii=torch.nn.Parameter(OTHER.clone()))
+    assert [name for name, _ in chain.named_parameters()] == ["radii"]
+    optimizer = torch.optim.LBFGS(chain.parameters(), line_search_fn="strong_wolfe")
+
+    def loss():
+        optimizer.zero_grad()
+        error = 1e3 * (chain(LENGTHS) - TRUNK(LENGTHS)).square().mean()
+        error.backward()
+        return error
+
+    for _ in range(10):
+        optimizer.step(loss)
+    assert_close(chain.radii.detach(), TRUNK.radii, rtol=1e-4, atol=0)
+    assert_close(chain(LENGTHS).detach(), TRUNK(LENGTHS), rtol=0, atol=1e-5)
+
+
+def test_weights_of_corrections_have_derivatives():
+    q, x, groups = trunk_log()
+    for coupling in ("parallel", "serial"):
+        model = HybridForwardModel(trunk(), "linear", coupling=coupling).fit(q, x, groups=groups)
+        module, rows = model.module_, torch.from_numpy(q[:3])
+        weights = {"weights": torch.ones(1).double().requires_grad_()}
+        given = functional_call(module, weights, (rows,))
+        (slope,) = torch.autograd.grad(given.sum(), weights["weights"])
+        assert_close(slope[0], (module(rows) - module.mechanical(rows)).sum(), rtol=0, atol=1e-12)
+        module.weights.mul_(1.05)  # of the core as of torch, also where they sum to more than one
+        found = native.evaluate(module, q[:3], jacobian=True)
+        for a, b in zip(found, module.forward_and_jacobian(rows), strict=True):
+            np.testing.assert_allclose(a, b.numpy(), rtol=0, atol=1e-12)
+
+
+def test_copies_keep_what_is_learned_and_frozen_models_have_none():
+    chain = TRUNK.with_geometry(radii=torch.nn.Parameter(OTHER.clone()))
+    chain.offsets.requires_grad_()
+    for twin in (copy.deepcopy(chain), pickle.loads(pickle.dumps(chain)), copy.copy(chain)):
+        assert isinstance(twin.radii, torch.nn.Parameter)
+        assert twin.radii.requires_grad
+        assert twin.offsets.requires_grad
+        assert not isinstance(twin.offsets, torch.nn.Parameter)
+        assert_close(twin(LENGTHS), chain(LENGTHS), rtol=0, atol=0)
+    frozen = chain.frozen()
+    assert not frozen(LENGTHS).requires_grad
+    assert chain(LENGTHS).requires_grad
+    single = copy.deepcopy(chain).float()
+    assert_close(single(LENGTHS.float()).double(), chain(LENGTHS), rtol=0, atol=1e-6)
+    q = torch.from_numpy(np.random.default_rng(2).uniform(0.1, 0.12, (80, 6)))
+    x = chain(q).detach().numpy()
+    model = HybridForwardModel(chain, "linear", calibrate=("radii",)).fit(q.numpy(), x)
+    np.testing.assert_allclose(model.predict(q.numpy()), x, rtol=0, atol=1e-6)
+    assert chain.radii.requires_grad
+
+
+def test_states_of_earlier_versions_are_read():
+    """They hold what is computed now."""
+    arm = CHAINS["arm"][0]
+    earlier = {**arm.state_dict(), "motions": torch.zeros(3, 3, 4, 4), "end": torch.eye(4)}
+    earlier |= {"slides": torch.ones(3), "origins_at_zero": torch.zeros(3, 4, 4)}
+    twin, q = copy.deepcopy(arm), torch.from_numpy(CHAINS["arm"][1])
+    twin.load_state_dict(earlier)
+    assert_close(twin(q), arm(q), rtol=0, atol=0)
+    chain = copy.deepcopy(TRUNK)
+    chain.load_state_dict(
+        {**ConstantCurvatureChain(OTHER).state_dict(), "arc_matrix": torch.ones(1)}
+    )
+    assert_close(chain(LENGTHS), ConstantCurvatureChain(OTHER)(LENGTHS), rtol=0, atol=0)
+    with pytest.raises(RuntimeError, match="Unexpected key"):
+        chain.load_state_dict({**chain.state_dict(), "arc_matrices": torch.ones(1)})
+
+
+def test_axes_of_any_length():
+    arm, q = copy.deepcopy(CHAINS["arm"][0]), torch.from_numpy(CHAINS["arm"][1])
+    before = arm.jacobian(q)
+    arm.axes.mul_(torch.tensor([[2.0], [0.5], [3.0]]))
+    assert_close(arm.jacobian(q), before, rtol=0, atol=1e-14)
+    assert_close(torch.from_numpy(native.evaluate(arm, q.numpy(), jacobian=True)[1]), before)
+
+
+def test_threads_see_one_state_or_the_other():
+    """A result is never that of the state before its own."""
+    chains = [TRUNK, TRUNK.with_geometry(radii=OTHER)]
+    tips = [chain(LENGTHS) for chain in chains]
+    shared, wrong, done = copy.deepcopy(TRUNK), [], threading.Event()
+
+    def read():
+        while not done.is_set():
+            x = shared(LENGTHS)
+            if not any(torch.equal(x, tip) for tip in tips):
+                wrong.append(x)
+
+    threads = [threading.Thread(target=read) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for k in range(100):
+        shared.radii = chains[k % 2].radii
+        if not torch.equal(shared(LENGTHS), tips[k % 2]):
+            wrong.append(k)
+    done.set()
+    for thread in threads:
+        thread.join()
+    assert not wrong
+
+
+def test_what_is_computed_in_a_transform_is_not_kept():
+    chain = copy.deepcopy(TRUNK)
+    for transform in (jacrev, jacfwd):
+        assert_close(vmap(transform(chain))(LENGTHS), TRUNK.jacobian(LENGTHS), rtol=0, atol=1e-12)
+        with torch.inference_mode():
+            chain(LENGTHS)
+        leaf = LENGTHS.clone().requires_grad_()
+        assert torch.autograd.grad(chain(leaf).sum(), leaf)[0].abs().max() > 0.0
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_compiled_graphs_follow_the_state():
+    for model, q in (CHAINS["trunk"], CHAINS["arm"]):
+        chain, rows = copy.deepcopy(model), torch.from_numpy(q)
+        graph = torch.compile(chain, backend="eager", fullgraph=True)
+        assert_close(graph(rows), model(rows), rtol=0, atol=1e-12)
+        for name, entry in chain.state_dict().items():
+            entry.copy_(changed(name, entry, np.random.default_rng(0)))
+            assert_close(graph(rows), chain(rows), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("operator", operators(2, 0.1).values())
+def test_operators_do_not_change(operator):
+    """What is derived from them, such as the width, stays right."""
+    for twin in (operator, copy.deepcopy(operator), pickle.loads(pickle.dumps(operator))):
+        for name, value in vars(twin).items():
+            with pytest.raises(AttributeError, match="make a new operator"):
+                setattr(twin, name, value)
+            if isinstance(value, np.ndarray):
+                with pytest.raises(ValueError, match="read-only"):
+                    value[...] = 0.0
+        np.testing.assert_array_equal(twin.width, operator.width)
