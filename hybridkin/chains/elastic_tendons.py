@@ -23,7 +23,6 @@ from hybridkin.chains._checks import filled, float_dtype, stiffnesses
 from hybridkin.chains._elastic_body import COMPRESSED, ElasticBody, why_not
 from hybridkin.chains.arc_chain import (
     STRUCTURE,
-    ArcChain,
     Change,
     each_marker,
     frame_numbers,
