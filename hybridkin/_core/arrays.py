@@ -187,16 +187,42 @@ def table(value: Any, name: str) -> Any:
 
 
 def labels(groups: ArrayLike | Tensor, n_rows: int, name: str = "groups") -> NDArray:
-    """Return the label of the motion of every row, shape (N,)."""
+    """Return the label of the motion of every row, shape (N,); no row may lack one."""
     if isinstance(groups, Tensor):
-        names = as_tensor(groups, name).numpy(force=True)
-    else:
-        names = np.asarray(groups)
+        groups = as_tensor(groups, name).numpy(force=True)
+    if np.ma.is_masked(groups):
+        groups = np.where(np.ma.getmaskarray(groups), None, groups)
+    names = entries = np.asarray(groups)
     check_shape(names, name, [n_rows], "one entry for each row of the log")
-    if names.dtype.kind == "f" and not np.isfinite(names).all():
-        need = "must name the motion of every row, got NaN or infinity"
-        raise ValueError(f"`{name}` {need}; drop these rows.")
+    if isinstance(groups, (list, tuple)):  # NumPy makes a text of NaN beside texts
+        entries = np.array([*groups, None], dtype=object)[:-1]
+    missing = _is_missing(entries)
+    if missing.any():
+        row = int(missing.argmax())
+        raise ValueError(
+            f"`{name}` must name the motion of every row, got {entries[row]} in {missing.sum()} of "
+            f"{n_rows} rows (first: row {row}); name these rows, or leave them out."
+        )
     return names.astype(str) if names.dtype == object else names
+
+
+def _is_missing(names: NDArray) -> NDArray[np.bool_]:
+    """Return which labels (N,) are None, NaN, NaT, NA or infinite."""
+    if names.dtype.kind in "iubUSV":
+        return np.zeros(names.shape, dtype=bool)
+    if names.dtype != object:
+        return ~np.isfinite(names)
+    return np.array([not _is_label(entry) for entry in names], dtype=bool)
+
+
+def _is_label(entry: Any) -> bool:
+    """Return whether an object can name a motion: it equals itself, and is not infinite."""
+    try:
+        equal = bool(entry == entry)
+    except (TypeError, ValueError):  # NA of pandas is neither equal nor unequal
+        return False
+    infinite = isinstance(entry, Real) and math.isinf(entry)
+    return entry is not None and equal and not infinite
 
 
 def as_array(a: Numbers) -> np.ndarray:

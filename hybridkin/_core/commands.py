@@ -44,6 +44,7 @@ class Commands:
         self.q: Any = q if hasattr(q, "columns") else real_array(q, "q")
         self.runs: NDArray | None = None
         self.time: NDArray | None = None
+        check_shape(self.q, "q", ("N", "n"), "one command in each row")
         if runs is not None:
             self.runs = labels(runs, len(self), "runs")
         if time is not None:
@@ -52,8 +53,15 @@ class Commands:
 
     @classmethod
     def of(cls, X: Any) -> Self:
-        """Return the commands of a caller, who may give an array: one run."""
-        return X if isinstance(X, cls) else cls(table(X, "X"))
+        """Return the commands of a caller, who may give an array: one run.
+
+        The shape of an array is not checked; scikit-learn's own checks follow.
+        """
+        if isinstance(X, cls):
+            return X
+        commands = cls(np.zeros((0, 0)))
+        commands.q = table(X, "X")
+        return commands
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -70,10 +78,30 @@ class Commands:
         return len(self.q)
 
     def __getitem__(self, rows: Any) -> Self:
-        """Return some of the rows: a slice, indices or a mask (N,)."""
+        """Return some of the rows: a slice, indices, a mask (N,), or the number of one row."""
         if isinstance(rows, tuple):  # as scikit-learn indexes: (rows, ...)
             rows = rows[0]
+        if isinstance(rows, (int, np.integer)):
+            rows = [range(len(self))[rows]]
         q = self.q.iloc[rows] if hasattr(self.q, "iloc") else self.q[rows]
         runs = None if self.runs is None else self.runs[rows]
         time = None if self.time is None else self.time[rows]
         return type(self)(q, runs, time)
+
+    def __array__(self, *_: object, **__: object) -> NDArray:
+        """Raise: an array would lose the runs and the order of the rows."""
+        raise TypeError(
+            "Commands are no array: the order of their rows, runs and times count. Functions that "
+            "change single columns or rows, such as permutation_importance, take `commands.q`, for "
+            "a model without hysteresis."
+        )
+
+    def __repr__(self) -> str:
+        """Return a one-line summary."""
+        n_rows, n = self.shape
+        parts = [f"{n_rows} rows of {n} actuators"]
+        if self.runs is not None:
+            parts.append(f"{len(np.unique(self.runs))} runs")
+        if self.time is not None and n_rows:
+            parts.append(f"time from {self.time.min():.6g} to {self.time.max():.6g} s")
+        return f"{type(self).__name__}({', '.join(parts)})"

@@ -15,6 +15,7 @@ from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.metrics import r2_score
 from sklearn.utils.validation import check_is_fitted
 
+from hybridkin._core.arrays import labels
 from hybridkin._core.commands import Commands
 from hybridkin._core.html import html_table
 from hybridkin._core.model import ForwardModel, as_forward_model
@@ -95,7 +96,8 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """
         if groups is not None:
             commands = Commands.of(X)
-            X = Commands(commands.q, groups, commands.time)
+            runs = labels(groups, len(commands))
+            X = Commands(commands.q, runs, commands.time)
         if not return_radius:
             return self._evaluated(self._tips, X)[0]
         check_is_fitted(self)

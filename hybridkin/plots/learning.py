@@ -14,6 +14,7 @@ from sklearn.utils import check_random_state
 from sklearn.utils.validation import has_fit_parameter
 from typing_extensions import Self
 
+from hybridkin._core.arrays import labels
 from hybridkin._core.texts import plot_label
 from hybridkin.plots._arrays import distance, named, plain, positions
 from hybridkin.plots._canvas import (
@@ -135,7 +136,7 @@ class LearningCurveDisplay(Display):
             models = {type(models).__name__: models}
         rng = check_random_state(random_state)
         if groups is not None:
-            groups = np.asarray(groups)
+            groups = labels(groups, np.shape(q)[0])
         splits = _splits(cv, q, groups, rng)
         splits = [
             (_ordered(np.asarray(train), groups, rng), test) for train, test in splits
