@@ -1,12 +1,34 @@
-"""Equal rows of a log, merged into one row with a weight that counts them."""
+"""Rows and their weights: equal rows are merged, and rows of weight 0 lose their targets."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from hybridkin._core.arrays import Numbers, as_array
+from hybridkin._core.arrays import Numbers, as_array, table
+
+
+def targets_that_count(y: Any, weights: Any, name: str) -> Any:
+    """Return targets (N, ...) in which rows of weight 0 repeat the first row that counts.
+
+    Nothing then depends on what `y` holds there: NaN, or any number. Of rows that do not count,
+    all are zero. Shapes and weights that are not allowed pass, for the checks that follow.
+    """
+    if weights is None:
+        return y
+    rows = table(y, name)
+    counts = table(weights, "sample_weight")
+    if np.ndim(rows) == 0 or np.shape(counts) != np.shape(rows)[:1]:
+        return y
+    counted = counts != 0.0
+    if counted.all():
+        return rows
+    filled = rows.copy()
+    filled[~counted] = rows[counted][0] if counted.any() else 0.0
+    return filled
 
 
 def distinct_rows(

@@ -22,7 +22,7 @@ from hybridkin._core.arrays import (
     number,
     one_of,
 )
-from hybridkin._core.distinct import distinct_rows
+from hybridkin._core.distinct import distinct_rows, targets_that_count
 from hybridkin._core.model import Portable
 from hybridkin._core.units import motion_message
 from hybridkin.calibration._least_squares import HELD_OUT, LOSSES, Fit, Rows, solve
@@ -179,8 +179,8 @@ def calibrate(
     groups : array-like of shape (N,), optional
         Motion of every row; required for `cv_rmse` on held-out motions.
     sample_weight : array-like of shape (N,), optional
-        How often each row counts: 2 is the same as the row twice, 0 drops it. Equal rows are held
-        out together.
+        How often each row counts: 2 is the same as the row twice, 0 drops it, whatever x holds
+        there. Equal rows are held out together.
 
     Returns
     -------
@@ -252,6 +252,7 @@ def fit_geometry(
     returns_tensors = isinstance(q, Tensor)
     device = chain.geometry()["base"].device
     chain = chain.frozen().cpu()  # the solver runs on the CPU, without a graph
+    x = targets_that_count(x, sample_weight, "x")
     q, x, unit_messages = check_data(chain, q, x)
     if groups is not None:
         groups = labels(groups, len(q))

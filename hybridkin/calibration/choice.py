@@ -13,7 +13,7 @@ from torch import Tensor
 
 from hybridkin._core.arrays import Numbers, as_tensor, labels, one_of
 from hybridkin._core.directions import in_terms, moved_directions
-from hybridkin._core.distinct import distinct_rows
+from hybridkin._core.distinct import distinct_rows, targets_that_count
 from hybridkin._core.model import ForwardModel
 from hybridkin.calibration._least_squares import COMPARED, LOSSES, ROUGH, Rows, solve
 from hybridkin.calibration._search import Start, search, widened
@@ -175,6 +175,7 @@ def choose_geometry(
     one_of(loss, "loss", LOSSES)
     nominal = chain
     chain = chain.frozen().cpu()
+    x = targets_that_count(x, weights, "x")
     q, x, _ = check_data(chain, q, x)
     motions = None if groups is None else labels(groups, len(q))
     if weights is not None:

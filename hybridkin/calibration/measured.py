@@ -17,7 +17,17 @@ _INNER = 0.4
 _BEYOND = 0.65
 
 
-def check_finite(**arrays: ArrayLike) -> None:
+LEAVE_OUT = (
+    "leave these rows out (np.isfinite finds them), or read the log with "
+    "datasets.load_log(..., drop_invalid=True)"
+)
+WEIGH_ZERO = (
+    "give these rows the weight 0 in `sample_weight` (np.isfinite finds them): their commands "
+    "still move the actuators, which they would not if the rows were left out"
+)
+
+
+def check_finite(advice: str = LEAVE_OUT, /, **arrays: ArrayLike) -> None:
     """Raise if rows of numbers hold NaN or infinity."""
     for name, values in arrays.items():
         rows = np.asarray(values)
@@ -28,8 +38,7 @@ def check_finite(**arrays: ArrayLike) -> None:
             continue
         raise ValueError(
             f"`{name}` must be finite, got NaN or infinity in {bad.sum()} of {len(rows)} rows "
-            f"(first: row {bad.argmax()}); leave these rows out (np.isfinite finds them), or "
-            "read the log with datasets.load_log(..., drop_invalid=True)."
+            f"(first: row {bad.argmax()}); {advice}."
         )
 
 
@@ -51,7 +60,7 @@ def distance(a: NDArray, b: NDArray) -> NDArray:
     return np.nanmean(distances(a, b), axis=1)
 
 
-def with_missing_markers(x: NDArray, name: str) -> NDArray:
+def with_missing_markers(x: NDArray, name: str, advice: str = LEAVE_OUT) -> NDArray:
     """Return rows x (N, 3 K) in which all coordinates of an incomplete marker are NaN.
 
     Raise if a row has no complete marker, or if numbers are infinite.
@@ -61,7 +70,7 @@ def with_missing_markers(x: NDArray, name: str) -> NDArray:
     # A marker may be missing where another one of the row is complete.
     allowed = missing & ~missing.all(axis=1, keepdims=True)
     required = np.where(allowed, 0.0, markers)
-    check_finite(**{name: required.reshape(x.shape)})
+    check_finite(advice, **{name: required.reshape(x.shape)})
     return np.where(missing, np.nan, markers).reshape(x.shape)
 
 

@@ -18,6 +18,7 @@ import torch
 from numpy.typing import NDArray
 from sklearn.base import clone
 from sklearn.kernel_ridge import KernelRidge
+from sklearn.utils import get_tags
 from sklearn.utils.validation import has_fit_parameter
 from torch import Tensor
 from typing_extensions import Self
@@ -44,7 +45,13 @@ from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._spec import ErrorModel, FittedError, Seed, Spec, Weighted
 from hybridkin.learning.elm import ELMRegressor, draw_layer
 from hybridkin.learning.elm_cv import ELMRegressorCV
-from hybridkin.learning.regressor_modules import Regressor, error_module
+from hybridkin.learning.regressor_modules import (
+    Regressor,
+    ResidualRegressor,
+    UnitSpread,
+    error_module,
+    sees_scale,
+)
 
 _LEAST = 0.2  # assumed lower limit of training errors, as a share of the errors before learning
 _LARGEST_LEVERAGE = 0.999
@@ -346,6 +353,10 @@ class RegressorModel(TipModel, Generic[_Regressor]):
     def _fitted(self, rows: Rows) -> _Regressor:
         return _fitted(self.regressor, rows)
 
+    def knows_held_out_error(self, rows: Rows) -> bool:
+        """Return whether the `noise` of its fit is that of held-out rows, or groups if given."""
+        return self.holds_out and rows.groups is None
+
     def _settled(self, regressor: _Regressor) -> ErrorModel:
         return self
 
@@ -362,6 +373,16 @@ class RegressorModel(TipModel, Generic[_Regressor]):
         mean = np.average(before, axis=0, weights=rows.counts)
         least = _LEAST * _spread(before - mean, rows.counts)
         return max(_spread(after, rows.counts), least)
+
+
+class ForeignModel(RegressorModel[Any]):
+    """A regressor of another library, which sees residuals of unit spread."""
+
+    def _fitted(self, rows: Rows) -> Any:
+        scaling = UnitSpread.of(_residual(rows), rows.counts)
+        if not sees_scale(self.regressor):
+            return _fitted(self.regressor, rows)
+        return _fitted(ResidualRegressor(self.regressor, scaling), rows)
 
 
 class NetworkModel(RegressorModel[ELMRegressor]):
@@ -394,6 +415,10 @@ class NetworkModelCV(RegressorModel[ELMRegressorCV]):
         """Return the network with the errors of the given rows."""
         regressor.left_out_errors_ = rows.as_given(regressor.left_out_errors_)
         return regressor
+
+    def knows_held_out_error(self, rows: Rows) -> bool:
+        """Return True: it holds out rows, or groups if given."""
+        return True
 
     def starting_at(self, settled: ErrorModel) -> ErrorModel:
         """Return the model with a shorter search, which starts at the settled input scales.
@@ -490,21 +515,36 @@ def _copy(regressor: _Regressor) -> _Regressor:
 
 
 def _fitted(regressor: _Regressor, rows: Rows) -> _Regressor:
-    """Return a copy of the regressor fitted to the residuals, with the weights that it takes."""
+    """Return a copy of the regressor fitted to the residuals, with the arguments that it takes."""
     copied: Any = clone(regressor)
-    if not has_fit_parameter(copied, "sample_weight"):
+    within = copied.regressor if isinstance(copied, ResidualRegressor) else copied
+    if not has_fit_parameter(within, "sample_weight"):
         rows = rows.repeated()
     options = {}
     if rows.weights is not None:
         options["sample_weight"] = rows.weights
-    if rows.groups is not None and has_fit_parameter(copied, "groups"):
+    if rows.groups is not None and has_fit_parameter(within, "groups"):
         options["groups"] = rows.groups
     turn = nullcontext()
     if isinstance(regressor, KernelRidge):
         turn = TURNS.filters
-    with turn:
-        copied.fit(rows.X, rows.residual, **options)
+    try:
+        with turn:
+            copied.fit(rows.X, rows.residual, **options)
+    except ValueError as error:
+        if np.ndim(rows.residual) > 1 and not get_tags(within).target_tags.multi_output:
+            raise _single_output(within) from error
+        raise
     return copied
+
+
+def _single_output(regressor: Any) -> ValueError:
+    """Return the error for a regressor that cannot learn several columns."""
+    name = type(regressor).__name__
+    return ValueError(
+        f"`error_model` must learn all columns of `y`, but {name} takes one; fit one for each: "
+        f"sklearn.multioutput.MultiOutputRegressor({name}(...))."
+    )
 
 
 def _on_moved_directions(module: ForwardModel, directions: Directions) -> ForwardModel:

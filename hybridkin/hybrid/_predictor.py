@@ -17,6 +17,7 @@ from sklearn.utils.validation import check_is_fitted
 
 from hybridkin._core.arrays import labels
 from hybridkin._core.commands import Commands
+from hybridkin._core.distinct import targets_that_count
 from hybridkin._core.html import html_table
 from hybridkin._core.model import ForwardModel, as_forward_model
 from hybridkin._core.plausible import PlausibleRows
@@ -122,8 +123,12 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def score(
         self, X: object, y: ArrayLike, sample_weight: ArrayLike | None = None
     ) -> float:
-        """Return R^2 of `predict`, averaged over the columns of y, without missing markers."""
+        """Return R^2 of `predict`, averaged over the columns of y, without missing markers.
+
+        Of rows of weight 0, y is ignored; with `play` they move the actuators.
+        """
         x = self.predict(X)
+        y = targets_that_count(y, sample_weight, "y")
         measured = np.asarray(y, dtype=float).reshape(len(x), -1)
         predicted = x.reshape(measured.shape)
         weights = np.ones(len(x))
@@ -246,9 +251,9 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def _warn_of_units(self, rows: Rows) -> None:
         """Warn if measured tips span far more than the robot, so they cannot be in metres."""
         chain = self._chain
-        if chain is None:
+        if chain is None or not rows.counts.any():
             return
-        measured, tips = known_tips(chain, rows)
+        measured, tips = known_tips(chain, rows.take(np.flatnonzero(rows.counts)))
         message = motion_message(
             "y", torch.cat([tips, measured]), tips, float(chain.reach)
         )

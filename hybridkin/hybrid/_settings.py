@@ -8,7 +8,7 @@ from sklearn.utils._param_validation import HasMethods, Interval, StrOptions
 from torch import nn
 
 from hybridkin.chains.hysteresis import HysteresisOperator
-from hybridkin.hybrid._error_models import NAMED, RegressorModel, network_model
+from hybridkin.hybrid._error_models import NAMED, ForeignModel, network_model
 from hybridkin.hybrid._selection import Auto
 from hybridkin.hybrid._spec import ErrorModel, Seed
 from hybridkin.learning.elm import ELMRegressor
@@ -42,7 +42,7 @@ def error_model_of(setting: object, coupling: str, random_state: Seed) -> ErrorM
     elif isinstance(setting, (ELMRegressor, ELMRegressorCV)):
         error_model = network_model(setting, coupling, random_state)
     else:
-        error_model = RegressorModel(setting)
+        error_model = ForeignModel(setting)
     if coupling not in error_model.couplings:
         raise TypeError(
             "`error_model` must be a name of features, an ELMRegressor or an ELMRegressorCV with "

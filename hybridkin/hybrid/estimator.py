@@ -16,8 +16,11 @@ from torch import nn
 
 from hybridkin._core.arrays import labels, number, table
 from hybridkin._core.commands import Commands
+from hybridkin._core.distinct import targets_that_count
 from hybridkin._core.model import PoseModel, as_forward_model
 from hybridkin.calibration.measured import (
+    LEAVE_OUT,
+    WEIGH_ZERO,
     check_finite,
     check_unscaled,
     with_missing_markers,
@@ -216,8 +219,9 @@ class HybridForwardModel(HybridPredictor):
         y : array-like of shape (N, m) or (N,)
             Measured tip positions x [m]; poses (N, 6); K markers (N, 3 K), NaN if missing.
         sample_weight : array-like of shape (N,), optional
-            How many times each row counts: a weight of 2 is the same row twice, 0 leaves it out.
-            Equal rows are held out together. With `play`, rows of weight 0 still move actuators.
+            How many times each row counts: a weight of 2 is the same row twice, 0 leaves it out,
+            whatever y holds there, also NaN. With `play`, rows of weight 0 still move actuators.
+            Equal rows are held out together.
         groups : array-like of shape (N,), optional
             Motion of every row. Whole motions are held out by the calibration
             (``calibration_.cv_rmse``), by error models that choose by groups, and for the radius.
@@ -274,7 +278,8 @@ class HybridForwardModel(HybridPredictor):
         y : array-like of shape (N, m) or (N,)
             Measured tips [m].
         sample_weight : array-like of shape (N,), optional
-            How many times each row counts: a weight of 2 is the same row twice, 0 leaves it out.
+            How many times each row counts: a weight of 2 is the same row twice, 0 leaves it out,
+            whatever y holds there. With `play`, rows of weight 0 still move the actuators.
         decay : float, default=0.98
             Factor in (0, 1] by which every new row multiplies the weights of all earlier rows. 0.98
             forgets within about fifty measurements.
@@ -368,7 +373,7 @@ class HybridForwardModel(HybridPredictor):
         True
         """
         check_is_fitted(self, "module_")
-        rows = self._checked_rows(X, y, None, groups, reset=False)
+        rows = self._checked_rows(X, y, None, groups, reset=False, weighted=False)
         check_parameters(parameters, rows.tips.shape[1] % 3 == 0)
         if self.play_ is not None:
             rows = rows.effective(self.play_)
@@ -443,14 +448,19 @@ class HybridForwardModel(HybridPredictor):
         weights: ArrayLike | None,
         groups: Any = None,
         reset: bool = True,
+        weighted: bool = True,
     ) -> Rows:
-        """Return the measured rows, checked."""
+        """Return the measured rows, checked; `weighted`: whether the caller may give weights."""
         commands = Commands.of(X)
         X = commands.q
-        y = table(y, "y")
-        missing = self._missing_markers(y)
+        y = table(targets_that_count(y, weights, "y"), "y")
+        advice = LEAVE_OUT
+        if weighted and self.play is not None:
+            advice = WEIGH_ZERO
+        missing = self._missing_markers(y, advice)
         y = None if y is None else np.where(missing, 0.0, y)
-        check_finite(X=X, y=y)
+        check_finite(X=X)
+        check_finite(advice, y=y)
         X, y, weights = check_rows(self, X, y, weights, reset)
         y = np.where(missing, np.nan, y)
         # Torch warns of columns of a data frame.
@@ -464,13 +474,13 @@ class HybridForwardModel(HybridPredictor):
             checked_times(rows.time, rows.run_of_rows)
         return rows
 
-    def _missing_markers(self, y: Any) -> NDArray[np.bool_]:
+    def _missing_markers(self, y: Any, advice: str) -> NDArray[np.bool_]:
         """Return which entries of y (N, 3 K) are missing markers; each row must keep a marker."""
         mechanical = self.mechanical_model
         allowed = mechanical is None or isinstance(mechanical, MarkedChain)
         if not allowed or self.output == "pose" or np.ndim(y) != 2 or y.shape[1] % 3:
             return np.zeros(np.shape(y), dtype=bool)
-        return np.isnan(with_missing_markers(y, "y"))
+        return np.isnan(with_missing_markers(y, "y", advice))
 
     def _spec(self, error_model: ErrorModel, rows: Rows) -> Spec:
         """Return the settings as a specification, with a copy of the mechanical model."""
@@ -482,7 +492,7 @@ class HybridForwardModel(HybridPredictor):
         names = ()
         if isinstance(mechanical, Chain):
             check_unscaled("X", rows.X, "actuator vectors [m or rad]")
-            check_unscaled("y", rows.tips, "tip positions [m]")
+            check_unscaled("y", rows.tips[rows.counts > 0.0], "tip positions [m]")
             mechanical.check_actuators(rows.q, "X")
             names = self.calibrate
             if names is None and error_model.chooses:

@@ -21,6 +21,7 @@ from hybridkin.hybrid._radius import Radius, conformal_radius
 from hybridkin.hybrid._range import TrainingRange, state_range
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._spec import FitStart, FittedError, Spec
+from hybridkin.hybrid._worse import worse_than_mechanical
 from hybridkin.hybrid.cv_results import CvResults
 from hybridkin.hybrid.held_out import MEAN_LENGTH
 
@@ -119,6 +120,7 @@ def fit_to_log(
     fitted.take_low_rank(rows.q)
     radius, of_radius = conformal_radius(spec, measured, moved)
     messages += [*of_play, *of_radius, *fit_messages(fitted.spec, rows)]
+    messages += worse_than_mechanical(fitted, _by_motion(log, rows, play))
     return HybridFit(
         module=fitted.module,
         error=fitted.error,
@@ -134,3 +136,13 @@ def fit_to_log(
         radius=radius,
         messages=tuple(dict.fromkeys(messages)),
     )
+
+
+def _by_motion(log: Rows, rows: Rows, play: HysteresisOperator | None) -> Rows:
+    """Return the rows of a fit with the groups to hold out: those of the log, else its runs."""
+    if log.groups is not None or log.runs is None:
+        return rows
+    by_run = replace(log, groups=log.runs)
+    if play is not None:
+        by_run = by_run.effective(play)
+    return by_run.distinct()

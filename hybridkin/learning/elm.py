@@ -13,6 +13,7 @@ from sklearn.utils.validation import check_is_fitted
 
 from hybridkin._core.arrays import copied, real_array
 from hybridkin._core.blocks import in_blocks_of, rows_at_once
+from hybridkin._core.distinct import targets_that_count
 from hybridkin._core.estimators import estimator_of, params_of, restore_columns
 from hybridkin._core.stored import Stored
 from hybridkin.learning._ridge import (
@@ -63,6 +64,11 @@ class FittedNetwork(MultiOutputMixin, RegressorMixin, BaseEstimator):
             return y
         std = np.sqrt(np.multiply.outer(1 + self.leverage(X), self.noise_variance_))
         return y, std.reshape(y.shape).astype(y.dtype)
+
+    def score(self, X, y, sample_weight=None):
+        """Return R^2 of `predict`; of rows of weight 0, `y` is ignored."""
+        y = targets_that_count(y, sample_weight, "y")
+        return super().score(X, y, sample_weight)
 
     def jacobian(self, X):
         """Return the derivative of the prediction with respect to the inputs, in closed form.

@@ -8,6 +8,7 @@ from sklearn.utils import check_random_state
 from sklearn.utils.validation import _check_sample_weight, validate_data
 
 from hybridkin._core.arrays import real_array, table
+from hybridkin._core.distinct import targets_that_count
 from hybridkin.learning.network import ELM
 
 DTYPES = (np.float64, np.float32)
@@ -47,7 +48,11 @@ def _scaling(X, sample_weight, input_scaling):
 
 
 def check_rows(estimator, X, y, sample_weight, reset=True):
-    """Return the rows, `y` in float64, and their weights."""
+    """Return the rows, `y` in float64, and their weights; `y` of rows of weight 0 is ignored.
+
+    Further rows of a fitted estimator (not `reset`) may all have the weight 0.
+    """
+    y = targets_that_count(y, sample_weight, "y")
     X, y, sample_weight = map(table, (X, y, sample_weight), ("X", "y", "sample_weight"))
     good = _is_finite(y, 1) or _is_finite(y, 2)
     checks = {"multi_output": True, "y_numeric": True}
@@ -57,7 +62,7 @@ def check_rows(estimator, X, y, sample_weight, reset=True):
         return X, y, None
     weights = np.asarray(sample_weight, dtype=np.float64)
     good = _is_finite(weights, 1) and len(weights) == len(X)
-    if not good or weights.min() < 0.0 or not weights.any():
+    if not good or weights.min() < 0.0 or (reset and not weights.any()):
         weights = _check_sample_weight(
             sample_weight, X, dtype=np.float64, ensure_non_negative=True
         )

@@ -7,6 +7,8 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
+from sklearn.base import BaseEstimator, TransformerMixin
+from sklearn.compose import TransformedTargetRegressor
 from sklearn.kernel_ridge import KernelRidge
 from sklearn.linear_model import ElasticNet, LinearRegression, Ridge, RidgeCV
 from sklearn.pipeline import Pipeline
@@ -48,6 +50,9 @@ def error_module(regressor: Regressor, q: Tensor) -> ForwardModel:
     q : Tensor of shape (N, n)
         The training rows.
     """
+    if isinstance(regressor, ResidualRegressor):
+        of_residual = error_module(regressor.regressor_, q)
+        return _rescaled(of_residual, regressor.transformer_)
     if isinstance(regressor, Fitted):
         return as_forward_model(regressor)
     steps: list[Any] = [regressor]
@@ -74,6 +79,72 @@ def error_module(regressor: Regressor, q: Tensor) -> ForwardModel:
     if not before and type(readout) is KernelRidge and readout.kernel == "rbf":
         return _kernel_module(readout, center, scale)
     return RegressorModule(regressor, q)
+
+
+class UnitSpread(TransformerMixin, BaseEstimator):
+    """Residuals minus their mean, over one spread for all outputs.
+
+    Parameters
+    ----------
+    mean : ndarray of shape (m,)
+        Subtracted [m].
+    spread : float
+        Divided by [m].
+    """
+
+    def __init__(self, mean: NDArray, spread: float) -> None:
+        self.mean = mean
+        self.spread = spread
+
+    @classmethod
+    def of(cls, residual: NDArray, counts: NDArray) -> UnitSpread:
+        """Return the map of residuals (N, m) to mean zero and a mean variance of one."""
+        mean = np.average(residual, axis=0, weights=counts)
+        squares = np.average((residual - mean) ** 2, axis=0, weights=counts)
+        return cls(mean, float(np.sqrt(squares.mean())) or 1.0)
+
+    def fit(self, X: NDArray, y: object = None) -> UnitSpread:
+        """Return self: the map is fixed."""
+        return self
+
+    def transform(self, X: NDArray) -> NDArray:
+        """Return scaled residuals."""
+        return (X - self.mean) / self.spread
+
+    def inverse_transform(self, X: NDArray) -> NDArray:
+        """Return residuals [m]."""
+        return X * self.spread + self.mean
+
+
+class ResidualRegressor(TransformedTargetRegressor):
+    """A regressor of residuals that sees them with mean zero and unit spread; it predicts metres.
+
+    Attributes
+    ----------
+    regressor_ : estimator
+        The fitted regressor, of scaled residuals.
+    transformer_ : UnitSpread
+        The scaling.
+    """
+
+    def __init__(self, regressor: Any, transformer: UnitSpread) -> None:
+        super().__init__(regressor, transformer=transformer, check_inverse=False)
+
+
+def sees_scale(regressor: object) -> bool:
+    """Return whether the scale of its targets may change what a regressor learns."""
+    if isinstance(regressor, Pipeline):
+        regressor = regressor.steps[-1][1]
+    return not isinstance(regressor, (LinearRegression, Ridge, RidgeCV, KernelRidge))
+
+
+def _rescaled(module: ForwardModel, scaling: UnitSpread) -> ForwardModel:
+    """Return the model of the residual [m] from that of the scaled residual."""
+    mean = torch.from_numpy(scaling.mean)
+    if isinstance(module, AffineModule):
+        bias = mean + scaling.spread * module.bias
+        return AffineModule(scaling.spread * module.coef, bias)
+    return RescaledModule(module, mean, scaling.spread)
 
 
 def _line(fitted: Any) -> tuple[NDArray, NDArray]:
@@ -354,6 +425,37 @@ class KernelModule(ForwardModel):
         towards = (kernel @ tangent.to(q)).unflatten(-1, (-1, q.shape[-1]))
         J = (towards - value[..., None] * u[..., None, :]) / self.scale.to(q)
         return value + self.bias.to(q), J
+
+
+class RescaledModule(ForwardModel):
+    """The model ``mean + spread * f(q)``.
+
+    Parameters
+    ----------
+    model : ForwardModel
+        f, q (..., n) -> (..., m).
+    mean : Tensor of shape (m,)
+        Added [m].
+    spread : float
+        The factor [m].
+    """
+
+    def __init__(self, model: ForwardModel, mean: Tensor, spread: float) -> None:
+        super().__init__()
+        self.model = model
+        self.n_actuators = model.n_actuators
+        self.n_outputs = model.n_outputs
+        _register(self, mean=mean, spread=spread)
+
+    def forward(self, q: Tensor) -> Tensor:
+        """Return mean + spread f(q), shape (..., m)."""
+        return self.mean.to(q) + self.spread.to(q) * self.model(q)
+
+    def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the value (..., m), and its Jacobian (..., m, n)."""
+        x, J = self.model.forward_and_jacobian(q)
+        spread = self.spread.to(q)
+        return self.mean.to(q) + spread * x, spread * J
 
 
 class RegressorModule(ForwardModel):

@@ -236,9 +236,9 @@ class OffsetByGroup(RegressorMixin, BaseEstimator):
 def test_a_regressor_that_takes_groups_gets_them(groups):
     model = HybridForwardModel(CHAIN, OffsetByGroup(), guard=None).fit(*log(30), groups=groups)
     if groups is None:
-        assert model.error_model_.groups_ is None
+        assert model.error_model_.regressor_.groups_ is None
     else:
-        assert_array_equal(model.error_model_.groups_, groups)
+        assert_array_equal(model.error_model_.regressor_.groups_, groups)
 
 
 # Noise, and changes of the robot
