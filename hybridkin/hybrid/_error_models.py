@@ -18,7 +18,6 @@ import torch
 from numpy.typing import NDArray
 from sklearn.base import clone
 from sklearn.kernel_ridge import KernelRidge
-from sklearn.utils import get_tags
 from sklearn.utils.validation import has_fit_parameter
 from torch import Tensor
 from typing_extensions import Self
@@ -532,19 +531,24 @@ def _fitted(regressor: _Regressor, rows: Rows) -> _Regressor:
         with turn:
             copied.fit(rows.X, rows.residual, **options)
     except ValueError as error:
-        if np.ndim(rows.residual) > 1 and not get_tags(within).target_tags.multi_output:
-            raise _single_output(within) from error
-        raise
+        if not _takes_one_column(within, rows):
+            raise
+        name = type(within).__name__
+        raise ValueError(
+            f"`error_model` must learn all columns of `y`, but {name} takes one; fit one for each: "
+            f"sklearn.multioutput.MultiOutputRegressor({name}(...))."
+        ) from error
     return copied
 
 
-def _single_output(regressor: Any) -> ValueError:
-    """Return the error for a regressor that cannot learn several columns."""
-    name = type(regressor).__name__
-    return ValueError(
-        f"`error_model` must learn all columns of `y`, but {name} takes one; fit one for each: "
-        f"sklearn.multioutput.MultiOutputRegressor({name}(...))."
-    )
+def _takes_one_column(regressor: Any, rows: Rows) -> bool:
+    """Return whether a regressor that could not learn the residuals learns their first column."""
+    single: Any = clone(regressor)
+    try:
+        single.fit(rows.X, _residual(rows)[:, 0])
+    except ValueError:
+        return False
+    return np.ndim(rows.residual) > 1
 
 
 def _on_moved_directions(module: ForwardModel, directions: Directions) -> ForwardModel:
