@@ -223,6 +223,16 @@ class ForwardModel(PortableModule):
         """
         return []
 
+    @property
+    def farthest(self) -> float:
+        """Distance from a tip beyond which a target is in another unit [m]; infinite: unknown."""
+        return math.inf
+
+    @property
+    def longest_usual(self) -> float:
+        """Length of q up to which `unit_messages` has nothing to say; infinite: unknown."""
+        return math.inf
+
     def far_messages(self, x: Tensor, name: str) -> list[str]:
         """Return warnings if tips (..., 3) lie too far from the base to be in metres."""
         return []

@@ -43,7 +43,7 @@ class PlausibleRows:
             and q.dtype == _FLOAT64
             and q.shape == self._shape
             and q.flags.c_contiguous
-            and math.hypot(*q.tolist()[0]) <= self._small
+            and math.hypot(*q.tolist()[0]) <= self.small
         )
 
     @cached_property
@@ -51,7 +51,7 @@ class PlausibleRows:
         return 1, len(self.rest)
 
     @cached_property
-    def _small(self) -> float:
+    def small(self) -> float:
         """A length of q up to which any row lies within the bounds."""
         lengths = np.linalg.norm(self.weights, axis=1)
         largest = float(lengths.max(initial=np.finfo(float).tiny))

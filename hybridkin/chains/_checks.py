@@ -19,10 +19,12 @@ from hybridkin._core.arrays import (
     real_array,
     shaped,
 )
-from hybridkin._core.units import warn_millimetres
+from hybridkin._core.units import warn_length
 
 # ratio of radii; more leave too few digits with the routing "base"
 _MOST_UNLIKE = 1000.0
+_RADIUS = 0.03  # usual radius of a robot [m], and length of a segment
+_LENGTH = 0.2
 _TURNS = 4.0 * math.pi  # [rad]; the angle of a tendon is never larger
 
 
@@ -95,7 +97,7 @@ def arc_geometry(
         )
     S = radii.numel()
     counts = actuator_counts(n_actuators, S)
-    warn_millimetres("radii", radii, 1.0)
+    warn_length("radii", radii, 1.0, _RADIUS)
     each = gains
     if not _is_nested(gains) and np.shape(gains) == (S,):
         each = np.repeat(real_array(gains, "gains"), counts)
@@ -113,7 +115,7 @@ def arc_geometry(
         lengths = [length for length in lengths if length is not None]
     if extensible != (True,) * S and lengths is not None:
         geometry["lengths"] = lengths_of(lengths, "lengths", dtype, S - sum(extensible))
-        warn_millimetres("lengths", geometry["lengths"], 10.0)
+        warn_length("lengths", geometry["lengths"], 10.0, _LENGTH)
     if not geometry["gains"].all():
         raise ValueError(f"`gains` must not be zero [m per unit of q], got {gains}.")
     return counts, extensible, geometry

@@ -19,7 +19,7 @@ from hybridkin._core.blocks import in_blocks
 from hybridkin._core.plan import NoKernel, Plan
 from hybridkin._core.plausible import PlausibleRows
 from hybridkin._core.stored import Restore, Stored
-from hybridkin._core.units import LONGEST_PULL, millimetres_message
+from hybridkin._core.units import LONGEST_PULL, length_message
 from hybridkin.chains._arcs import (
     Segments,
     rolled,
@@ -40,6 +40,7 @@ ALIASES = {"turns": "angles", "tool": "offsets", "gain": "gains"}
 
 Change = Callable[[Tensor], Tensor]
 _LONGEST = 10.0  # largest plausible length of an extensible segment [m]
+_REACHES = 50.0  # and in sizes of the robot
 STRUCTURE = {"actuators_per_segment": list, "markers": list, "routing": str}
 """Settings of every chain of arcs in files."""
 
@@ -435,7 +436,7 @@ class ArcChain(MarkedChain):
         return ", ".join(words)
 
     def unit_messages(self, q: Tensor, name: str, factor: float = 1.0) -> list[str]:
-        """Return a warning if lengths exceed 10 m, or length changes 4 backbone lengths."""
+        """Return a warning if lengths exceed 10 m or 50 robots, or changes 4 backbone lengths."""
         if not self.in_metres:
             name = f"{name}` times `gains"
         # Also test q itself, without zeros: `q` may hold speeds, or limits that are absent.
@@ -448,14 +449,18 @@ class ArcChain(MarkedChain):
         (metres,) = in_blocks(size, q)
         beyond = metres > factor * self._largest_metres.to(q)
         beyond[..., : self.stage is not None] = False  # an angle
-        message = millimetres_message(name, metres[beyond], 0.0)
+        length = self.reach.detach() / self.n_segments
+        usual = torch.where(self.absolute, length, self.radii.detach().max())
+        usual = usual.to(q).expand_as(metres)[beyond]
+        message = length_message(name, metres[beyond], 0.0, usual)
         return [] if message is None else [message]
 
     @property
     def _largest_metres(self) -> Tensor:
         """Largest plausible length or change of length (n,) [m]."""
-        pull = LONGEST_PULL * self.reach.detach()
-        return torch.where(self.absolute, _LONGEST, pull)
+        reach = self.reach.detach()
+        longest = (_REACHES * reach).clamp(max=_LONGEST)
+        return torch.where(self.absolute, longest, LONGEST_PULL * reach)
 
     def plausible_rows(self) -> PlausibleRows:
         """Return bounds of rows that need no warning about their units."""

@@ -248,6 +248,17 @@ class Chain(PoseModel):
     def _check_rows(self, rows: Tensor, name: str) -> None:
         """Raise if finite rows (N, n) cannot be a log of this robot."""
 
+    @property
+    def farthest(self) -> float:
+        """Distance from a tip beyond which a target is in another unit [m]."""
+        return _FAR * float(self.reach.detach())
+
+    @property
+    def longest_usual(self) -> float:
+        """Length of q up to which `unit_messages` has nothing to say; infinite: unknown."""
+        plausible = self.plausible_rows()
+        return math.inf if plausible is None else plausible.small
+
     def far_messages(self, x: Tensor, name: str) -> list[str]:
         """Return a warning if tips span more than 50 times the robot's size."""
         origin = self.base[:3, 3].detach().to(x)

@@ -14,7 +14,7 @@ from hybridkin._core.arrays import Numbers, Transform
 from hybridkin._core.derived import derived
 from hybridkin._core.plan import NoKernel, Plan
 from hybridkin._core.stored import Layout, Restore, Stored
-from hybridkin._core.units import degrees_message, millimetres_message, warn_millimetres
+from hybridkin._core.units import degrees_message, length_message, warn_length
 from hybridkin.chains._arm_files import (
     Joint,
     Options,
@@ -46,6 +46,7 @@ if TYPE_CHECKING:
 __all__ = ["RigidChain"]
 
 _FAR = 10.0  # [m]; a joint that slides further is more likely in millimetres
+_LINK = 0.3  # [m]; a usual link
 _KINDS = ("revolute", "prismatic")
 
 
@@ -224,7 +225,7 @@ class RigidChain(Chain):
         }
         self._set_geometry(geometry)
         self.to(dtype)
-        warn_millimetres("origins", self.origins[:, :3, 3].abs(), _FAR)
+        warn_length("origins", self.origins[:, :3, 3].abs(), _FAR, _LINK)
 
     @classmethod
     def from_urdf(
@@ -642,7 +643,10 @@ class RigidChain(Chain):
         # The motion of every joint by each actuator alone: an actuator may have a gear.
         joints = (q[:, None] * self.couplings.to(q)).abs()
         turned = degrees_message(name, joints[:, ~self.slides], factor)
-        slid = millimetres_message(name, joints[:, self.slides], factor * _FAR)
+        reach = float(self.reach.detach())
+        slid = length_message(
+            name, joints[:, self.slides], factor * _FAR, min(reach, 1.0)
+        )
         return [message for message in (turned, slid) if message is not None]
 
     def extra_repr(self) -> str:

@@ -274,7 +274,7 @@ def load_log(
         if unit == "m" and (middle > 10 or span > 5):
             warnings.warn(
                 f"The `{name}` columns span {span:.4g} m around {middle:.4g} m; if the file has "
-                f"millimetres, give {name}_unit='mm'.",
+                f"millimetres, give {name}_unit='mm' (centimetres: 'cm').",
                 stacklevel=2,
             )
     si_unit = q_unit if q_unit == "1" else "rad"

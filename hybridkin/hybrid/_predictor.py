@@ -33,6 +33,7 @@ from hybridkin.hybrid._module import Hybrid
 from hybridkin.hybrid._radius import Radius
 from hybridkin.hybrid._range import TrainingRange
 from hybridkin.hybrid._rows import Rows
+from hybridkin.hybrid._units import check_commands
 from hybridkin.hybrid._wrapped import in_columns, pose_difference
 from hybridkin.hybrid.cv_results import CvResults
 from hybridkin.hybrid.log_fit import HybridFit
@@ -247,6 +248,12 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if isinstance(self.mechanical_model_, Chain):
             return self.mechanical_model_
         return None
+
+    def _check_commands(self, rows: Rows) -> None:
+        """Raise if actuator vectors have another unit than those of the fit."""
+        chain = self._chain
+        turns = chain is not None and bool(torch.as_tensor(chain.turns).all())
+        check_commands(rows, self.training_range_, turns)
 
     def _warn_of_units(self, rows: Rows) -> None:
         """Warn if measured tips span far more than the robot, so they cannot be in metres."""

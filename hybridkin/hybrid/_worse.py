@@ -17,7 +17,7 @@ from hybridkin.hybrid._module import Hybrid
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._spec import Spec, residuals
 
-_FEW = 20  # rows below which none are held out
+_FEW = 20  # rows below which errors of held-out rows mean little
 
 
 def worse_than_mechanical(fitted: FittedHybrid, rows: Rows) -> list[str]:
@@ -36,6 +36,8 @@ def worse_than_mechanical(fitted: FittedHybrid, rows: Rows) -> list[str]:
     """
     spec = fitted.spec
     model = spec.error_model
+    if len(rows) < _FEW:  # which has a warning of its own
+        return []
     if spec.mechanical is None or not isinstance(model, RegressorModel):
         return []
     before, after = _errors(spec, fitted.module, rows)
@@ -62,7 +64,7 @@ def worse_than_mechanical(fitted: FittedHybrid, rows: Rows) -> list[str]:
 
 def _can_hold_out(rows: Rows) -> bool:
     """Return whether a fifth of the rows, or of their groups, can be held out."""
-    if len(rows) < _FEW or np.isnan(rows.tips).any():
+    if np.isnan(rows.tips).any():
         return False
     return rows.groups is None or len(np.unique(rows.groups)) > 1
 

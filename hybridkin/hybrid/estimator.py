@@ -39,6 +39,7 @@ from hybridkin.hybrid._predictor import HybridPredictor
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._settings import CONSTRAINTS, error_model_of
 from hybridkin.hybrid._spec import ErrorModel, Spec, residuals
+from hybridkin.hybrid._units import check_tips
 from hybridkin.hybrid.log_fit import HybridFit, fit_to_log
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.hidden_layer import check_rows
@@ -302,6 +303,7 @@ class HybridForwardModel(HybridPredictor):
         if self.play_ is not None:
             moved, self._past = continued(self.play_, rows, self._past)
             rows = replace(rows, X=moved)
+        self._check_commands(rows)
         self._warn_of_units(rows)
         rows = self.change_.before(rows, self.output)
         fitted = self.fitted_module_
@@ -354,8 +356,9 @@ class HybridForwardModel(HybridPredictor):
         Raises
         ------
         ValueError
-            For other `parameters`, and for "base" if the outputs are neither tips in space nor
-            poses.
+            If X or y has another unit than the fit: X by its size, y by how far the tips of several
+            postures lie apart. For other `parameters`, and for "base" if the outputs are neither
+            tips in space nor poses.
 
         Warns
         -----
@@ -377,6 +380,8 @@ class HybridForwardModel(HybridPredictor):
         check_parameters(parameters, rows.tips.shape[1] % 3 == 0)
         if self.play_ is not None:
             rows = rows.effective(self.play_)
+        self._check_commands(rows)
+        check_tips(rows, self.fitted_module_)
         self._warn_of_units(rows)
         self.change_, message = likeliest_change(
             self.fitted_module_,

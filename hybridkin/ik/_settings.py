@@ -152,6 +152,8 @@ class StepSettings(Portable):
     periods: Tensor = field(init=False)
     pulls: Tensor = field(init=False)
     n_actuators: int | None = field(init=False)
+    farthest: float = field(init=False)
+    longest_usual: float = field(init=False)
 
     def __post_init__(self) -> None:
         """Check the settings against each other and the model, and derive the others."""
@@ -203,6 +205,8 @@ class StepSettings(Portable):
             periods=periods,
             pulls=bound(model.robot.pulls, "pulls"),
             n_actuators=next(iter(sizes), None),
+            farthest=model.robot.farthest,
+            longest_usual=model.robot.longest_usual,
         )
 
     def present(self) -> StepSettings:
@@ -248,6 +252,12 @@ class StepSettings(Portable):
                 robot = self.task.models[0].robot
                 messages += robot.unit_messages(rows, name, factor)
         return messages
+
+    def posture_messages(self, q: Tensor, name: str) -> list[str]:
+        """Return warnings if configurations (..., n) seem to have another unit than the model."""
+        rows = q.reshape(-1, q.shape[-1])
+        finite = rows[torch.isfinite(rows).all(-1)]
+        return self.task.models[0].robot.unit_messages(finite, name)
 
     def far_messages(self, x: Tensor, name: str) -> list[str]:
         """Return warnings if targets lie too far from the robot to be in metres."""

@@ -45,9 +45,7 @@ def followed(
     start = settings.configurations(q0, "q0", path.points)
     target = path.points.to(start.dtype)
     command = as_array(start) if path.as_numpy else start
-    tracker = Tracker(settings, command, path.tol, loop.memory)
-    if state is not None:
-        tracker.reset(command, state)
+    tracker = Tracker(settings, command, path.tol, loop.memory, state)
     q, effective, x, measured, sigma_min, held, damped = tracker.follow(
         target, path.periods, loop.plant, loop.feedback, loop.progress
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from inspect import signature
@@ -12,6 +13,7 @@ import torch
 from torch import Tensor
 
 from hybridkin._core.arrays import (
+    as_tensor,
     give_back,
     is_numpy,
     leading,
@@ -262,8 +264,33 @@ class InverseKinematics:
                     Step
                 )  # its constructor takes longer than the step
                 vars(step)["_row"] = result
+                settings = self._settings
+                too_long = math.hypot(*q.tolist()) > settings.longest_usual  # pyright: ignore
+                if too_long or step.error > settings.farthest:
+                    self._warn_of_units(q, x_target, x_measured)
                 return step
-        return self._steps(core, q, x_target, dx, x_measured, dq)
+        step = self._steps(core, q, x_target, dx, x_measured, dq)
+        settings = self._settings
+        q_rows = settings.configurations(q, "q")
+        too_long = q_rows.norm(dim=-1) > settings.longest_usual
+        too_far = torch.as_tensor(step.error) > settings.farthest
+        if too_long.any() or too_far.any():
+            self._warn_of_units(q, x_target, x_measured)
+        return step
+
+    def _warn_of_units(
+        self, q: Array, x_target: Array, x_measured: Array | None
+    ) -> None:
+        """Warn where arguments of a step whose error is too large have another unit."""
+        settings = self._settings
+        messages = settings.posture_messages(settings.configurations(q, "q"), "q")
+        tips = {"x_target": x_target, "x_measured": x_measured}
+        for name, value in tips.items():
+            if value is not None:
+                points = settings.points(value, name)
+                messages += settings.far_messages(points, name)
+        for message in messages:
+            warnings.warn(message, stacklevel=3)
 
     @torch.no_grad()
     def _steps(
@@ -379,6 +406,37 @@ class InverseKinematics:
         must be twice differentiable by torch.
         """
         settings = self.settings
+        target = settings.points(x_target, "x_target")
+        messages = settings.far_messages(target, "x_target")
+        if q0 is not None:
+            start = settings.configurations(q0, "q0", target)
+            messages += settings.posture_messages(start, "q0")
+        for message in messages:
+            warnings.warn(message, stacklevel=3)
+        return self._solved(
+            x_target,
+            q0,
+            tol=tol,
+            max_iter=max_iter,
+            restarts=restarts,
+            n_solutions=n_solutions,
+            differentiable=differentiable,
+        )
+
+    @torch.no_grad()
+    def _solved(
+        self,
+        x_target: Array,
+        q0: Array | None = None,
+        *,
+        tol: float | Sequence[float] = 1e-4,
+        max_iter: int = 50,
+        restarts: int = 32,
+        n_solutions: int | None = None,
+        differentiable: bool = False,
+    ) -> IKSolution:
+        """Return what `solve` does, without warnings about units."""
+        settings = self.settings
         task = settings.task
         axes = len(task.shape)
         tolerance = settings.tolerance(tol)
@@ -391,8 +449,6 @@ class InverseKinematics:
             "`x_target` must be a torch tensor for differentiable=True.",
         )
         target = settings.points(x_target, "x_target")
-        for message in settings.far_messages(target, "x_target"):
-            warnings.warn(message, stacklevel=3)
         if q0 is None:
             start = settings.start(target)
         else:
@@ -544,8 +600,10 @@ class InverseKinematics:
         target = settings.points(points, "path", lead="T")
         require(len(target) > 0, "`path` must hold at least one point, got none.")
         starts = None
+        messages = settings.far_messages(target, "path")
         if q0 is not None:
             starts = settings.configurations(q0, "q0", target)
+            messages += settings.posture_messages(starts, "q0")
             require(
                 starts.ndim < 3 and starts.numel() > 0,
                 f"`q0` must have shape (n,) or (K, n), got {tuple(starts.shape)}.",
@@ -554,9 +612,9 @@ class InverseKinematics:
         tolerance = settings.tolerance(tol)
         timed = Path(target, times, periods, tolerance, is_numpy(points))
         loop = Loop(plant, feedback, memory, progress)
+        for message in messages:
+            warnings.warn(message, stacklevel=3)
         if starts is not None and starts.ndim == 1:
-            for message in settings.far_messages(target, "path"):
-                warnings.warn(message, stacklevel=3)
             return followed(settings, starts, timed, loop, state)
         require(state is None, "`state` requires `q0` of shape (n,), one start.")
         # The start is chosen on the model alone: the robot moves once.
@@ -579,7 +637,7 @@ class InverseKinematics:
         settings = self.settings
         guesses = q0
         if guesses is None:
-            yield self.solve(target[0]).q
+            yield self._solved(target[0]).q
             start = settings.start(target)[None]
             guesses = nearest_starts(settings, start, start[:, 0], target, _GUESSES)[0]
         # The nearest ones, and always the first.
@@ -587,7 +645,7 @@ class InverseKinematics:
         distances = settings.task.distances(x[None], target)[0]
         distances[0] = -1.0
         guesses = guesses[distances.argsort()[: _GUESSES + 1]]
-        solution = self.solve(target[0], guesses, max_iter=200)
+        solution = self._solved(target[0], guesses, max_iter=200)
         if q0 is not None:
             yield solution.q[0]
         for wanted in (IKStatus.CONVERGED, IKStatus.OUT_OF_DOMAIN):
@@ -619,4 +677,9 @@ class InverseKinematics:
         Tracker
             Its `step` takes a target, and optionally the measured tip, and returns the command.
         """
-        return Tracker(self.settings, q0, self.settings.tolerance(tol), memory)
+        settings = self.settings
+        tracker = Tracker(settings, q0, settings.tolerance(tol), memory)
+        start = as_tensor(q0, "q0")
+        for message in settings.posture_messages(start, "q0"):
+            warnings.warn(message, stacklevel=2)
+        return tracker

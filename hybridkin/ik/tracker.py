@@ -77,7 +77,12 @@ class Tracker(Portable):
     """
 
     def __init__(
-        self, settings: StepSettings, q0: Array, tol: Tolerance, memory: float | None
+        self,
+        settings: StepSettings,
+        q0: Array,
+        tol: Tolerance,
+        memory: float | None,
+        state: Any = None,
     ) -> None:
         if memory is not None:
             memory = number(memory, "memory")
@@ -88,7 +93,7 @@ class Tracker(Portable):
         self._memory = memory
         self._as_numpy = is_numpy(q0)
         self._lock = Lock()  # of the state, for threads that share the tracker
-        self.reset(q0)
+        self._reset(q0, state)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
@@ -185,6 +190,11 @@ class Tracker(Portable):
             State of the hysteresis [unit of q]: `state` of a tracker, or as from `apply` of the
             model's `play_` with the commands until now. Default: without hysteresis at q.
         """
+        self._reset(q, state)
+        for message in self._settings.posture_messages(as_tensor(q, "q"), "q"):
+            warnings.warn(message, stacklevel=2)
+
+    def _reset(self, q: Array, state: Any) -> None:
         start = as_tensor(q, "q", self._settings.task.device)
         n = self._settings.n_actuators
         right_shape = start.ndim == 1 and n in (None, len(start))
@@ -195,6 +205,7 @@ class Tracker(Portable):
         )
         with self._lock:
             self._like = start.clone()
+            self._unseen = {"x_target", "x_measured"}
             self._start(self._like, torch.zeros_like(start), state)
 
     def _start(self, q: Tensor, dq: Tensor, hysteresis: Any) -> None:
@@ -256,10 +267,23 @@ class Tracker(Portable):
                     state = None
                 q = as_tensor(robot.command(), "q")
                 self._start(q, robot.last().step.dq[0], state)
+            if "x_target" in self._unseen:
+                self._look("x_target", x_target)
+            if x_measured is not None and self._unseen:
+                self._look("x_measured", x_measured)
             robot = self._robot
             if not robot.tick(x_target, dx, x_measured):
                 self._step(x_target, dx, x_measured)
             return robot.command()
+
+    def _look(self, name: str, value: Array) -> None:
+        """Warn if the first target or tip after `reset` has another unit than the robot."""
+        points = self._settings.points(value, name, lead="")
+        if not torch.isfinite(points).all():
+            return
+        self._unseen.discard(name)
+        for message in self._settings.far_messages(points, name):
+            warnings.warn(message, stacklevel=3)
 
     def _step(
         self, x_target: Array, dx: Array | None, x_measured: Array | None

@@ -60,8 +60,9 @@ class Trajectory:
         largest = float(np.abs(x).max())
         if largest > _FAR:
             warnings.warn(
-                f"`x` reaches {largest:.4g} m, which looks like millimetres; hybridkin works in "
-                "metres: divide by 1000, or read a file with unit='mm'.",
+                f"`x` reaches {largest:.4g} m, which looks like millimetres or centimetres; "
+                "hybridkin works in metres: divide by 1000 or 100, or read a file with unit='mm' "
+                "or 'cm'.",
                 stacklevel=4,
             )
         vars(self).update(t=t, x=x)

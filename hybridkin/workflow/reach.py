@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridkin._core.units import rough_unit
 from hybridkin.ik.results import IKStatus
 from hybridkin.ik.trajectories import Trajectory
 from hybridkin.workflow.domain import Domain
@@ -19,7 +20,7 @@ _POINTS = 13  # of the path, evenly in time; its ends in each direction are adde
 _PLACES = 48  # places that are tried for a path
 _HALVINGS = 7
 _ITERATIONS = 100
-_OTHER_UNIT = 100.0  # a path this many times larger than the workspace: another unit
+_OTHER_UNIT = 20.0  # a path this many times larger than the workspace: another unit
 
 
 def center_of(path: Trajectory) -> NDArray:
@@ -70,9 +71,10 @@ def check_reach(
     far = np.linalg.norm(path.x, axis=1).max()
     reach = np.linalg.norm(tips, axis=1).max()
     if far > _OTHER_UNIT * reach:
+        unit = rough_unit(far / reach)
         raise ValueError(
             f"`path` goes {far:.4g} m from the origin, the tips of the robot {reach:.3g} m. This "
-            "looks like millimetres read as metres; give --unit mm."
+            f"looks like {unit.name} read as metres; give --unit {unit.symbol}."
         )
     if force:
         return
