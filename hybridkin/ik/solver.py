@@ -265,8 +265,9 @@ class InverseKinematics:
                 )  # its constructor takes longer than the step
                 vars(step)["_row"] = result
                 settings = self._settings
+                row, places = result
                 too_long = math.hypot(*q.tolist()) > settings.longest_usual  # pyright: ignore
-                if too_long or step.error > settings.farthest:
+                if too_long or row[places["error"]] > settings.farthest:
                     self._warn_of_units(q, x_target, x_measured)
                 return step
         step = self._steps(core, q, x_target, dx, x_measured, dq)

@@ -24,13 +24,14 @@ from hybridkin._core.turns import TURNS
 from hybridkin.learning._left_out import LeftOut, left_out
 from hybridkin.learning._ridge import gather
 from hybridkin.learning.elm import ELMRegressor, FittedNetwork
-from hybridkin.learning.hidden_layer import check_rows, device_named, draw_layer
+from hybridkin.learning.hidden_layer import check_rows, device_named, draw_layer, scaling
 
 # Times the largest eigenvalue of the features' Gram matrix.
 _AUTO_ALPHAS = np.logspace(-11, 2, 40)
 _ZOOM = (0.5, 1.0, 2.0, 4.0)  # times the best weight scale, with new input scales
 _WORTH_GROWING = 0.96  # of the mean squared error: 2 % of the error
 _LEAST_RELEVANCE = 0.01
+_NEVER = 1e30  # range of an input that never moved: nothing is learned of it
 _ROWS_OF_JACOBIANS = 10_000
 _SHARED = ("activation", "input_scaling", "fit_intercept", "direct_link")
 _SHARED += ("block_size", "device")
@@ -41,7 +42,8 @@ class ELMRegressorCV(FittedNetwork):
 
     Every choice minimises the mean squared error on held-out rows, each row alone or by groups.
     These errors are exact for the given hidden layer and input scales. One factorisation gives
-    them for the whole grid of penalties, without refits.
+    them for the whole grid of penalties, without refits. Inputs that never moved in the training
+    rows have no effect on predictions.
 
     In relevance rounds, each input is then scaled by how much the derivative with respect to it
     varies over the training rows. Inputs without effect, or with a linear effect, then use fewer
@@ -223,6 +225,8 @@ class ELMRegressorCV(FittedNetwork):
             seed = int(check_random_state(seed).randint(2**31))
         params = {name: vars(self)[name] for name in _SHARED}
         params["random_state"] = seed
+        if search.still.any():
+            params["input_scaling"] = search.bounds(self.input_scaling)
         sizes = _positive(self.n_hidden, "n_hidden", integer=True)
         scales = _positive(self.weight_scales, "weight_scales")
         for size, scale in product(sizes, scales):
@@ -286,7 +290,20 @@ class _Search:
             self.weights = np.ones(len(X))
         self.splits = splits
         self.alphas = alphas
+        low = X.min(axis=0)
+        high = X.max(axis=0)
+        largest = np.maximum(np.abs(low), np.abs(high))
+        self.still = high - low <= 4.0 * np.finfo(X.dtype).eps * largest
         self.tried: list[_Candidate] = []
+
+    def bounds(self, input_scaling):
+        """Return the bounds of an input scaling, far apart for inputs that never moved.
+
+        Random weights would else give the network an arbitrary slope along these inputs.
+        """
+        center, scale = scaling(self.X, self.sample_weight, input_scaling)
+        scale[self.still] = _NEVER
+        return np.array([center - scale, center + scale])
 
     @property
     def best(self):
@@ -393,6 +410,7 @@ def _relevance(best, search):
     weight = search.weights.sum()
     variance = squares / weight - (total / weight) ** 2
     spread = np.sqrt(np.maximum(variance, 0.0).sum(axis=0))
+    spread[search.still] = 0.0
     relevance = np.maximum(spread / (spread.max() or 1.0), _LEAST_RELEVANCE)
     half = scale / relevance
     return relevance, np.array([center - half, center + half])

@@ -15,7 +15,7 @@ DTYPES = (np.float64, np.float32)
 _FEW = 64  # numbers that Python adds in less time than NumPy
 
 
-def _scaling(X, sample_weight, input_scaling):
+def scaling(X, sample_weight, input_scaling):
     """Return center and scale (d,) that map the columns of `X` to about [-1, 1]."""
     n_inputs = X.shape[1]
     eps = np.finfo(X.dtype).eps
@@ -113,7 +113,7 @@ def draw_layer(params, X, sample_weight):
     shape = (params.n_hidden, X.shape[1])
     W = rng.uniform(-params.weight_scale, params.weight_scale, shape)
     b = rng.uniform(-params.weight_scale, params.weight_scale, params.n_hidden)
-    center, scale = _scaling(X, sample_weight, params.input_scaling)
+    center, scale = scaling(X, sample_weight, params.input_scaling)
     n_features = params.n_hidden + params.direct_link * X.shape[1]
     return ELM(
         params.activation,
