@@ -46,7 +46,8 @@ _LARGE = (
     Unit("micrometres", "um", 1e6, "divide by 1e6"),
 )
 _KILOMETRES = Unit("kilometres", "km", 1e-3, "multiply by 1000")
-_BOTH = Unit("centimetres or inches", "cm", 63.0, "divide by 100, or by 39.37")
+# Of rough ratios up to 170.
+_BOTH = Unit("centimetres or inches", "cm", 30.0, "divide by 100, or by 39.37")
 _DEGREES = Unit("degrees", "deg", 180.0 / math.pi, "take numpy.radians of them")
 
 

@@ -645,7 +645,7 @@ class RigidChain(Chain):
         turned = degrees_message(name, joints[:, ~self.slides], factor)
         reach = float(self.reach.detach())
         slid = length_message(
-            name, joints[:, self.slides], factor * _FAR, min(reach, 1.0)
+            name, joints[:, self.slides], factor * _FAR, 0.5 * min(reach, 1.0)
         )
         return [message for message in (turned, slid) if message is not None]
 

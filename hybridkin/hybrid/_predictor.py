@@ -33,10 +33,10 @@ from hybridkin.hybrid._module import Hybrid
 from hybridkin.hybrid._radius import Radius
 from hybridkin.hybrid._range import TrainingRange
 from hybridkin.hybrid._rows import Rows
-from hybridkin.hybrid._units import check_commands
 from hybridkin.hybrid._wrapped import in_columns, pose_difference
 from hybridkin.hybrid.cv_results import CvResults
 from hybridkin.hybrid.log_fit import HybridFit
+from hybridkin.hybrid.other_units import check_commands
 from hybridkin.learning.hidden_layer import check_inputs
 from hybridkin.native.library import evaluate
 

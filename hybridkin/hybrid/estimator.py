@@ -33,14 +33,15 @@ from hybridkin.hybrid._adapt import (
     check_parameters,
     likeliest_change,
 )
+from hybridkin.hybrid._fit import known_tips
 from hybridkin.hybrid._html import fitted_rows
 from hybridkin.hybrid._hysteresis import continued
 from hybridkin.hybrid._predictor import HybridPredictor
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._settings import CONSTRAINTS, error_model_of
 from hybridkin.hybrid._spec import ErrorModel, Spec, residuals
-from hybridkin.hybrid._units import check_tips
 from hybridkin.hybrid.log_fit import HybridFit, fit_to_log
+from hybridkin.hybrid.other_units import check_tips
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.hidden_layer import check_rows
 
@@ -381,8 +382,13 @@ class HybridForwardModel(HybridPredictor):
         if self.play_ is not None:
             rows = rows.effective(self.play_)
         self._check_commands(rows)
-        check_tips(rows, self.fitted_module_)
-        self._warn_of_units(rows)
+        with torch.no_grad():
+            predicted = self.fitted_module_(rows.q).numpy()
+        check_tips(rows.tips[:, : predicted.shape[1]], predicted, "y")
+        if self._chain is not None:  # wherever its base is
+            measured, _ = known_tips(self._chain, rows)
+            for message in self._chain.far_messages(measured, "y"):
+                warnings.warn(message, stacklevel=2)
         self.change_, message = likeliest_change(
             self.fitted_module_,
             rows,

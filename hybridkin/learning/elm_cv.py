@@ -24,7 +24,12 @@ from hybridkin._core.turns import TURNS
 from hybridkin.learning._left_out import LeftOut, left_out
 from hybridkin.learning._ridge import gather
 from hybridkin.learning.elm import ELMRegressor, FittedNetwork
-from hybridkin.learning.hidden_layer import check_rows, device_named, draw_layer, scaling
+from hybridkin.learning.hidden_layer import (
+    check_rows,
+    device_named,
+    draw_layer,
+    scaling,
+)
 
 # Times the largest eigenvalue of the features' Gram matrix.
 _AUTO_ALPHAS = np.logspace(-11, 2, 40)

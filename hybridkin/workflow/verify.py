@@ -16,6 +16,7 @@ from hybridkin._core.commands import Commands
 from hybridkin._core.rotations import rigid_motion
 from hybridkin.chains.play import PlayOperator
 from hybridkin.datasets import Log
+from hybridkin.hybrid.other_units import check_tips
 from hybridkin.native.library import evaluate
 from hybridkin.workflow.errors import Errors, ExpectedErrors
 from hybridkin.workflow.model import LoadedModel
@@ -146,7 +147,8 @@ def verify_track(
     Raises
     ------
     ValueError
-        If rows or commands of the log are not those of the track.
+        If rows or commands of the log are not those of the track, or if its tips are in another
+        unit than the model.
     """
     if out is not None:
         check_out(out, "verify", force=force)
@@ -165,7 +167,9 @@ def verify_track(
             f"`log` must have at least 3 measured tips of the path, got {len(rows)}."
         )
     q = motion[rows]
-    errors = np.linalg.norm(x - loaded.tips(q), axis=1)
+    predicted = loaded.tips(q)
+    check_tips(x, predicted, "x")
+    errors = np.linalg.norm(x - predicted, axis=1)
     promised = loaded.promised_errors(q)
     parts = {}
     for name, part in _parts(loaded, q).items():

@@ -56,7 +56,7 @@ def log(n=120, seed=0):
     rng = np.random.default_rng(seed)
     q = 0.25 + 0.05 * rng.uniform(-1, 1, (n, 3))
     x = ConstantCurvatureChain([0.05])(torch.from_numpy(q)).numpy() + 0.02 * np.sin(20 * q)
-    return q, x + [0.3, 0.0, 0.0]
+    return q, x + np.array([0.3, 0.0, 0.0])
 
 
 @pytest.mark.parametrize("unit", [1e3, 1024.0, 0.125])
@@ -94,7 +94,7 @@ def test_jacobian_updates_and_copies_are_those_of_the_prediction(name):
     np.testing.assert_allclose(fitted.predict(q)[weight], learned[weight], rtol=0, atol=1e-10)
     copied = pickle.loads(pickle.dumps(fitted))
     np.testing.assert_array_equal(copied.predict(q), fitted.predict(q))
-    moved = x + [0.01, 0.0, 0.0]
+    moved = x + np.array([0.01, 0.0, 0.0])
     fitted.partial_fit(q, moved)
     assert np.linalg.norm(fitted.predict(q) - moved, axis=1).mean() < 0.008
     fitted.adapt(q, moved)
@@ -138,7 +138,7 @@ def test_weights_are_repetitions_for_the_scale():
 
 def test_a_column_that_never_moves_has_a_mean_alone():
     q, x = log()
-    x = ConstantCurvatureChain([0.06])(torch.from_numpy(q)).numpy() + [0.1, 0.2, 0.3]
+    x = ConstantCurvatureChain([0.06])(torch.from_numpy(q)).numpy() + np.array([0.1, 0.2, 0.3])
     for name in ("MLP", "SVR", "ElasticNet"):
         fitted = model(REGRESSORS[name]).fit(q, x)
         np.testing.assert_allclose(fitted.predict(q), x, rtol=0, atol=1e-9)

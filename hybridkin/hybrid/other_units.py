@@ -1,12 +1,10 @@
-"""New rows in another unit than those of the fit: which of X and y, and by what factor."""
+"""Rows in another unit than those of the fit: which of q and x, and by what factor."""
 
 from __future__ import annotations
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from hybridkin._core.model import ForwardModel
 from hybridkin._core.units import other_unit
 from hybridkin.hybrid._range import TrainingRange
 from hybridkin.hybrid._rows import Rows
@@ -36,39 +34,44 @@ def check_commands(rows: Rows, seen: TrainingRange, turns: bool) -> None:
     moved = usual > 0.0
     if not len(rows) or not moved.any():
         return
-    ratio = float(np.median(np.abs(rows.X)[:, moved] / usual[moved]))
+    largest = (np.abs(rows.X)[:, moved] / usual[moved]).max(axis=1)
+    ratio = float(np.median(largest))
     small = ratio < _SMALLER and lengths.all()
     if not small and ratio < _LARGER:
         return
     _refuse("X", "actuator vectors", ratio, "those of the fit", turns)
 
 
-def check_tips(rows: Rows, model: ForwardModel) -> None:
+def check_tips(measured: NDArray, predicted: NDArray, name: str) -> None:
     """Raise if measured tips are those of a model in another unit; its base may have moved.
 
     Rows that hold about one posture, or that do not move, tell nothing of the unit.
+
+    Parameters
+    ----------
+    measured, predicted : ndarray of shape (N, m)
+        Tips, NaN if not measured, and those of the model at the same commands [m].
+    name : str
+        Name of the measured tips in messages.
     """
-    with torch.no_grad():
-        predicted = model(rows.q).numpy()
-    measured = rows.tips[:, : predicted.shape[1]]
-    predicted = np.where(np.isnan(measured), np.nan, predicted)
-    moved = _span(predicted)
-    if len(rows) < 2 or not moved > _POSTURES * np.nanmax(np.abs(predicted)):
+    seen = np.where(np.isnan(measured), np.nan, predicted)
+    moved = _span(seen)
+    if len(measured) < 2 or not moved > _POSTURES * np.nanmax(np.abs(seen)):
         return
     ratio = _span(measured) / moved
-    if _SMALLER < ratio < _LARGER:
+    small = ratio < _SMALLER and other_unit(ratio) is not None
+    if not small and ratio < _LARGER:  # smaller ones can be a robot that did not move
         return
-    _refuse("y", "tips", ratio, "the model predicts", False)
+    _refuse(name, "tips", ratio, "the model predicts", False)
 
 
 def _refuse(name: str, what: str, ratio: float, than: str, turns: bool) -> None:
-    """Raise if the ratio is that of a unit."""
+    """Raise an error that names the unit, if the ratio is that of one."""
     unit = other_unit(ratio, angle=turns)
-    if unit is None:
-        return
+    looks = "check their unit" if unit is None else f"this looks like {unit.in_words}"
     raise ValueError(
         f"`{name}` must hold {what} in the unit of the fit, but they are about {ratio:.2g} times "
-        f"as large as {than}, which looks like {unit.in_words}."
+        f"as large as {than}; {looks}."
     )
 
 
