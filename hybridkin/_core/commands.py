@@ -17,15 +17,16 @@ class Commands:
     """Actuator vectors in order of time: which rows follow each other, and when.
 
     Only models with hysteresis need it: all methods of a `HybridForwardModel` take it as `X`.
-    ``commands[rows]`` are some of the rows, so scikit-learn can split them.
+    ``commands[rows]`` are some of the rows, also for the number of a single one, so scikit-learn
+    can split them. They are no array: `permutation_importance`, for example, would lose the order.
 
     Parameters
     ----------
     q : array-like of shape (N, n)
         Commands, in the unit of q.
     runs : array-like of shape (N,), optional
-        Run of every row. The rows of a run follow each other without a break, and each run starts
-        without hysteresis. Default: one run; for a fit with `groups`, each group.
+        Run of every row, none missing. The rows of a run follow each other without a break, and
+        each run starts without hysteresis. Default: one run; for a fit with `groups`, each group.
     time : array-like of shape (N,), optional
         Time of every row, ascending in each run [s]. Only creep needs it.
 

@@ -58,7 +58,11 @@ class HybridForwardModel(HybridPredictor):
         Maps q (..., n) to x (..., m), for example a `ConstantCurvatureChain`. It is copied, never
         changed. None: no mechanical model, everything is learned (f^dat of the paper).
     error_model : estimator, str or None, default=None
-        Any scikit-learn regressor with as many outputs as x has, or a name:
+        Any scikit-learn regressor with as many outputs as x has (others in a
+        `MultiOutputRegressor`), or a name. A regressor of another library sees q as given, or as
+        its own pipeline scales it, and residuals with mean zero and unit spread: its penalties and
+        tolerances are relative to that spread, and lengths can be in any unit. (`LinearRegression`,
+        `Ridge`, `RidgeCV` and `KernelRidge` give the same at any scale, and see metres.) Names:
 
         - "elm", the same as None: ``ELMRegressor(random_state=random_state)``;
         - "linear" or "quadratic": features of all actuators; "pose": features of a chain's shape
@@ -126,7 +130,9 @@ class HybridForwardModel(HybridPredictor):
         What `adapt` has found: the ``shift`` of the actuator zeros (n,) [unit of q], and the
         ``motion`` of the base (4, 4); zero and the identity after a fit.
     error_model_ : estimator, ReadoutFit, FittedBlend, tuple or None
-        The fitted error model; a tuple has one for each marker. A blend has ``weights`` and
+        The fitted error model; a tuple has one for each marker. A regressor that sees scaled
+        residuals is the ``regressor_`` of a `TransformedTargetRegressor`, which predicts [m]. A
+        blend has ``weights`` and
         ``error_models``. With serial coupling or named features it holds the chosen ``alphas`` and
         the ``residual`` of every row from a fit without that row or its group [m]. A model from a
         file has none.
@@ -248,8 +254,12 @@ class HybridForwardModel(HybridPredictor):
             function of q; if tendons of a ConstantCurvatureChain contradict each other, as slack
             tendons do (`predict` and the Jacobians warn too); if no row moves along directions of X
             that move the tip, in which corrections are then constant; if numbers look like
-            millimetres; if there are too few groups for `coverage`; and the warnings of
+            another unit; if there are too few groups for `coverage`; and the warnings of
             `calibrate`.
+            If a regressor makes the mechanical model worse: on the training rows, or else on a
+            fifth of the groups, runs or rows, held out, which takes one more fit of the regressor
+            to the others (none for an ELMRegressorCV, or an ELMRegressor without groups, which know
+            their held-out errors; and none below 20 rows).
         """
         fitted = fit_to_log(*prepared(self, X, y, groups, sample_weight))
         for message in fitted.messages:

@@ -141,10 +141,10 @@ def sees_scale(regressor: object) -> bool:
 def _rescaled(module: ForwardModel, scaling: UnitSpread) -> ForwardModel:
     """Return the model of the residual [m] from that of the scaled residual."""
     mean = torch.from_numpy(scaling.mean)
-    if isinstance(module, AffineModule):
-        bias = mean + scaling.spread * module.bias
-        return AffineModule(scaling.spread * module.coef, bias)
-    return RescaledModule(module, mean, scaling.spread)
+    spread = torch.tensor(scaling.spread, dtype=mean.dtype)
+    if isinstance(module, (AffineModule, PolynomialModule, KernelModule)):
+        return module.rescaled(mean, spread)
+    return RescaledModule(module, mean, spread)
 
 
 def _line(fitted: Any) -> tuple[NDArray, NDArray]:
@@ -215,6 +215,10 @@ class AffineModule(ForwardModel):
         matrix = np.atleast_2d(coef)
         self.n_outputs, self.n_actuators = matrix.shape
         _register(self, coef=matrix, bias=np.broadcast_to(bias, self.n_outputs))
+
+    def rescaled(self, mean: Tensor, spread: Tensor) -> AffineModule:
+        """Return mean (m,) + spread times this module."""
+        return AffineModule(spread * self.coef, mean + spread * self.bias)
 
     def forward(self, q: Tensor) -> Tensor:
         """Return coef q + bias, shape (..., m)."""
@@ -315,6 +319,12 @@ class PolynomialModule(ForwardModel):
         """Readouts (D, m + m n) of these monomials: of the polynomial, then of its Jacobian."""
         return self._monomials_and_readouts()[1]
 
+    def rescaled(self, mean: Tensor, spread: Tensor) -> PolynomialModule:
+        """Return mean (m,) + spread times this module."""
+        powers = nn.functional.pad(self.powers, (0, 0, 1, 0))  # the monomial 1
+        readout = torch.vstack([mean, spread * self.readout])
+        return PolynomialModule(powers, readout, self.center, self.scale)
+
     def forward(self, q: Tensor) -> Tensor:
         """Return the polynomial, shape (..., m)."""
         monomials, readouts = self._monomials_and_readouts()
@@ -397,6 +407,13 @@ class KernelModule(ForwardModel):
         """Return the products (N, m n) of weights and rows."""
         return ((self.weights[:, :, None] * self.rows[:, None]).flatten(1),)
 
+    def rescaled(self, mean: Tensor, spread: Tensor) -> KernelModule:
+        """Return mean (m,) + spread times this module."""
+        bias = mean + spread * self.bias
+        return KernelModule(
+            self.rows, spread * self.weights, bias, self.center, self.scale
+        )
+
     def forward(self, q: Tensor) -> Tensor:
         """Return the sum, shape (..., m)."""
         return in_blocks(self._forward, q, self._block)[0]
@@ -436,11 +453,13 @@ class RescaledModule(ForwardModel):
         f, q (..., n) -> (..., m).
     mean : Tensor of shape (m,)
         Added [m].
-    spread : float
+    spread : Tensor of shape ()
         The factor [m].
     """
 
-    def __init__(self, model: ForwardModel, mean: Tensor, spread: float) -> None:
+    layout = Layout("rescaled", {"mean": "m", "spread": ""}, parts=("model",))
+
+    def __init__(self, model: ForwardModel, mean: Tensor, spread: Tensor) -> None:
         super().__init__()
         self.model = model
         self.n_actuators = model.n_actuators

@@ -21,7 +21,19 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import PolynomialFeatures, StandardScaler
 from sklearn.svm import SVR
 
-from hybridkin import Commands, ConstantCurvatureChain, HybridForwardModel
+from hybridkin import (
+    Commands,
+    ConstantCurvatureChain,
+    HybridForwardModel,
+    InverseKinematics,
+)
+from hybridkin.hybrid.description import restorer
+from hybridkin.learning.regressor_modules import (
+    AffineModule,
+    KernelModule,
+    PolynomialModule,
+    RescaledModule,
+)
 
 pytestmark = pytest.mark.filterwarnings("ignore:Stochastic Optimizer")
 
@@ -125,6 +137,28 @@ def test_modules_of_others_are_scaled_back():
     np.testing.assert_allclose(fitted.predict(q), line.predict(q), rtol=0, atol=1e-7)
     np.testing.assert_allclose(fitted.jacobian(q), line.jacobian(q), rtol=0, atol=1e-5)
     assert 1.0 < fitted.error_model_.regressor_.largest_ < 10.0
+
+
+@pytest.mark.slow
+def test_closed_forms_stay_closed_and_compiled():
+    """Also a model from a file, for a regressor whose module has a layout."""
+    q, x = log()
+    for name in ("ElasticNet", "ElasticNet of squares"):
+        fitted = model(REGRESSORS[name]).fit(q, x)
+        assert InverseKinematics(fitted, q_min=0.1).tracker(q[0]).backend == "compiled"
+    rng = np.random.default_rng(0)
+    mean, spread = torch.from_numpy(rng.normal(size=3)), torch.tensor(0.01).double()
+    kernel = KernelModule(rng.normal(size=(5, 3)), rng.normal(size=(5, 3)), 0.1, q[0], q[1])
+    polynomial = PolynomialModule(rng.integers(0, 3, (6, 3)), rng.normal(size=(6, 3)), q[0], q[1])
+    affine = AffineModule(rng.normal(size=(3, 3)), 0.3)
+    rows = torch.from_numpy(q)
+    for module in (kernel, polynomial, affine):
+        folded = module.rescaled(mean, spread).forward_and_jacobian(rows)
+        around = RescaledModule(module, mean, spread)
+        for one, other in zip(folded, around.forward_and_jacobian(rows), strict=True):
+            torch.testing.assert_close(one, other, rtol=0.0, atol=1e-12)
+        again = RescaledModule.from_stored(around.stored(), restorer())
+        torch.testing.assert_close(again(rows), around(rows), rtol=0.0, atol=1e-15)
 
 
 def test_weights_are_repetitions_for_the_scale():
