@@ -301,6 +301,10 @@ class HiddenLayer(FeatureModel):
             )
         self.alphas = (float(network.alpha), float(network.alpha))
 
+    def knows_held_out_error(self, rows: Rows) -> bool:
+        """Return True: `fit_readout` holds out rows, or groups if given."""
+        return True
+
     def features(self, q: Tensor, mechanical: ForwardModel) -> Features:
         """Return the features for training rows q (N, n)."""
         layer = draw_layer(self.layer, q.numpy(), None)

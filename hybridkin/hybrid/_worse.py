@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hybridkin._core.turns import TURNS
 from hybridkin.calibration.measured import folds, points
-from hybridkin.hybrid._error_models import RegressorModel
+from hybridkin.hybrid._error_models import HiddenLayer, RegressorModel
 from hybridkin.hybrid._fit import FittedHybrid, fit_hybrid
 from hybridkin.hybrid._module import Hybrid
 from hybridkin.hybrid._rows import Rows
@@ -36,9 +36,9 @@ def worse_than_mechanical(fitted: FittedHybrid, rows: Rows) -> list[str]:
     """
     spec = fitted.spec
     model = spec.error_model
-    if len(rows) < _FEW:  # which has a warning of its own
+    if spec.mechanical is None or not isinstance(model, (RegressorModel, HiddenLayer)):
         return []
-    if spec.mechanical is None or not isinstance(model, RegressorModel):
+    if spec.compared or len(rows) < _FEW:  # which have warnings of their own
         return []
     before, after = _errors(spec, fitted.module, rows)
     where = "on the training rows"

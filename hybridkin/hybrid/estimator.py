@@ -311,10 +311,10 @@ class HybridForwardModel(HybridPredictor):
         if alpha is not None:
             _check_positive("alpha", alpha, np.inf)
         rows = self._checked_rows(X, y, sample_weight, reset=False)
+        self._check_commands(rows)
         if self.play_ is not None:
             moved, self._past = continued(self.play_, rows, self._past)
             rows = replace(rows, X=moved)
-        self._check_commands(rows)
         self._warn_of_units(rows)
         rows = self.change_.before(rows, self.output)
         fitted = self.fitted_module_
