@@ -190,8 +190,8 @@ def labels(groups: ArrayLike | Tensor, n_rows: int, name: str = "groups") -> NDA
     """Return the label of the motion of every row, shape (N,); no row may lack one."""
     if isinstance(groups, Tensor):
         groups = as_tensor(groups, name).numpy(force=True)
-    if np.ma.is_masked(groups):
-        groups = np.where(np.ma.getmaskarray(groups), None, groups)
+    if isinstance(groups, np.ma.MaskedArray):
+        groups = np.array([None if x is np.ma.masked else x for x in groups])
     names = entries = np.asarray(groups)
     check_shape(names, name, [n_rows], "one entry for each row of the log")
     if isinstance(groups, (list, tuple)):  # NumPy makes a text of NaN beside texts

@@ -520,7 +520,9 @@ def _copy(regressor: _Regressor) -> _Regressor:
 def _fitted(regressor: _Regressor, rows: Rows) -> _Regressor:
     """Return a copy of the regressor fitted to the residuals, with the arguments that it takes."""
     copied: Any = clone(regressor)
-    within = copied.regressor if isinstance(copied, ResidualRegressor) else copied
+    within: Any = copied
+    if isinstance(regressor, ResidualRegressor):
+        within = copied.regressor
     if not has_fit_parameter(within, "sample_weight"):
         rows = rows.repeated()
     options = {}
@@ -552,7 +554,7 @@ def _takes_one_column(regressor: Any, rows: Rows) -> bool:
         single.fit(rows.X, _residual(rows)[:, 0])
     except ValueError:
         return False
-    return np.ndim(rows.residual) > 1
+    return rows.y.ndim > 1
 
 
 def _on_moved_directions(module: ForwardModel, directions: Directions) -> ForwardModel:

@@ -127,6 +127,9 @@ class ResidualRegressor(TransformedTargetRegressor):
         The scaling.
     """
 
+    regressor_: Any
+    transformer_: Any
+
     def __init__(self, regressor: Any, transformer: UnitSpread) -> None:
         super().__init__(regressor, transformer=transformer, check_inverse=False)
 
