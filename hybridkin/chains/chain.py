@@ -264,7 +264,7 @@ class Chain(PoseModel):
         """Return a warning if tips span more than 50 times the robot's size."""
         origin = self.base[:3, 3].detach().to(x)
         points = torch.cat([origin[None], x.reshape(-1, 3)])
-        finite = points[torch.isfinite(points).all(-1)]
+        finite = points[countable(points).all(-1)]
         reach = float(self.reach.detach())
         message = span_message(name, finite, reach, _FAR)
         return [] if message is None else [message]
