@@ -78,16 +78,18 @@ def html_text(text: object) -> str:
 
 
 def markdown(text: object) -> str:
-    """Return a text in Markdown: words that could be markup become code, as `*` or `log.csv`."""
-    words = []
-    for word in visible(text).split():
-        is_start = not words and _LIST.fullmatch(word)
+    """Return a text in Markdown: words that could be markup become code, as `*x*` or `log.csv`."""
+    words = visible(text).split()
+    shown = []
+    for k, word in enumerate(words):
         outside = _SPAN.sub(r"\1q\2", word)
         is_word = _WORD.fullmatch(outside) and not _MARKUP.search(outside)
-        if is_start or not (is_word or word == "*"):  # alone it is a star
+        if word == "*":  # a star between words is one
+            is_word = 0 < k < len(words) - 1
+        if not is_word or (k == 0 and _LIST.fullmatch(word)):
             word = _code(word)
-        words.append(word)
-    return " ".join(words)
+        shown.append(word)
+    return " ".join(shown)
 
 
 def markdown_cell(text: object) -> str:

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from html.parser import HTMLParser
+from pathlib import Path
 from xml.etree import ElementTree
 
 import matplotlib.pyplot as plt
@@ -15,6 +16,7 @@ import numpy as np
 import pytest
 from markdown_it import MarkdownIt
 
+from hybridkin import cli
 from hybridkin._core import texts
 from hybridkin._core.html import html_table
 from hybridkin.datasets import load_log
@@ -269,6 +271,7 @@ def test_no_name_is_a_formula_in_a_figure():
         ("set `groups`, e.g. 1.5 mm", "set `groups`, e.g. 1.5 mm"),
         ("a`b", "`` a`b ``"),
         ("1. first", "`1.` first"),
+        ("a *", "a `*`"),  # beside the stars of bold words
     ],
 )
 def test_usual_texts_stay_readable_in_markdown(text, written):
@@ -280,3 +283,15 @@ def test_numbers_stay_numbers_in_a_table():
     cells = ["-1", "+1.5", "-1e-9", "-inf", "=1", "-a", "'-a", "a"]
     assert [*map(texts.csv_cell, cells)] == [*cells[:4], "'=1", "'-a", "''-a", "a"]
     assert texts.csv_table(["a"], [[math.nan], [-1.5]]) == "a\nnan\n-1.5\n"
+
+
+def test_the_command_line_writes_in_one_place():
+    folder = Path(cli.__file__).parent
+    found = {}
+    for path in folder.glob("*.py"):
+        words = re.findall(
+            r"(?<!\.)\bprint\(|std(?:out|err)\.write\(", path.read_text(encoding="utf-8")
+        )
+        if words:
+            found[path.name] = words
+    assert found == {"_terminal.py": ["print("]}
