@@ -36,4 +36,4 @@ def why_not(words: str, q: Tensor, is_missing: Tensor, first: int = 0) -> str | 
         return None
     rows = named_rows([first + place for place in places])
     example = [float(f"{value:.6g}") for value in q[places[0]].tolist()]
-    return f"{words.format(rows=rows)} (first q: {example})."
+    return f"{words.format(rows=rows)} (first `q`: {example})."
