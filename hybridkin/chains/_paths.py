@@ -87,6 +87,13 @@ def bend_readings(angles: Tensor, extensible: bool) -> Tensor:
     return readings
 
 
+def bend_extremes(angles: Tensor, extensible: bool) -> tuple[float, float]:
+    """Return the largest and the smallest reading of a bending of 1 rad in any direction [-]."""
+    readings = nn.functional.pad(bend_readings(angles, extensible), (0, 1))
+    most, least = torch.linalg.svdvals(readings).tolist()
+    return most, least
+
+
 def bend_counts(
     angles: Sequence[Tensor], extensible: Sequence[bool]
 ) -> tuple[int, ...]:
@@ -99,11 +106,8 @@ def bend_counts(
         if stretches and len(of_segment) == 1:
             bends.append(0)
             continue
-        # The largest and the smallest reading of a bending of 1 rad in any direction.
-        readings = bend_readings(of_segment, stretches)
-        singular_values = torch.linalg.svdvals(nn.functional.pad(readings, (0, 1)))
-        most, least = singular_values.tolist()
-        planar = least <= 64.0 * torch.finfo(readings.dtype).eps * most
+        most, least = bend_extremes(of_segment, stretches)
+        planar = least <= 64.0 * torch.finfo(of_segment.dtype).eps * most
         if most < _DETERMINED or not (planar or least > _DETERMINED * most):
             raise ValueError(
                 "`angles` must determine the bending of every segment, got "

@@ -17,10 +17,10 @@ from hybridkin._core.blocks import in_blocks
 from hybridkin._core.derived import derived
 from hybridkin._core.plan import NoKernel, Plan
 from hybridkin._core.plausible import PlausibleRows
-from hybridkin._core.stored import Layout, Stored
+from hybridkin._core.stored import Layout, Restore, Stored
 from hybridkin.chains._arcs import turned_by_first
 from hybridkin.chains._checks import filled, float_dtype
-from hybridkin.chains._paths import bend_counts, free_arcs
+from hybridkin.chains._paths import bend_counts, bend_extremes, free_arcs
 from hybridkin.chains.arc_chain import (
     STRUCTURE,
     ArcChain,
@@ -49,6 +49,9 @@ _SHAPING = (
     "rest_bends",
     "actuator_zeros",
     "gains",
+)
+_NEARLY = (
+    0.5  # relative reading across the plane of planar actuators, after a calibration
 )
 _CONTRADICTED = 0.3  # share of the readings that the arcs explain, in one segment
 _NOTICED = 0.1  # share of the radius: the reading of a bend of 0.1 rad
@@ -505,3 +508,24 @@ class ConstantCurvatureChain(ArcChain):
                 angles[k] = math.pi * (np.arange(len(angles[k])) % 2)
         stage = stored.value("stage", (str, None))
         return {**arguments, "lengths": lengths, "angles": angles, "stage": stage}
+
+    @classmethod
+    def from_stored(cls, stored: Stored, restore: Restore) -> ConstantCurvatureChain:
+        """Return the chain built from a description."""
+        chain = super().from_stored(stored, restore)
+        bends = stored.list_of(int, "bends")
+        if [*chain.bends] != bends or not chain._are_nearly_planar():
+            raise ValueError(f"`bends` must be those of the angles, got {bends!r:.80}")
+        return chain
+
+    def _are_nearly_planar(self) -> bool:
+        """Return whether the angles of planar segments are near a plane."""
+        by_segment = self.angles.split(self.actuators_per_segment)
+        for angles, stretches, n_bends in zip(
+            by_segment, self.extensible, self.bends, strict=True
+        ):
+            if n_bends == 1:
+                most, least = bend_extremes(angles, stretches)
+                if not least < _NEARLY * most:
+                    return False
+        return True

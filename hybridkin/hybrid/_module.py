@@ -277,6 +277,17 @@ class HybridModule(Hybrid):
         log_plane: Plane | None = None,
     ) -> None:
         super().__init__()
+        total = float(weights.sum())
+        if not (total <= 1.0 + _ROUNDING and bool((weights >= 0.0).all())):
+            raise ValueError(
+                "`weights` must be zero or more and sum to at most 1, got "
+                f"{weights.tolist()}."
+            )
+        if len(weights) != len(corrections):
+            raise ValueError(
+                f"`weights` must hold one number for each of {len(corrections)} corrections, got "
+                f"{len(weights)}."
+            )
         self.mechanical = mechanical
         self.corrections = nn.ModuleList(corrections)
         self.register_buffer("weights", weights)
@@ -419,7 +430,7 @@ class HybridModule(Hybrid):
                     trust.slope + weight * fading.slope,
                 )
         if self.drift is not None:
-            whole = torch.ones_like(self.weights[0])
+            whole = q.new_ones(())
             total = _plus(
                 total, whole, *trust.times(*self.drift.forward_and_jacobian(q))
             )

@@ -133,7 +133,7 @@ def _stored_play(operator: HysteresisOperator | None) -> dict[str, NDArray]:
 def _play_of(stored: Stored, n: int) -> HysteresisOperator | None:
     """Return the operator of n actuators from its arrays, see `_stored_play`."""
     friction = _friction_of(stored, n)
-    if "creep_gains" not in stored.arrays:
+    if not {"creep_gains", "creep_times"} & {*stored.arrays}:
         return friction
     times = stored.array("creep_times", "J")
     shape = (len(times), n)[: stored.array("creep_gains").ndim]
@@ -142,9 +142,11 @@ def _play_of(stored: Stored, n: int) -> HysteresisOperator | None:
 
 
 def _friction_of(stored: Stored, n: int) -> HysteresisOperator | None:
-    if "play_width" not in stored.arrays:
+    if not {"play_width", "play_slopes"} & {*stored.arrays}:
         return None
     n_dimensions = stored.array("play_width").ndim
+    if n_dimensions < 2 and "play_slopes" in stored.arrays:
+        raise ValueError("`play_slopes` need a `play_width` of several plays")
     if n_dimensions == 2:
         widths = stored.array("play_width", ("K", 1))[:, 0]
         shape = (len(widths) - 1, n)[: stored.array("play_slopes").ndim]
@@ -206,9 +208,13 @@ def _restored_fit(
 ) -> HybridFit:
     """Return what the fit of a described hybrid found, without what files do not contain."""
     n = stored.value("n_features_in", int)
+    play = _play_of(stored, n)
     states = None
     if "state_range" in stored.arrays:
-        states = TrainingRange(*stored.array("state_range", (2, "R", n)))
+        if play is None:
+            raise ValueError("`state_range` needs the arrays of a hysteresis")
+        n_states = play.inner_states(np.zeros((1, n)), [0], [0.0]).shape[1]
+        states = TrainingRange(*stored.array("state_range", (2, n_states, n)))
     radius = None
     if "radius" in stored.arrays:
         numbers = stored.array("radius", (3,), finite=False).tolist()
@@ -241,7 +247,7 @@ def _restored_fit(
         single_output=stored.value("single_output", bool),
         training_range=TrainingRange(*stored.array("training_range", (2, n))),
         no_drift=no_drift,
-        play=_play_of(stored, n),
+        play=play,
         state_range=states,
         radius=radius,
     )

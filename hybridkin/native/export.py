@@ -437,7 +437,7 @@ def _middle(
     if controller is not None and np.isfinite(_limits(plan)[0][:2]).all():
         low, high, *_ = _limits(plan)[0]
         return 0.5 * (low + high), 0.5 * (high - low)
-    return _usual(module, plan.n_inputs)
+    return usual_range(module, plan.n_inputs)
 
 
 def _vectors(
@@ -473,7 +473,7 @@ def _vectors(
     return entries
 
 
-def _usual(module: ForwardModel, n: int) -> tuple[NDArray, NDArray]:
+def usual_range(module: ForwardModel, n: int) -> tuple[NDArray, NDArray]:
     """Return the middle and half width of q: of the training rows, else from the radii."""
     buffers = {
         name.rpartition(".")[2]: a.numpy() for name, a in module.state_dict().items()

@@ -22,7 +22,8 @@ def model_header(path: str | Path) -> Header:
         JSON values: ``created`` (date); ``versions`` of the packages that wrote it; ``units`` of q
         and x; ``training`` (``rows``, errors [m], for error_model="auto" all candidates, and the
         notes given to `save_model`); for a hybrid, ``domain`` (``q_low`` and ``q_high`` of the
-        training rows, and the ``guard``). The model itself: ``kind``, ``settings``, names of
+        training rows, and the ``guard``); ``prediction`` (``x`` and domain ``distance`` at two rows
+        ``q``, which `load_model` compares). The model itself: ``kind``, ``settings``, names of
         ``arrays``, and ``parts``, each with these four entries.
 
     Raises

@@ -26,12 +26,14 @@ from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.elm_cv import ELMRegressorCV
 from hybridkin.learning.hidden_layer import device_named
 from hybridkin.saving._file import Header, packed, read, unpacked, write
+from hybridkin.saving._prediction import check_prediction, prediction_of
 
 _DAMAGE = (
     ArithmeticError,
     AttributeError,
     LookupError,
     MemoryError,
+    RuntimeError,
     TypeError,
     ValueError,
 )
@@ -61,9 +63,13 @@ def save_model(
     ------
     TypeError
         For other models, because their parts could only be stored as code.
+    ValueError
+        For a model that does not predict finite numbers.
 
     Notes
     -----
+    The file also holds what the model predicts at two rows. `load_model` compares it.
+
     A reader ignores entries of the header that it does not know. A file of another format version
     is not loaded: `load_model` raises an error that names the hybridkin version that wrote it.
 
@@ -103,6 +109,10 @@ def save_model(
     if stored.kind == "elm_regressor":
         results = {"rows": stored.settings["n_samples_seen"]}
     entries, arrays = packed(stored)
+    try:
+        header["prediction"] = prediction_of(model)
+    except ValueError as error:
+        raise ValueError(f"`model` must predict finite numbers: {error}.") from error
     header["training"] = {**results, **_checked(training)}
     write(as_path(path), {**header, **entries}, arrays)
 
@@ -129,7 +139,8 @@ def load_model(path: str | Path, *, device: str | torch.device | None = None) ->
     FileNotFoundError
         If there is no such file.
     ValueError
-        If the file is not a saved model, is damaged, or has another format version.
+        If the file is not a saved model, is damaged, has another format version, or describes a
+        model that a constructor refuses or that does not predict what it did.
     RuntimeError
         If this machine does not have the device.
     """
@@ -144,12 +155,14 @@ def load_model(path: str | Path, *, device: str | torch.device | None = None) ->
             model = ELMRegressor.from_stored(stored, restorer())
             model.device = None if device is None else str(at)
         else:
-            return restorer()(stored).to(at)
-        model.module_.to(at)
-        return model
+            model = restorer()(stored)
+        check_prediction(model, header.get("prediction"))
     except _DAMAGE as error:
-        reason = (str(error) or repr(error))[:400].rstrip(".")
+        reason = (str(error) or repr(error))[:800].rstrip(".")
         raise ValueError(f"{path} is damaged: {reason}.") from error
+    module = model if isinstance(model, ForwardModel) else model.module_
+    module.to(at)
+    return model
 
 
 def _checked(training: Mapping[str, object] | None) -> Header:
