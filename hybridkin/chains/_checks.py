@@ -25,6 +25,8 @@ from hybridkin._core.units import warn_length
 _MOST_UNLIKE = 1000.0
 _RADIUS = 0.03  # usual radius of a robot [m], and length of a segment
 _LENGTH = 0.2
+# lengths [m] and gains [m per unit of q] are smaller, and their inverses too
+_HUGE = 1e15
 _TURNS = 4.0 * math.pi  # [rad]; the angle of a tendon is never larger
 
 
@@ -45,7 +47,18 @@ def lengths_of(
         raise ValueError(
             f"`{name}` must be positive [m] on every segment, got {lengths.tolist()}."
         )
+    _check_size(lengths, name)
     return lengths
+
+
+def _check_size(numbers: Tensor, name: str) -> None:
+    """Raise if numbers are so large or small that bends would be mere rounding."""
+    sizes = numbers.abs()
+    if not ((sizes > 1.0 / _HUGE) & (sizes < _HUGE)).all():
+        raise ValueError(
+            f"`{name}` must be between {1.0 / _HUGE:g} and {_HUGE:g}, got {numbers.tolist()}; "
+            "check the units."
+        )
 
 
 def filled(
@@ -118,6 +131,7 @@ def arc_geometry(
         warn_length("lengths", geometry["lengths"], 10.0, _LENGTH)
     if not geometry["gains"].all():
         raise ValueError(f"`gains` must not be zero [m per unit of q], got {gains}.")
+    _check_size(geometry["gains"], "gains")
     return counts, extensible, geometry
 
 

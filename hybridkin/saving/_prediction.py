@@ -19,6 +19,8 @@ _INSIDE = 0.5  # of half the usual range: inside the domain, where all actuators
 _OUTSIDE = 1.5  # outside, where guards fade corrections out
 # What rounding on another machine may change, relative to the size of x plus its change over q.
 _TOLERANCE = {torch.float64: 1e-7, torch.float32: 1e-3}
+_MOST = 1e-3  # of the size of x: a model whose rounding changes more is damaged
+_LEAST = 1e-30  # smaller numbers may be rounded to zero
 
 
 def prediction_of(model: Any) -> Header:
@@ -53,7 +55,8 @@ def check_prediction(model: Any, prediction: object) -> None:
     single = any(a.dtype == torch.float32 for a in module.state_dict().values())
     relative = _TOLERANCE[torch.float32 if single else torch.float64]
     change = (np.abs(J) * np.abs(rows[:, None])).sum(2)
-    tolerance = relative * (np.abs(x).max() + change)
+    size = np.abs(x).max()
+    tolerance = np.minimum(relative * (size + change), _MOST * size) + _LEAST
     if prediction is not None:
         wanted = _numbers(stored, "x", x.shape)
         _check_equal(rows, x, wanted, tolerance, "the file says")

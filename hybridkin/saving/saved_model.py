@@ -151,6 +151,7 @@ def load_model(path: str | Path, *, device: str | torch.device | None = None) ->
         stored = unpacked(header, arrays)
         if stored.kind == "hybrid":
             model = hybrid_of(stored, header.get("training"))
+            _check_domain(model, header.get("domain"))
         elif stored.kind == "elm_regressor":
             model = ELMRegressor.from_stored(stored, restorer())
             model.device = None if device is None else str(at)
@@ -181,6 +182,21 @@ def _units(model: object, output: str = "position") -> dict[str, str | list[str]
     if output == "position":
         return {"q": model.units, "x": "m"}
     return {"q": model.units, "x": ["m"] * 3 + ["rad"] * 3}
+
+
+def _check_domain(model: HybridForwardModel, domain: object) -> None:
+    """Raise a ValueError if the range of the training rows is not that of the header."""
+    if not isinstance(domain, dict):
+        return
+    ranges = _domain(model)
+    for name in ("q_low", "q_high"):
+        found, wanted = ranges[name], domain.get(name)
+        if not np.allclose(
+            np.array(wanted, dtype=float), found, rtol=1e-9, atol=1e-300
+        ):
+            raise ValueError(
+                f"`{name}` of the domain is {wanted}, but {found} of the model"
+            )
 
 
 def _domain(model: HybridForwardModel) -> Header:

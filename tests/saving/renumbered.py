@@ -18,6 +18,7 @@ from hybridkin.saving.header import model_header
 
 FACTORS = [0.0, -1.0, 1.05, 1e-3, 1e3, 1e-9, 1e9, 1e-60, 1e60, 1e-70, 1e70, -1e40]
 NUMBERS = [0, 1, -1, 2, 0.5, 1.05, 1e9, 1e60, -1e60, 1e-60, 7, True, None]
+_LEAST = 1e-30  # smaller numbers may be rounded to zero
 _ACCURATE = 1e-6  # relative to the size of x plus its change over q
 
 
@@ -54,7 +55,7 @@ def _others(array: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         else:
             at = rng.integers(array.size)
             changed.flat[at] = factor * (changed.flat[at] or 1.0)
-    return changed.astype(array.dtype)
+        return changed.astype(array.dtype)
 
 
 def _other_setting(entry: Any, rng: np.random.Generator) -> None:
@@ -93,7 +94,7 @@ def judged(path: Path, rows: np.ndarray) -> str:
         by_core, J_by_core = native.evaluate(module, q, jacobian=True)
     if not all(np.isfinite(a).all() for a in (x, J, by_core, J_by_core)):
         return f"not finite: {x.tolist()} and {by_core.tolist()} by the core"
-    allowed = _ACCURATE * (np.abs(x).max() + (np.abs(J) * np.abs(q[:, None])).sum(2))
+    allowed = _ACCURATE * (np.abs(x).max() + (np.abs(J) * np.abs(q[:, None])).sum(2)) + _LEAST
     if not (np.abs(x - by_core) <= allowed).all():
         return f"{x.tolist()}, but {by_core.tolist()} by the core"
     return "read"

@@ -59,7 +59,7 @@ def test_files_without_a_prediction_are_read(tmp_path):
     twin, q = load_model(tmp_path / "earlier"), torch.full((2, 3), 0.3).double()
     assert torch.equal(twin(q), BODY(q))
     write(tmp_path / "earlier", header, {**arrays, "radii": np.full(1, 1e60)})
-    with pytest.raises(ValueError, match=r"earlier is damaged: .*finite"):
+    with pytest.raises(ValueError, match="earlier is damaged: `radii`"):
         load_model(tmp_path / "earlier")
 
 
