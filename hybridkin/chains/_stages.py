@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridkin.native.hysteresis import Stage
+from hybridkin.native.hysteresis import DOUBLE_ROUNDING, Stage
 
 
 def follow_in_numpy(
@@ -14,7 +14,7 @@ def follow_in_numpy(
     steps: NDArray,
     state: NDArray,
     lead: bool,
-    rounding: float,
+    rounding: float = DOUBLE_ROUNDING,
 ) -> NDArray:
     """Return rows (T, n) after the hysteresis; the state becomes that after the last row.
 

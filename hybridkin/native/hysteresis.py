@@ -7,7 +7,10 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hybridkin._core.kernel_numbers import HK_CREEP_ROUNDING
 from hybridkin.native.library import address, opened_library
+
+DOUBLE_ROUNDING = HK_CREEP_ROUNDING * float(np.finfo(np.float64).eps)
 
 
 class Stage(NamedTuple):
@@ -80,7 +83,7 @@ def follow(
     steps: NDArray,
     state: NDArray,
     lead: bool,
-    rounding: float,
+    rounding: float = DOUBLE_ROUNDING,
 ) -> NDArray:
     """Return rows (T, n) after the hysteresis; the state becomes that after the last row.
 
@@ -98,7 +101,7 @@ def follow(
         Whether to return commands for effective changes instead of the reverse.
     rounding : float
         Rounding of the rows, relative to their size: smaller changes are no reversals of what is
-        before creep.
+        before creep. Default: that of float64.
     """
     described = stage_numbers(stages)
     code = np.array(described.code, dtype=np.int32)
