@@ -56,6 +56,7 @@ WRITTEN = {  # names in the folder
 WRITTEN["fit"].append("robot.toml")
 FILES = [(command, name) for command, names in WRITTEN.items() for name in names]
 FILES += [(command, name) for command, (name, _) in SINGLE.items()]
+FIRST = [*dict(reversed(FILES)).items()]  # one of each command
 MINE = b"mine"
 
 
@@ -124,8 +125,11 @@ def test_a_file_of_another_is_refused_at_once_and_kept(place, capsys, command, n
     assert (place / name).read_bytes() == MINE
 
 
-@pytest.mark.parametrize(("command", "name"), FILES)
-@pytest.mark.parametrize("kind", ["pipe", "folder", "device"])
+@pytest.mark.parametrize(
+    ("command", "name", "kind"),
+    [(*file, "pipe") for file in FILES]
+    + [(*file, kind) for file in FIRST for kind in ("folder", "device")],
+)
 def test_what_is_no_file_is_refused_at_once_also_by_force(place, capsys, command, name, kind):
     if kind != "folder" and not hasattr(os, "mkfifo"):
         pytest.skip("needs POSIX")

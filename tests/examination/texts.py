@@ -179,7 +179,7 @@ def of_robot(rng: np.random.Generator, home: Path) -> int:
     q, x, motions = names[:3], names[3:6], names[6:10]
     title, unit, groups = names[10:]
     unit = f"u{unit}"
-    log = f"{texts.visible(named(rng, 1)[0]).replace('/', ' ')[:60]}\x1b[2J\n.csv"
+    log = f"./{texts.visible(named(rng, 1)[0]).replace('/', ' ')[:60]}\x1b[2J\n.csv"
     toml = texts.toml_value
     (home / "robot.toml").write_text(
         f"name = {toml(title)}\ncalibrate = []\n[[segment]]\nradius = 0.005\nlength = 0.1\n"
@@ -204,13 +204,13 @@ def of_robot(rng: np.random.Generator, home: Path) -> int:
         ["export", "robot.toml", "--out", "export"],
         ["export", "robot.toml", "--mex", "--out", "mex"],
         ["export", "robot.toml", "--fmu", "robot.fmu"],
-        ["evaluate", "robot.toml", log, "--q", names[0]],
+        ["evaluate", "robot.toml", log, f"--q={names[0]}"],
     ]
     for arguments in lines:
         out = io.StringIO()
         with redirect_stdout(out), redirect_stderr(out), warnings.catch_warnings():
             code = main(arguments)
-        fails = arguments[-2] == "--q"
+        fails = arguments[-1].startswith("--q=")
         assert code == (2 if fails else 0), (arguments, out.getvalue()[-300:])
         assert not checks.hidden(out.getvalue()), arguments
     judge(home, [*q, *x])

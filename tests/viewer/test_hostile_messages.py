@@ -92,7 +92,9 @@ def sending(*messages):
 
 def is_alive(view):
     """Steer the view from its page, and return whether the robot follows."""
-    goal = view.robot.x + np.array([0.02, 0.0, 0.0])
+    home = view.robot.loaded.tips(view.robot.domain.preferred[None])[0]
+    goal = home + np.array([0.02, 0.0, 0.0])
+    until(lambda: view.robot._resting)
     connected(view, sending({**POSE, "position": goal.tolist()}))
     until(lambda: np.linalg.norm(view.robot.x - goal) < 2e-3)
     return view._thread.is_alive() and view._failure is None
