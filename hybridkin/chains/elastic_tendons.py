@@ -397,7 +397,8 @@ class ElasticTendonChain(ElasticBody):
     def _warn(self, rows: Tensor, is_short: Tensor) -> Tensor:
         first = first_row()
         if first is not None:
-            why = why_not(COMPRESSED, rows, is_short.any(1), first)
+            is_named = is_short.any(1) & rows.isfinite().all(1)
+            why = why_not(COMPRESSED, rows, is_named, first)
             if why is not None:
                 warnings.warn(f"{why} Results are NaN there.", stacklevel=2)
         return is_short

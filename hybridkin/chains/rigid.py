@@ -429,7 +429,10 @@ class RigidChain(Chain):
         arm = cls(**arrays, **settings, dtype=dtype)
         # The constructor rounds poses and axes; the state is what the file holds.
         arm._set_geometry(
-            {name: torch.tensor(a, dtype=dtype) for name, a in arrays.items()}
+            {
+                name: torch.tensor(a, dtype=dtype, device="cpu")
+                for name, a in arrays.items()
+            }
         )
         return arm
 

@@ -252,7 +252,9 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def _check_commands(self, rows: Rows) -> None:
         """Raise if actuator vectors have another unit than those of the fit."""
         chain = self._chain
-        turns = chain is not None and bool(torch.as_tensor(chain.turns).all())
+        turns = chain is not None and bool(
+            torch.as_tensor(chain.turns, device="cpu").all()
+        )
         check_commands(rows, self.training_range_, turns)
 
     def _warn_of_units(self, rows: Rows) -> None:
