@@ -141,12 +141,12 @@ class PortableModule(Portable, nn.Module):
         return cls(**arguments)
 
     def _load_from_state_dict(
-        self, state_dict: dict[str, Any], prefix: str, *others: Any
+        self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any
     ) -> None:
         for key in [*state_dict]:
             if key.removeprefix(prefix).split(".")[0] in self.computed:
                 del state_dict[key]
-        super()._load_from_state_dict(state_dict, prefix, *others)
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
     if TYPE_CHECKING:  # attributes that no statement assigns are buffers
 

@@ -386,7 +386,7 @@ class ElasticTendonChain(ElasticBody):
 
         The length of an arc that would be too short is NaN, with a warning.
         """
-        rest = self.lengths.to(shape)
+        rest = self.geometry()["lengths"].to(shape)
         changes, bendings = shape.split([self.n_segments, 2 * self.n_segments], dim=1)
         lengths = rest + changes
         is_short = lengths < HK_LEAST_LENGTH * rest
@@ -419,7 +419,8 @@ class ElasticTendonChain(ElasticBody):
         with axial stiffness k has ``k d^2 <= n e^2``, with the largest stretch e there.
         """
         bounds = super().plausible_rows()
-        softest = (self.axial_stiffness.sqrt() * self.lengths).amin()
+        lengths = self.geometry()["lengths"]
+        softest = (self.axial_stiffness.sqrt() * lengths).amin()
         most = (1.0 - HK_LEAST_LENGTH) * softest / self.n_actuators**0.5
         shape = torch.cat([torch.zeros_like(self.radii), *self.rest_bends.T])
         preloaded = (self.tendon_zeros + self._readings() @ shape).abs()

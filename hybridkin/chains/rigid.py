@@ -89,8 +89,12 @@ class _Links(NamedTuple):
 
     def to(self, like: Tensor) -> _Links:
         """Return it in the dtype and on the device of a tensor."""
-        numbers = [part.to(like) for part in self[:3]]
-        return _Links(*numbers, self.slides.to(like.device))
+        return _Links(
+            self.motions.to(like),
+            self.axes.to(like),
+            self.end.to(like),
+            self.slides.to(like.device),
+        )
 
     def columns(self, frames: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the tip (3, N), its derivatives and the joint axes (n_joints, 3, N).
@@ -428,12 +432,8 @@ class RigidChain(Chain):
         dtype = torch.from_numpy(arrays["base"]).dtype
         arm = cls(**arrays, **settings, dtype=dtype)
         # The constructor rounds poses and axes; the state is what the file holds.
-        arm._set_geometry(
-            {
-                name: torch.tensor(a, dtype=dtype, device="cpu")
-                for name, a in arrays.items()
-            }
-        )
+        for name, array in arrays.items():
+            arm._set_geometry({name: torch.tensor(array, dtype=dtype, device="cpu")})
         return arm
 
     def geometry(self) -> dict[str, Tensor]:

@@ -45,6 +45,7 @@ def check_prediction(model: Any, prediction: object) -> None:
     """
     module = _module(model)
     rows = _rows(model)
+    stored = None
     if prediction is not None:
         if not isinstance(prediction, dict):
             raise ValueError(f"`prediction` must be a dict, got {prediction!r:.60}")
@@ -57,7 +58,7 @@ def check_prediction(model: Any, prediction: object) -> None:
     change = (np.abs(J) * np.abs(rows[:, None])).sum(2)
     size = np.abs(x).max()
     tolerance = np.minimum(relative * (size + change), _MOST * size) + _LEAST
-    if prediction is not None:
+    if stored is not None:
         wanted = _numbers(stored, "x", x.shape)
         _check_equal(rows, x, wanted, tolerance, "the file says")
         wanted = _numbers(stored, "distance", distance.shape)
