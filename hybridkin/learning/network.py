@@ -196,7 +196,7 @@ class ELM(LeverageModule):
     def _tangent(self):
         w_in = self.input_weights / self.input_scale
         w_out = self.output_weights[: len(w_in)]
-        return ((w_out.T[:, None] * w_in.T).flatten(0, 1),)
+        return ((w_out.T[:, None] * w_in.T).flatten(0, 1).contiguous(),)
 
     @property
     def tangent(self):
