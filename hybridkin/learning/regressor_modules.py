@@ -144,7 +144,7 @@ def sees_scale(regressor: object) -> bool:
 def _rescaled(module: ForwardModel, scaling: UnitSpread) -> ForwardModel:
     """Return the model of the residual [m] from that of the scaled residual."""
     mean = torch.from_numpy(scaling.mean)
-    spread = torch.tensor(scaling.spread, dtype=mean.dtype)
+    spread = mean.new_tensor(scaling.spread)
     if isinstance(module, (AffineModule, PolynomialModule, KernelModule)):
         return module.rescaled(mean, spread)
     return RescaledModule(module, mean, spread)
