@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from hybridkin._core.model import ForwardModel
 from hybridkin._core.stored import Stored
@@ -50,7 +51,8 @@ def check_prediction(model: Any, prediction: object) -> None:
         if not isinstance(prediction, dict):
             raise ValueError(f"`prediction` must be a dict, got {prediction!r:.60}")
         stored = Stored("prediction", prediction)
-        rows = _numbers(stored, "q", rows.shape)
+        n_rows = len(stored.value("q", list))
+        rows = _numbers(stored, "q", (n_rows, module.n_actuators))
     x, J, distance = _by_torch(module, rows)
     _check_finite(rows, x, J, distance)
     single = any(a.dtype == torch.float32 for a in module.state_dict().values())
@@ -77,7 +79,10 @@ def _module(model: Any) -> ForwardModel:
 
 
 def _rows(model: Any) -> NDArray:
-    """Return the fixed rows q (2, n), from the training range or the geometry."""
+    """Return the fixed rows q (1 or 2, n), from the training range or the geometry.
+
+    One may be left out: an elastic robot may have no shape there.
+    """
     module = _module(model)
     if isinstance(model, HybridForwardModel):
         low, high = model.training_range_
@@ -85,18 +90,28 @@ def _rows(model: Any) -> NDArray:
     else:
         middle, half = usual_range(module, module.n_actuators)
     pattern = np.linspace(-1.0, 0.8, module.n_actuators)
-    return middle + half * np.outer([_INSIDE, _OUTSIDE], pattern)
+    rows = middle + half * np.outer([_INSIDE, _OUTSIDE], pattern)
+    has_shape = module.has_shape(_on_its_device(module, rows)).numpy(force=True)
+    if not has_shape.any():
+        raise ValueError(
+            f"the arrays do not give finite numbers: the robot has no shape at q = {rows.tolist()}"
+        )
+    return rows[has_shape]
 
 
 def _by_torch(module: ForwardModel, rows: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """Return x (2, m), dx/dq (2, m, n) and the domain distances (2,)."""
-    state = next(iter(module.state_dict().values()))
-    q = torch.tensor(rows, device=state.device)
+    """Return x (N, m), dx/dq (N, m, n) and the domain distances (N,)."""
+    q = _on_its_device(module, rows)
     with torch.no_grad():
         x, J = module.forward_and_jacobian(q)
         results = x, J, module.domain_distance(q)
     x, J, distance = [a.numpy(force=True) for a in results]
     return x, J, distance
+
+
+def _on_its_device(module: ForwardModel, rows: NDArray) -> Tensor:
+    state = next(iter(module.state_dict().values()))
+    return torch.tensor(rows, device=state.device)
 
 
 def _rounded(values: NDArray) -> Any:

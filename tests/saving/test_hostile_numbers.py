@@ -9,7 +9,8 @@ from renumbered import judged, renumbered
 from safetensors.numpy import load_file
 from saved_models import FOLDER
 
-from hybridkin import ForceTendonChain, load_model, native, save_model
+from hybridkin import ElasticTendonChain, ForceTendonChain, load_model, native, save_model
+from hybridkin.saving import _prediction
 from hybridkin.saving._file import write
 from hybridkin.saving.header import model_header
 
@@ -101,6 +102,16 @@ def test_a_model_that_predicts_nothing_finite_is_not_saved(tmp_path):
     with pytest.raises(ValueError, match="`model` must predict finite numbers"):
         save_model(body, tmp_path / "model")
     assert [*tmp_path.iterdir()] == []
+
+
+def test_a_row_without_a_shape_is_left_out(tmp_path, monkeypatch):
+    monkeypatch.setattr(_prediction, "_OUTSIDE", 1e3)  # compressed there
+    body = ElasticTendonChain([0.01], [0.1], axial_stiffness=1e-3)
+    save_model(body, tmp_path / "model")
+    assert len(model_header(tmp_path / "model")["prediction"]["q"]) == 1
+    monkeypatch.undo()
+    q = torch.tensor([[0.001, -0.002, 0.0]], dtype=torch.float64)
+    assert torch.equal(load_model(tmp_path / "model")(q), body(q))
 
 
 @pytest.mark.needs_core
