@@ -234,11 +234,14 @@ def c_project(
         raise ValueError(
             f"`name` must be a valid name in C, e.g. trunk_3, got {name!r}."
         )
-    controller = model if isinstance(model, _Controller) else None
+    # Twins in float64, as C computes: what they derive from a geometry has its precision, too.
+    controller = copy.deepcopy(model) if isinstance(model, _Controller) else None
     if controller:
         modules = [*controller.settings.task.steered]
     else:
-        modules = [as_forward_model(model)]
+        modules = [copy.deepcopy(as_forward_model(model))]
+    for module in modules:
+        module.double()
     try:
         if controller:
             plan = Plan(controller.settings.write_plan)
@@ -444,7 +447,6 @@ def _vectors(
     modules: list[ForwardModel], plan: Plan, controller: _Controller | None, dtype: str
 ) -> Entries:
     """Return the data of the test: inputs, and the outputs that torch computes."""
-    doubles = [copy.deepcopy(module).double() for module in modules]
     rng = np.random.default_rng(0)
     center, half = _middle(modules[0], plan, controller)
     # Eight usual rows, then rows at growing distance from the center; the last one is NaN.
@@ -454,10 +456,10 @@ def _vectors(
     rows = rows.astype(dtype)
     with torch.no_grad(), without_warnings():
         at = torch.from_numpy(rows.astype(float))
-        pairs = [double.forward_and_jacobian(at) for double in doubles]
+        pairs = [module.forward_and_jacobian(at) for module in modules]
         x = torch.cat([x for x, _ in pairs], dim=1).numpy()
         J = torch.cat([J for _, J in pairs], dim=1).numpy()
-        distances = [double.domain_distance(at).numpy() for double in doubles]
+        distances = [module.domain_distance(at).numpy() for module in modules]
     distance = np.max(distances, axis=0)
     arrays = {"Q": rows, "X": x, "J": J, "DISTANCE": distance, "HOME": rows[0]}
     entries: Entries = {"ROWS": len(rows)}

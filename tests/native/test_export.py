@@ -17,6 +17,7 @@ from hybridkin import (
     ConstantCurvatureChain,
     ElasticTendonChain,
     InverseKinematics,
+    as_forward_model,
     load_model,
 )
 from hybridkin._core.plan import NoKernel
@@ -67,6 +68,15 @@ def agrees(folder, model, *more, **options):
     done = subprocess.run([built(folder, *more)], capture_output=True, text=True)
     assert done.returncode == 0, done.stdout
     return "0 failures" in done.stdout
+
+
+@needs_cc
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["chain_of_all_parts", "elastic_hybrid", "elm"])
+def test_a_model_in_float32_is_written_as_its_twin_in_float64(tmp_path, name):
+    model = as_forward_model(load_model(FOLDER / f"{name}.safetensors")).float()
+    assert agrees(tmp_path, model)
+    assert torch.float32 in {entry.dtype for entry in model.state_dict().values()}
 
 
 TASKS = {
