@@ -32,7 +32,7 @@ from hybridkin import (
 )
 from hybridkin._core.stored import KINDS_OF_MODELS
 from hybridkin.hybrid.description import restorer
-from hybridkin.learning.regressor_modules import KernelModule, PolynomialModule
+from hybridkin.learning.regressor_modules import KernelModule, PolynomialModule, RescaledModule
 from hybridkin.saving._file import packed, unpacked
 
 IN_FULL = "EXAMPLES" in os.environ  # in the examination
@@ -48,7 +48,9 @@ def smooth():
     polynomial = PolynomialModule(POWERS, rng.normal(size=(6, 2)), *range_of)
     kernel = KernelModule(rng.normal(size=(7, 3)), rng.normal(size=(7, 2)), 0.1, *range_of)
     q = rng.uniform(0.2, 0.3, (3, 3))
-    return {"polynomial": (polynomial, q), "kernel": (kernel, q)}
+    mean = torch.tensor([0.3, -0.1], dtype=torch.float64)
+    rescaled = RescaledModule(copy.deepcopy(kernel), mean, mean.new_tensor(0.7))
+    return {"polynomial": (polynomial, q), "kernel": (kernel, q), "rescaled": (rescaled, q)}
 
 
 def balanced():
