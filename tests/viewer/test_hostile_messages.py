@@ -12,8 +12,8 @@ import hybridkin
 from hybridkin import robots
 
 viser = pytest.importorskip("viser", reason='needs viser: pip install "hybridkin[view]"')
-msgspec = pytest.importorskip("msgspec", reason='needs viser: pip install "hybridkin[view]"')
-websockets = pytest.importorskip("websockets", reason='needs viser: pip install "hybridkin[view]"')
+import msgspec  # noqa: E402 (viser brings them)
+import websockets  # noqa: E402
 
 NAN, INF = float("nan"), float("inf")
 CAMERA = {
