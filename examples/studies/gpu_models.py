@@ -10,6 +10,8 @@ import torch
 from numpy.typing import NDArray
 from sklearn.kernel_ridge import KernelRidge
 from sklearn.linear_model import LinearRegression
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import PolynomialFeatures
 from sklearn.tree import DecisionTreeRegressor
 from torch import Tensor
 
@@ -291,6 +293,11 @@ LEARNED: dict[str, Callable[[], Kind]] = {
     ),
     "hybrid, regression, box guard": lambda: Kind(
         hybrid(LinearRegression(), guard="box"), *_CHAMBERS
+    ),
+    "hybrid, polynomial": lambda: Kind(
+        hybrid(make_pipeline(PolynomialFeatures(2), LinearRegression())),
+        *_CHAMBERS,
+        is_saved=False,
     ),
     "hybrid, no guard": lambda: Kind(hybrid(network(), guard=None), *_CHAMBERS),
     "hybrid, tree by differences": lambda: Kind(

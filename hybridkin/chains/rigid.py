@@ -645,10 +645,11 @@ class RigidChain(Chain):
         """Return warnings if joints turn by more than two turns, or slide too far."""
         # The motion of every joint by each actuator alone: an actuator may have a gear.
         joints = (q[:, None] * self.couplings.to(q)).abs()
-        turned = degrees_message(name, joints[:, ~self.slides], factor)
+        slides = self.slides.to(q.device)
+        turned = degrees_message(name, joints[:, ~slides], factor)
         reach = float(self.reach.detach())
         slid = length_message(
-            name, joints[:, self.slides], factor * _FAR, 0.5 * min(reach, 1.0)
+            name, joints[:, slides], factor * _FAR, 0.5 * min(reach, 1.0)
         )
         return [message for message in (turned, slid) if message is not None]
 

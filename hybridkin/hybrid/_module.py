@@ -301,7 +301,7 @@ class HybridModule(Hybrid):
     @property
     def corrects_inside(self) -> bool:
         """Whether a correction acts inside the robot, see `InnerCorrection`."""
-        return any(correction.inside for _, correction in self._parts())
+        return any(correction.inside for correction in self._corrections)
 
     @property
     def plane(self) -> tuple[Tensor, Tensor] | None:
@@ -314,7 +314,7 @@ class HybridModule(Hybrid):
     def longest_correction(self) -> Tensor | float:
         """Upper bound of the distance from f(q) to x, infinite without guards, () [m]."""
         longest = 0.0 if self.drift is None else torch.inf
-        for weight, correction in self._parts():
+        for weight, correction in self._parts(self.weights):
             guard = correction.guard
             if guard is None:
                 return torch.inf
@@ -330,9 +330,8 @@ class HybridModule(Hybrid):
 
     def with_drift(self, drift: AffineModule) -> Self:
         """Return the same model with another drift; this model does not change."""
-        corrections = [correction for _, correction in self._parts()]
         arguments = self.weights, drift, self.tested, self.log_plane
-        return type(self)(self.mechanical, corrections, *arguments)
+        return type(self)(self.mechanical, self._corrections, *arguments)
 
     def forward(self, q: Tensor) -> Tensor:
         """Return x of shape (..., m) [m]."""
@@ -361,10 +360,14 @@ class HybridModule(Hybrid):
             return super().has_shape(q)
         return self.mechanical.has_shape(q)
 
-    def _parts(self) -> list[tuple[Tensor, TipCorrection]]:
-        """Return pairs of weight () and correction."""
-        corrections = cast("list[TipCorrection]", [*self.corrections])
-        return [*zip(self.weights.unbind(), corrections, strict=True)]
+    @property
+    def _corrections(self) -> list[TipCorrection]:
+        return cast("list[TipCorrection]", [*self.corrections])
+
+    def _parts(self, like: Tensor) -> list[tuple[Tensor, TipCorrection]]:
+        """Return pairs of weight () and correction, weights on the device and in the dtype of q."""
+        weights = self.weights.to(like).unbind()
+        return [*zip(weights, self._corrections, strict=True)]
 
     def _inside(self, q: Tensor) -> Inside | None:
         """Return the mechanical model inside at rows q, where a correction acts there."""
@@ -392,7 +395,7 @@ class HybridModule(Hybrid):
             inside = self._inside(q)
         trust = q.new_ones(len(q), 1)
         total = q.new_zeros(len(q), 1)
-        for weight, correction in self._parts():
+        for weight, correction in self._parts(q):
             value = correction.value(q, inside)
             guard = correction.guard
             if guard is not None:
@@ -406,7 +409,7 @@ class HybridModule(Hybrid):
 
     def _distance(self, q: Tensor) -> Tensor:
         """Return the largest distance of any guard, and of the groups, at rows q, (N, 1)."""
-        guards = [correction.guard for _, correction in self._parts()]
+        guards = [correction.guard for correction in self._corrections]
         farthest = q.new_zeros(len(q))
         for measure in (*guards, self.tested):
             if measure is not None:
@@ -421,7 +424,7 @@ class HybridModule(Hybrid):
         elif self.mechanical is not None:
             total = self.mechanical.forward_and_jacobian(q)
         trust = Fading(q.new_ones(1, 1), q.new_zeros(1, 1, 1))
-        for weight, correction in self._parts():
+        for weight, correction in self._parts(q):
             x, J, fading = correction.guarded_and_jacobian(q, inside)
             total = _plus(total, weight, x, J)
             if fading is not None:
@@ -444,5 +447,4 @@ def _plus(
     """Return a sum plus the weighted x and J."""
     if total is None:
         return weight * x, weight * J
-    weight = weight.to(x)
     return torch.addcmul(total[0], x, weight), torch.addcmul(total[1], J, weight)

@@ -346,6 +346,7 @@ class PolynomialModule(ForwardModel):
 
     def _features(self, q: Tensor, monomials: Tensor) -> Tensor:
         u = (q - self.center.to(q)) / self.scale.to(q)
+        monomials = monomials.to(q.device)
         phi = torch.ones_like(u[..., :1]).expand(*u.shape[:-1], len(monomials))
         of_each = [torch.ones_like(u)]
         for _ in range(int(monomials.max())):

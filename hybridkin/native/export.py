@@ -478,7 +478,8 @@ def _vectors(
 def usual_range(module: ForwardModel, n: int) -> tuple[NDArray, NDArray]:
     """Return the middle and half width of q: of the training rows, else from the radii."""
     buffers = {
-        name.rpartition(".")[2]: a.numpy() for name, a in module.state_dict().items()
+        name.rpartition(".")[2]: a.numpy(force=True)
+        for name, a in module.state_dict().items()
     }
     for pair in _RANGES:
         center, half = (buffers.get(name, np.empty(0)) for name in pair)
