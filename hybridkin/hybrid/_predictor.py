@@ -294,13 +294,19 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def _are_states_seen(self, X: object) -> NDArray[np.bool_]:
         """Return whether the log had the states inside of the hysteresis (N,)."""
         commands = Commands.of(X)
-        states_of_log = self._fitted.state_range
+        states_of_log = self._states_of_log
         if self.play_ is None or states_of_log is None:
             return np.ones(len(commands), dtype=bool)
         rows = check_inputs(self, commands.q)
         states = self.play_.inner_states(rows, commands.run_of_rows, commands.time)
         seen = states_of_log.moved(-self.change_.shift)
         return seen.beyond(states).max(axis=(1, 2), initial=0.0) <= 0.0
+
+    @property
+    def _states_of_log(self) -> TrainingRange | None:
+        """Range of the states inside of `play_` in the log; None if it is not that of the fit."""
+        fit = self._fitted
+        return fit.state_range if self.play_ is fit.play else None
 
     def _take(self, fit: HybridFit) -> None:
         """Become the model of a fit; the robot has not changed since."""

@@ -91,7 +91,7 @@ def stored_hybrid(model: HybridForwardModel) -> Stored:
             **model.change_._asdict(),
             "training_range": fit.training_range,
             **_stored_play(model.play_),
-            "state_range": fit.state_range,
+            "state_range": model._states_of_log,
             "radius": model.radius_,
             "fitted_rows": fit.fitted_rows,
         },
