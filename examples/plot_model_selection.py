@@ -8,6 +8,8 @@ configurations, no motions. Here neighbouring configurations form a group, so th
 on configurations unlike those of its fit.
 """
 
+import warnings
+
 import matplotlib.pyplot as plt
 import numpy as np
 from sklearn.cluster import KMeans
@@ -47,8 +49,10 @@ for name, model in candidates.items():
     )
 
 # %%
-# A grid over the coupling and over parameters of the network.
+# A grid over the coupling and over parameters of the network. With small penalties, networks make
+# the mechanical model worse, and each such fit warns; here the scores show it.
 
+warnings.filterwarnings("ignore", "`error_model` makes the mechanical model worse")
 model = HybridForwardModel(chain, ELMRegressor(random_state=0), calibrate="default")
 grid = {
     "coupling": ["parallel", "serial"],

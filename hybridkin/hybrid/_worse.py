@@ -27,6 +27,10 @@ def worse_than_mechanical(fitted: FittedHybrid, rows: Rows) -> list[str]:
     errors are compared; if these are smaller, the errors on a fifth of the groups, or rows, after
     one more fit to the other rows with the same geometry.
 
+    A mean square counts as larger if it exceeds that of the mechanical model by more than one
+    standard error of the latter over all groups, or rows. The spread of the differences would
+    excuse a few corrections that are far off.
+
     Parameters
     ----------
     fitted : FittedHybrid
@@ -40,25 +44,32 @@ def worse_than_mechanical(fitted: FittedHybrid, rows: Rows) -> list[str]:
         return []
     if spec.compared or len(rows) < _FEW:  # which have warnings of their own
         return []
-    before, after = _errors(spec, fitted.module, rows)
+    squares, corrected = _squares(spec, fitted.module, rows)
+    chance = _standard_error(squares, rows.groups)
+    before = squares.sum()
+    after = corrected.sum()
     where = "on the training rows"
-    if after <= before and model.knows_held_out_error(rows):
-        after = max(after, _tip(fitted.error.noise, rows))
+    if after <= before + chance and model.knows_held_out_error(rows):
+        after = max(after, _tip(fitted.error.noise, rows) ** 2)
         where = "on held-out rows"
-    elif after <= before and _can_hold_out(rows):
+    elif after <= before + chance and _can_hold_out(rows):
         train, test = folds(rows.X, rows.groups)[0]
         settled = replace(spec, error_model=fitted.error.settled, held_out=False)
         with TURNS.filters, warnings.catch_warnings():  # the full fit has given them
             warnings.simplefilter("ignore")
             module = fit_hybrid(settled, rows.take(train)).module
-        before, after = _errors(spec, module, rows.take(test))
+        squares, corrected = _squares(spec, module, rows.take(test))
+        before = squares.sum()
+        after = corrected.sum()
+        chance *= (rows.counts.sum() / rows.counts[test].sum()) ** 0.5  # of fewer rows
         where = "on a fifth of the rows, held out"
-    if after <= before:
+    if after <= before + chance:
         return []
     return [
-        f"`error_model` makes the mechanical model worse: its error {where} is {1e3 * after:.3g} "
-        f"mm (rms), that of the mechanical model alone {1e3 * before:.3g} mm. Use another "
-        'regressor, more rows, error_model="auto", which compares, or "drop".'
+        f"`error_model` makes the mechanical model worse: its error {where} is "
+        f"{1e3 * after**0.5:.3g} mm (rms), that of the mechanical model alone "
+        f"{1e3 * before**0.5:.3g} mm. Use another regressor, more rows, "
+        'error_model="auto", which compares, or "drop".'
     ]
 
 
@@ -69,20 +80,28 @@ def _can_hold_out(rows: Rows) -> bool:
     return rows.groups is None or len(np.unique(rows.groups)) > 1
 
 
-def _errors(spec: Spec, module: Hybrid, rows: Rows) -> tuple[float, float]:
-    """Return the rms tip errors of the mechanical model and of the hybrid [m]."""
+def _squares(spec: Spec, module: Hybrid, rows: Rows) -> tuple[NDArray, NDArray]:
+    """Return the parts (N,) of the mean squared tip error: mechanical model and hybrid [m^2]."""
     residual = residuals(spec.mechanical, rows.q, rows.y, spec.output)
     before = residual.reshape(rows.tips.shape)
     with torch.no_grad():
         after = before - module.error_part(rows.q).numpy()
-    return _rms(before, rows.counts), _rms(after, rows.counts)
+    return _parts(before, rows.counts), _parts(after, rows.counts)
 
 
-def _rms(residual: NDArray, counts: NDArray) -> float:
-    """Return the root mean square length (of points) of residuals (N, m), NaN left out."""
-    lengths = np.linalg.norm(points(residual), axis=2) ** 2
-    squares = np.ma.average(np.ma.masked_invalid(lengths), axis=0, weights=counts)
-    return float(squares.mean() ** 0.5)
+def _parts(residual: NDArray, counts: NDArray) -> NDArray:
+    """Return what each row adds to the mean squared length of residuals (N, m), NaN left out."""
+    squares = np.square(points(residual)).sum(2)
+    weights = np.where(np.isnan(squares), 0.0, counts[:, None])
+    return (np.nan_to_num(squares) * weights / weights.sum(0)).mean(1)
+
+
+def _standard_error(parts: NDArray, groups: NDArray | None) -> float:
+    """Return the standard error of a sum over independent groups; over rows if it is one group."""
+    if groups is not None and len(np.unique(groups)) > 1:
+        _, place = np.unique(groups, return_inverse=True)
+        parts = np.bincount(place, parts)
+    return float(len(parts) ** 0.5 * parts.std(ddof=1))
 
 
 def _tip(noise: float, rows: Rows) -> float:

@@ -131,11 +131,10 @@ class HybridForwardModel(HybridPredictor):
         ``motion`` of the base (4, 4); zero and the identity after a fit.
     error_model_ : estimator, ReadoutFit, FittedBlend, tuple or None
         The fitted error model; a tuple has one for each marker. A regressor that sees scaled
-        residuals is the ``regressor_`` of a `TransformedTargetRegressor`, which predicts [m]. A
-        blend has ``weights`` and
-        ``error_models``. With serial coupling or named features it holds the chosen ``alphas`` and
-        the ``residual`` of every row from a fit without that row or its group [m]. A model from a
-        file has none.
+        residuals is the ``regressor_`` of a `TransformedTargetRegressor`, which predicts [m], as
+        does its ``module_``. A blend has ``weights`` and ``error_models``. With serial coupling or
+        named features it holds the chosen ``alphas`` and the ``residual`` of every row from a fit
+        without that row or its group [m]. A model from a file has none.
     cv_results_ : dict or None
         For error_model="auto". By candidate, the last of which is the blend: the mean distance on
         held-out rows and its standard deviation over the folds [m], and ``io_distance``, the mean
@@ -259,7 +258,8 @@ class HybridForwardModel(HybridPredictor):
             If a regressor makes the mechanical model worse: on the training rows, or else on a
             fifth of the groups, runs or rows, held out, which takes one more fit of the regressor
             to the others (none for an ELMRegressorCV, or an ELMRegressor without groups, which know
-            their held-out errors; and none below 20 rows).
+            their held-out errors; and none below 20 rows). The mean square must exceed that of the
+            mechanical model by more than the standard error of the latter over rows, or groups.
         """
         fitted = fit_to_log(*prepared(self, X, y, groups, sample_weight))
         for message in fitted.messages:

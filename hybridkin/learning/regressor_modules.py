@@ -50,9 +50,6 @@ def error_module(regressor: Regressor, q: Tensor) -> ForwardModel:
     q : Tensor of shape (N, n)
         The training rows.
     """
-    if isinstance(regressor, ResidualRegressor):
-        of_residual = error_module(regressor.regressor_, q)
-        return _rescaled(of_residual, regressor.transformer_)
     if isinstance(regressor, Fitted):
         return as_forward_model(regressor)
     steps: list[Any] = [regressor]
@@ -125,13 +122,25 @@ class ResidualRegressor(TransformedTargetRegressor):
         The fitted regressor, of scaled residuals.
     transformer_ : UnitSpread
         The scaling.
+    module_ : ForwardModel
+        q -> residual [m] in torch, with closed-form Jacobian where `regressor_` has one.
     """
 
     regressor_: Any
     transformer_: Any
+    module_: ForwardModel
 
     def __init__(self, regressor: Any, transformer: UnitSpread) -> None:
         super().__init__(regressor, transformer=transformer, check_inverse=False)
+
+    def fit(self, X: NDArray, y: NDArray, **options: Any) -> ResidualRegressor:
+        """Fit the regressor to scaled residuals."""
+        super().fit(X, y, **options)
+        of_scaled = error_module(
+            self.regressor_, torch.from_numpy(X.astype(np.float64))
+        )
+        self.module_ = _rescaled(of_scaled, self.transformer_)
+        return self
 
 
 def sees_scale(regressor: object) -> bool:

@@ -13,7 +13,7 @@ from sklearn.ensemble import HistGradientBoostingRegressor, RandomForestRegresso
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, WhiteKernel
 from sklearn.kernel_ridge import KernelRidge
-from sklearn.linear_model import ElasticNet, Ridge
+from sklearn.linear_model import ElasticNet, LinearRegression, Ridge
 from sklearn.multioutput import MultiOutputRegressor
 from sklearn.neighbors import KNeighborsRegressor
 from sklearn.neural_network import MLPRegressor
@@ -139,6 +139,18 @@ def test_modules_of_others_are_scaled_back():
     assert 1.0 < fitted.error_model_.regressor_.largest_ < 10.0
 
 
+@pytest.mark.parametrize("name", REGRESSORS)
+def test_the_module_of_scaled_residuals_is_in_metres(name):
+    q, x = log()
+    regressor = model(REGRESSORS[name]).fit(q, x).error_model_
+    if not hasattr(regressor, "regressor_"):  # it sees metres
+        return
+    tolerance = {"rtol": 0, "atol": 1e-9}
+    learned = regressor.module_(torch.from_numpy(q)).numpy()
+    np.testing.assert_allclose(learned, regressor.predict(q), **tolerance)
+    assert np.abs(learned).max() < 0.5
+
+
 @pytest.mark.slow
 def test_closed_forms_stay_closed_and_compiled():
     """Also a model from a file, for a regressor whose module has a layout."""
@@ -213,17 +225,49 @@ def test_corrections_that_make_the_model_worse_are_named(grouped):
 def test_whole_groups_and_runs_are_held_out_for_the_comparison():
     """What one motion shows of itself is no error on another one: the nearest rows mislead."""
     rng = np.random.default_rng(0)
-    groups = np.arange(120) // 12
-    centre = rng.uniform(-1, 1, (10, 3))
+    groups = np.arange(120) // 4  # six motions are held out; of two, the difference is chance
+    centre = rng.uniform(-1, 1, (30, 3))
     q = 0.25 + 0.05 * centre[groups] + 1e-4 * rng.normal(size=(120, 3))
     x = ConstantCurvatureChain([0.06])(torch.from_numpy(q)).numpy()
-    x += 0.02 * rng.normal(size=(10, 3))[groups]  # an offset for each motion
+    x += 0.02 * rng.normal(size=(30, 3))[groups]  # an offset for each motion
     nearest = KNeighborsRegressor(1)
     model(nearest).fit(q, x)  # by rows it looks good
     for options in ({"groups": groups}, {}):
         commands = q if options else Commands(q, groups)
         with pytest.warns(UserWarning, match="a fifth of the rows, held out"):
             model(nearest).fit(commands, x, **options)
+
+
+class FarOff(RegressorMixin, BaseEstimator):
+    """Corrects nothing, except the row of largest first command, by a kilometre."""
+
+    def fit(self, X, y):
+        self.largest_ = X[:, 0].max()
+        return self
+
+    def predict(self, X):
+        return np.where(X[:, :1] == self.largest_, 1e3, 0.0) * np.ones(3)
+
+
+def test_a_single_row_far_off_is_no_chance():
+    q, x = log()
+    with pytest.warns(UserWarning, match=rf"worse: its error on the training rows {NUMBERS}"):
+        model(FarOff(), guard=None).fit(q, x)
+
+
+def test_differences_of_chance_are_not_named():
+    """The linear part of pure noise: held-out errors are larger or smaller by a few percent."""
+    named = 0
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        q = 0.25 + 0.05 * rng.uniform(-1, 1, (120, 3))
+        x = ConstantCurvatureChain([0.06])(torch.from_numpy(q)).numpy()
+        x += 0.005 * rng.normal(size=(120, 3))
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            model(LinearRegression()).fit(q, x)
+        named += any("makes the mechanical model worse" in str(w.message) for w in caught)
+    assert named <= 2
 
 
 def test_useful_corrections_and_few_rows_pass():
