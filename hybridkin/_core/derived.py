@@ -41,16 +41,17 @@ def derived(
             kept = module.__dict__.get(KEPT, {}).get(place)
             if kept is not None and kept.holds(module, settings):
                 return kept.values
-            entries = dict(zip(names, entries_of(module, names), strict=True))
+            present = _at_present(module)
+            entries = dict(zip(names, entries_of(present, names), strict=True))
             if _has_derivatives(entries):
-                return compute(module, *settings)
+                return compute(present, *settings)
             try:
                 kept = _Kept(entries, settings)
             except (RuntimeError, TypeError):
-                return compute(module, *settings)
+                return compute(present, *settings)
             # Later derivatives cannot use tensors of the inference mode.
             with torch.inference_mode(False), torch.no_grad():
-                values = compute(module, *settings)
+                values = compute(present, *settings)
             if kept.keeps(values):  # at once, for other threads
                 module.__dict__.setdefault(KEPT, {})[place] = kept
             return values
@@ -67,6 +68,16 @@ def entries_of(module: nn.Module, names: Sequence[str]) -> list[Tensor | None]:
     for name in names:
         entries.append(buffers[name] if name in buffers else getattr(module, name))
     return entries
+
+
+def _at_present(module: nn.Module) -> nn.Module:
+    """Return the module with its present entries, whatever other threads assign meanwhile."""
+    present = object.__new__(type(module))
+    state = vars(module).copy()
+    for place in ("_buffers", "_parameters"):
+        state[place] = state[place].copy()
+    vars(present).update(state)
+    return present
 
 
 class _Kept(Generic[Tensors]):

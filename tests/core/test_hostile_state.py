@@ -9,6 +9,7 @@ import copy
 import itertools
 import os
 import pickle
+import sys
 import threading
 
 import numpy as np
@@ -32,7 +33,12 @@ from hybridkin import (
 )
 from hybridkin._core.stored import KINDS_OF_MODELS
 from hybridkin.hybrid.description import restorer
-from hybridkin.learning.regressor_modules import KernelModule, PolynomialModule, RescaledModule
+from hybridkin.learning.regressor_modules import (
+    AffineModule,
+    KernelModule,
+    PolynomialModule,
+    RescaledModule,
+)
 from hybridkin.saving._file import packed, unpacked
 
 IN_FULL = "EXAMPLES" in os.environ  # in the examination
@@ -48,9 +54,14 @@ def smooth():
     polynomial = PolynomialModule(POWERS, rng.normal(size=(6, 2)), *range_of)
     kernel = KernelModule(rng.normal(size=(7, 3)), rng.normal(size=(7, 2)), 0.1, *range_of)
     q = rng.uniform(0.2, 0.3, (3, 3))
-    mean = torch.tensor([0.3, -0.1], dtype=torch.float64)
-    rescaled = RescaledModule(copy.deepcopy(kernel), mean, mean.new_tensor(0.7))
-    return {"polynomial": (polynomial, q), "kernel": (kernel, q), "rescaled": (rescaled, q)}
+    return {"polynomial": (polynomial, q), "kernel": (kernel, q)}
+
+
+def rescaled():
+    rng = np.random.default_rng(0)
+    line = AffineModule(rng.normal(size=(2, 3)), rng.normal(size=2))
+    mean, spread = torch.tensor([0.1, 0.2]).double(), torch.tensor(0.3).double()
+    return RescaledModule(line, mean, spread), rng.uniform(0.2, 0.3, (3, 3))
 
 
 def balanced():
@@ -75,7 +86,7 @@ def all_models():
     """Return modules of all kinds, with rows of q."""
     force = ForceTendonChain([0.01], [0.1], 0.02, 200.0, weight=0.5, taper=0.3, arcs=2)
     found = {**CHAINS, **smooth(), "force": (force, FORCES)}
-    found |= {"balanced": balanced(), "two markers": marked()}
+    found |= {"balanced": balanced(), "two markers": marked(), "rescaled": rescaled()}
     for name, (model, q) in models().items():
         module = getattr(model, "module_", model)
         found.setdefault(f"saved {name}", (module, q[:3]))
@@ -389,15 +400,20 @@ def test_threads_see_one_state_or_the_other():
                 wrong.append(x)
 
     threads = [threading.Thread(target=read) for _ in range(2)]
-    for thread in threads:
-        thread.start()
-    for k in range(100):
-        shared.radii = chains[k % 2].radii
-        if not torch.equal(shared(LENGTHS), tips[k % 2]):
-            wrong.append(k)
-    done.set()
-    for thread in threads:
-        thread.join()
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)  # threads meet at every place
+    try:
+        for thread in threads:
+            thread.start()
+        for k in range(100):
+            shared.radii = chains[k % 2].radii
+            if not torch.equal(shared(LENGTHS), tips[k % 2]):
+                wrong.append(k)
+    finally:
+        done.set()
+        for thread in threads:
+            thread.join()
+        sys.setswitchinterval(interval)
     assert not wrong
 
 
