@@ -31,6 +31,7 @@ from hybridkin import (
     native,
     save_model,
 )
+from hybridkin._core.derived import derived
 from hybridkin._core.stored import KINDS_OF_MODELS
 from hybridkin.hybrid.description import restorer
 from hybridkin.learning.regressor_modules import (
@@ -415,6 +416,20 @@ def test_threads_see_one_state_or_the_other():
             thread.join()
         sys.setswitchinterval(interval)
     assert not wrong
+
+
+def test_an_entry_assigned_while_a_result_is_computed():
+    class Doubled(torch.nn.Module):
+        @derived("a")
+        def result(self):
+            first = self.a
+            shared.a = torch.tensor(2.0)  # as by another thread
+            return (first + self.a,)
+
+    shared = Doubled()
+    shared.register_buffer("a", torch.tensor(1.0))
+    assert shared.result()[0] == 2.0
+    assert shared.result()[0] == 4.0
 
 
 def test_what_is_computed_in_a_transform_is_not_kept():
