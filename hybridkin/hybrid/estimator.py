@@ -59,10 +59,11 @@ class HybridForwardModel(HybridPredictor):
         changed. None: no mechanical model, everything is learned (f^dat of the paper).
     error_model : estimator, str or None, default=None
         Any scikit-learn regressor with as many outputs as x has (others in a
-        `MultiOutputRegressor`), or a name. A regressor of another library sees q as given, or as
+        ``MultiOutputRegressor``), or a name. A regressor of another library sees q as given, or as
         its own pipeline scales it, and residuals with mean zero and unit spread: its penalties and
-        tolerances are relative to that spread, and lengths can be in any unit. (`LinearRegression`,
-        `Ridge`, `RidgeCV` and `KernelRidge` give the same at any scale, and see metres.) Names:
+        tolerances are relative to that spread, and lengths can be in any unit.
+        (``LinearRegression``, ``Ridge``, ``RidgeCV`` and ``KernelRidge`` give the same at any
+        scale, and see metres.) Names:
 
         - "elm", the same as None: ``ELMRegressor(random_state=random_state)``;
         - "linear" or "quadratic": features of all actuators; "pose": features of a chain's shape
@@ -131,7 +132,7 @@ class HybridForwardModel(HybridPredictor):
         ``motion`` of the base (4, 4); zero and the identity after a fit.
     error_model_ : estimator, ReadoutFit, FittedBlend, tuple or None
         The fitted error model; a tuple has one for each marker. A regressor that sees scaled
-        residuals is the ``regressor_`` of a `TransformedTargetRegressor`, which predicts [m], as
+        residuals is the ``regressor_`` of a ``TransformedTargetRegressor``, which predicts [m], as
         does its ``module_``. A blend has ``weights`` and ``error_models``. With serial coupling or
         named features it holds the chosen ``alphas`` and the ``residual`` of every row from a fit
         without that row or its group [m]. A model from a file has none.
