@@ -396,7 +396,7 @@ class ElasticTendonChain(ElasticBody):
 
     def _warn(self, rows: Tensor, is_short: Tensor) -> Tensor:
         first = first_row()
-        if first is not None:
+        if first is not None and is_short.any():
             is_named = is_short.any(1) & rows.isfinite().all(1)
             why = why_not(COMPRESSED, rows, is_named, first)
             if why is not None:
