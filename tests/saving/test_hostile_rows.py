@@ -32,6 +32,7 @@ def outcome(model, entry, q):
         rows = Commands(q, time=np.arange(len(q), dtype=float))
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "`X` (reaches|has no tip: compressed)")
+        warnings.filterwarnings("ignore", "compressed: in row 2")  # again in torch
         values = getattr(model, entry)(rows)
     return values if isinstance(values, tuple) else (values,)
 
