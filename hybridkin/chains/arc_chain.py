@@ -90,6 +90,7 @@ class Frames(NamedTuple):
     # Velocity and angular velocity of the robot's end by the lengths, x- and y-bendings.
     moves: Tensor  # (3, 3, S, N)
     spins: Tensor  # (3, 3, S, N)
+    arcs: Tensor  # lengths [m], then x-, then y-bendings, (3 S, N)
     slope: Tensor  # d arcs / dq, (3 S, n) or (3 S, n, N)
 
 
@@ -379,6 +380,7 @@ class ArcChain(MarkedChain):
             points=steps.cumsum(1),
             moves=moves.unflatten(1, (3, S)),
             spins=spins.unflatten(1, (3, S)),
+            arcs=arcs,
             slope=slope,
         )
 
