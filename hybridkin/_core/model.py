@@ -216,6 +216,10 @@ class ForwardModel(PortableModule):
         """The model of the tip alone: the last one of several markers, else the model itself."""
         return self
 
+    def each_tip(self) -> list[Any]:
+        """Return one model for each point of the robot: a chain of K markers has K."""
+        return [self]
+
     def unit_messages(self, q: Tensor, name: str, factor: float = 1.0) -> list[str]:
         """Return warnings if q (N, n) holds values too large to be metres or radians.
 

@@ -84,6 +84,8 @@ class GeometryChoice:
         The other sets whose errors are at most a tenth above those of the chosen one.
     starts : tuple of Start or None
         Starts of the fits of all sets.
+    usual : tuple of GeometryChoice
+        The sets that suit few rows: nothing, the base, and base and radii of the given chain.
     """
 
     chain: Chain
@@ -94,6 +96,20 @@ class GeometryChoice:
     messages: tuple[str, ...] = ()
     rivals: tuple[GeometryChoice, ...] = ()
     starts: tuple[Start | None, ...] = ()
+    usual: tuple[GeometryChoice, ...] = ()
+
+    def smaller(self, name: str) -> GeometryChoice:
+        """Return the usual set of this name in place of the chosen one, if there is one."""
+        for usual in self.usual:
+            if usual.name == name:
+                return replace(
+                    self,
+                    chain=usual.chain,
+                    parameters=usual.parameters,
+                    start=usual.start,
+                    name=usual.name,
+                )
+        return self
 
 
 class _Candidate(NamedTuple):
@@ -223,7 +239,13 @@ def choose_geometry(
         return GeometryChoice(chosen_chain, names, starts[k], name, errors, messages)
 
     rivals = [choice(k) for k in near if k != best and candidates[k].parameters]
-    return replace(choice(best), rivals=tuple(rivals), starts=tuple(starts))
+    usual = [k for k, candidate in enumerate(candidates) if candidate.name in _USUAL]
+    return replace(
+        choice(best),
+        rivals=tuple(rivals),
+        starts=tuple(starts),
+        usual=tuple(choice(k) for k in usual),
+    )
 
 
 def _best(

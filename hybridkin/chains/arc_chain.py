@@ -147,6 +147,11 @@ class ArcChain(MarkedChain):
         return torch.from_numpy(absolute).to(self.radii.device)
 
     @property
+    def has_one_arc_per_segment(self) -> bool:
+        """Whether every segment is one arc."""
+        return self.arcs_per_segment == 1
+
+    @property
     def in_metres(self) -> bool:
         """Whether q is in metres: all gains are 1."""
         return bool((self.gains == 1.0).all())

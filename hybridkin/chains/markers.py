@@ -126,9 +126,9 @@ class MarkedChain(Chain):
     @property
     def tip_model(self) -> Self:
         """The chain of the last marker alone."""
-        return self.tips()[-1]
+        return self.each_tip()[-1]
 
-    def tips(self) -> list[Self]:
+    def each_tip(self) -> list[Self]:
         """Return one chain per marker, each mapping q (..., n) to x (..., 3)."""
         single = len(self.markers) == 1
         return [self] if single else [self._marked([marker]) for marker in self.markers]

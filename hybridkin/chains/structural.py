@@ -149,11 +149,11 @@ class StructuralChain(ForwardModel):
         """The chain without these errors."""
         return self.chain
 
-    def tips(self) -> list[StructuralChain]:
+    def each_tip(self) -> list[StructuralChain]:
         """Return one model per marker, each mapping q (..., n) to x (..., 3)."""
         weights = self.lengths, *self._weights(self.lengths)
         return [
-            StructuralChain(tip, *weights, self.motion) for tip in self.chain.tips()
+            StructuralChain(tip, *weights, self.motion) for tip in self.chain.each_tip()
         ]
 
     def forward(self, q: Tensor) -> Tensor:
@@ -181,7 +181,10 @@ class StructuralChain(ForwardModel):
 
     def from_coordinates_and_jacobian(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """Return `from_coordinates` and its derivative (N, 3 K, 3 m) by the arcs."""
-        x, columns = self.chain.from_coordinates_and_jacobian(z)
+        return self.moved(*self.chain.from_coordinates_and_jacobian(z))
+
+    def moved(self, x: Tensor, columns: Tensor) -> tuple[Tensor, Tensor]:
+        """Return points (N, 3 K) and their derivatives (N, 3 K, C), moved by T."""
         turn = self.motion[:3, :3].to(columns)
         turned = turn @ columns.unflatten(1, (-1, 3))
         return self._moved(x), turned.flatten(1, 2)
@@ -239,6 +242,11 @@ class StructuralChain(ForwardModel):
         if slope.ndim == 2:
             return torch.einsum("abn,bi->ain", whole, slope)
         return torch.einsum("abn,bin->ain", whole, slope)
+
+
+def without_errors(model: ForwardModel) -> ForwardModel:
+    """Return the chain of a StructuralChain, any other model as it is."""
+    return model.chain if isinstance(model, StructuralChain) else model
 
 
 def _derivative(

@@ -188,8 +188,10 @@ class FeatureModel(TipModel):
         read_out = self.read_out(rows, spec)
         fits = []
         for of_marker, marker in markers:
-            assert isinstance(marker.mechanical, ArcChain)
-            readout = read_out.readout.up_to(marker.mechanical)
+            assert marker.mechanical is not None
+            chain = marker.mechanical.robot
+            assert isinstance(chain, ArcChain)
+            readout = read_out.readout.up_to(chain)
             fit = read_out._replace(readout=readout)
             fits.append(self._fitted(fit, of_marker))
         return replace(_of_markers(fits), settled=fits[0].settled)
@@ -264,8 +266,9 @@ class ShapeModel(FeatureModel):
 
     def features(self, q: Tensor, mechanical: ForwardModel) -> Features:
         """Return the features for training rows q (N, n)."""
-        if isinstance(mechanical, ArcChain):
-            return PoseFeatures.of_range(q, mechanical)
+        robot = mechanical.robot
+        if isinstance(robot, ArcChain):
+            return PoseFeatures.of_range(q, robot)
         raise TypeError(
             "`mechanical_model` must be a chain of arcs with error_model='pose', got "
             f"{type(mechanical).__name__}; use error_model='quadratic'."

@@ -60,7 +60,10 @@ def fit_hybrid(spec: Spec, rows: Rows) -> FittedHybrid:
     rows = replace(rows, residual=residual)
     error = spec.error_model.fit(rows, spec)
     modules = []
-    markers = spec.by_marker(rows)
+    within = spec
+    if error.refined is not None:
+        within = replace(spec, mechanical=error.refined)
+    markers = within.by_marker(rows)
     for part, corrections in zip(markers, error.corrections, strict=True):
         modules.append(_module(*part, corrections))
     module = modules[0]

@@ -14,6 +14,7 @@ from hybridkin._core.blocks import in_blocks
 from hybridkin._core.model import ForwardModel, PortableModule
 from hybridkin._core.plan import CHAINS, NoKernel, Plan
 from hybridkin._core.stored import Layout, Stored
+from hybridkin.chains.structural import without_errors
 from hybridkin.hybrid._guards import GroupDistance, Guard, LeverageGuard, Plane
 from hybridkin.learning.regressor_modules import AffineModule
 
@@ -168,8 +169,13 @@ class Hybrid(ForwardModel):
 
     @property
     def robot(self) -> ForwardModel:
-        """The mechanical model, or the module itself without one."""
-        return self if self.mechanical is None else self.mechanical
+        """The mechanical model without learned errors, or the module itself without one."""
+        return self if self.nominal is None else self.nominal
+
+    @property
+    def nominal(self) -> ForwardModel | None:
+        """The mechanical model without the learned errors of its structure."""
+        return None if self.mechanical is None else without_errors(self.mechanical)
 
     @property
     def corrects_inside(self) -> bool:

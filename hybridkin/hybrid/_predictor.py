@@ -326,7 +326,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def _follow_robot(self) -> None:
         """Set the module and its mechanical model after the change and the drift of the robot."""
         hybrid = self.fitted_module_
-        mechanical = hybrid.mechanical
+        mechanical = hybrid.nominal
         drift = self._drift.correction()
         if drift is not None:
             hybrid = hybrid.with_drift(drift)

@@ -19,6 +19,7 @@ from hybridkin._core.plan import Plan
 from hybridkin._core.stored import Stored
 from hybridkin.calibration.measured import points
 from hybridkin.chains.arc_chain import ArcChain
+from hybridkin.chains.structural import StructuralChain
 from hybridkin.hybrid import _linearised
 from hybridkin.hybrid._features import Features, Readout
 from hybridkin.hybrid._linearised import Linearised, Pair
@@ -57,11 +58,14 @@ class ReadoutFit(NamedTuple):
     rmse: float = nan  # weighted root mean square length of `residual` [m]
 
 
-_Tips = Callable[[Tensor], tuple[Tensor, Tensor]]
+Tips = Callable[[Tensor], tuple[Tensor, Tensor]]
 
 
-def _tips(model: ForwardModel) -> _Tips:
+def tips_of(model: ForwardModel) -> Tips:
     """Return `from_coordinates_and_jacobian`, for arcs from the compiled core if available."""
+    if isinstance(model, StructuralChain):
+        of_chain = tips_of(model.chain)
+        return lambda z: model.moved(*of_chain(z))
     single = isinstance(model, ArcChain) and len(model.markers) == 1
     if not single or program_of(model) is None:
         return model.from_coordinates_and_jacobian
@@ -91,7 +95,7 @@ def _tips(model: ForwardModel) -> _Tips:
 
 
 def _at_tip(z: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the result of `_tips` if the inner coordinates are the tip."""
+    """Return the result of `tips_of` if the inner coordinates are the tip."""
     return z, identity(z.shape[1], z).expand(len(z), -1, -1)
 
 
@@ -247,7 +251,7 @@ class _Problem:
         self.noise_ratio = inf
         self.whitening = None
         self._last = None
-        self._tips = _tips(mechanical) if serial else _at_tip
+        self._tips = tips_of(mechanical) if serial else _at_tip
         self.z = mechanical.coordinates(q)[0] if serial else mechanical(q)
         self.seen = ~x.isnan()
         self.rest, J = self._rest(self.z)

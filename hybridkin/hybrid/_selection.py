@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 from sklearn.linear_model import LinearRegression
 from typing_extensions import Self
 
+from hybridkin.calibration.choice import GeometryChoice
 from hybridkin.calibration.measured import distance, inner_and_outer
 from hybridkin.chains.arc_chain import ArcChain
+from hybridkin.chains.structural import StructuralChain
 from hybridkin.hybrid._error_models import (
     Blend,
     KernelModel,
@@ -27,7 +29,16 @@ from hybridkin.hybrid._error_models import (
 from hybridkin.hybrid._fit import FittedHybrid, fit_hybrid
 from hybridkin.hybrid._kernel import folds_of
 from hybridkin.hybrid._rows import Rows
-from hybridkin.hybrid._spec import ErrorModel, FittedError, Seed, Spec
+from hybridkin.hybrid._spec import (
+    UNREFINED,
+    ErrorModel,
+    FittedError,
+    Refinement,
+    Seed,
+    Spec,
+    residuals,
+)
+from hybridkin.hybrid._structural_model import best_refinement
 from hybridkin.hybrid.held_out import (
     MEAN_LENGTH,
     HeldOut,
@@ -89,12 +100,21 @@ class Auto(ErrorModel):
         """Return the error model for these settings of a HybridForwardModel."""
         return cls(random_state)
 
+    def refinement(
+        self, spec: Spec, geometry: GeometryChoice, rows: Rows
+    ) -> Refinement:
+        """Return the errors of the structure, if they lower the errors on held-out rows."""
+        if spec.output == "pose":
+            return UNREFINED
+        return best_refinement(spec, geometry, rows)
+
     def starting_at(self, settled: ErrorModel) -> ErrorModel:
         """Return the candidates without their blend; their choices start at settled ones."""
         return settled
 
     def fit(self, rows: Rows, spec: Spec) -> FittedError:
         """Return the blend, fitted to all rows, and the comparison of the candidates."""
+        spec, rows = _refined(spec, rows)
         folds = folds_of(rows.X, rows.groups)
         fold = _fold_of_rows(folds)
         parts = [Part.of(spec, rows, train, test) for train, test in folds]
@@ -127,6 +147,7 @@ class Auto(ErrorModel):
             noise=comparison["expected_distance"] / MEAN_LENGTH,
             held_out=True,
             comparison=comparison,
+            refined=_errors_of_structure(spec),
             candidates={name: fitted.module for name, fitted in fits.items()},
         )
 
@@ -138,11 +159,14 @@ class Auto(ErrorModel):
         if spec.mechanical is None:
             candidates["linear"] = RegressorModel(LinearRegression())
         else:
-            candidates["mechanical"] = NoCorrection()
+            first = "mechanical"
+            if isinstance(spec.mechanical, StructuralChain):
+                first = "structural"
+            candidates[first] = NoCorrection()
             candidates["serial linear"] = LinearModel("serial")
             candidates["serial quadratic"] = QuadraticModel("serial")
             at_tip = "parallel "
-            if isinstance(spec.mechanical, ArcChain):
+            if isinstance(spec.mechanical.robot, ArcChain):
                 candidates["serial pose"] = ShapeModel("serial")
                 candidates["parallel pose"] = ShapeModel("parallel")
             else:
@@ -173,14 +197,29 @@ class Candidates(ErrorModel):
 
     def fit(self, rows: Rows, spec: Spec) -> FittedError:
         """Return the fits of all candidates."""
+        spec, rows = _refined(spec, rows)
         fold = _fold_of_rows(folds_of(rows.X, rows.groups))
         fits, outside = _fitted(self.models, rows, spec, fold)
         return replace(
             next(iter(fits.values())).error,
             settled=self,
+            refined=_errors_of_structure(spec),
             candidates={name: fitted.module for name, fitted in fits.items()},
             outside=outside,
         )
+
+
+def _refined(spec: Spec, rows: Rows) -> tuple[Spec, Rows]:
+    """Return the specification with the refined mechanical model, and the rows' residuals of it."""
+    spec = spec.refined(rows)
+    residual = residuals(spec.mechanical, rows.q, rows.y, spec.output)
+    return spec, replace(rows, residual=residual)
+
+
+def _errors_of_structure(spec: Spec) -> StructuralChain | None:
+    """Return the refined mechanical model, if it is refined."""
+    model = spec.mechanical
+    return model if isinstance(model, StructuralChain) else None
 
 
 def _fitted(

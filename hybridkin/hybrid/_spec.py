@@ -19,9 +19,9 @@ from hybridkin._core.directions import Directions
 from hybridkin._core.model import ForwardModel
 from hybridkin.calibration.calibrate import CalibrationResult, fit_geometry, refitted
 from hybridkin.calibration.choice import GeometryChoice, choose_geometry
-from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.hysteresis import HysteresisOperator
+from hybridkin.chains.structural import StructuralChain
 from hybridkin.hybrid._drift import too_far
 from hybridkin.hybrid._module import Hybrid, TipCorrection
 from hybridkin.hybrid._rows import Rows
@@ -51,6 +51,12 @@ class ErrorModel(ABC):
     def starting_at(self, settled: ErrorModel) -> ErrorModel:
         """Return this model for other rows; its choice may start at the settled settings."""
         return self
+
+    def refinement(
+        self, spec: Spec, geometry: GeometryChoice, rows: Rows
+    ) -> Refinement:
+        """Return how the calibrated model is refined before this model learns its residual."""
+        return UNREFINED
 
     @abstractmethod
     def fit(self, rows: Rows, spec: Spec) -> FittedError:
@@ -85,6 +91,8 @@ class FittedError:
         Whether `noise` is that of held-out rows, not of the training rows.
     comparison : CvResults or None
         Of "auto": `HybridForwardModel.cv_results_`.
+    refined : StructuralChain or None
+        The refined mechanical model that the corrections are added to. None: the calibrated one.
     candidates : dict of str to Hybrid, or None
         Of "auto": every candidate, fitted to all rows.
     outside : Predictions or None
@@ -98,6 +106,7 @@ class FittedError:
     rejected: bool = False
     held_out: bool = False
     comparison: CvResults | None = None
+    refined: StructuralChain | None = None
     candidates: dict[str, Hybrid] | None = None
     outside: Predictions | None = None
 
@@ -110,11 +119,31 @@ class FittedError:
         return None if result is None else type(result).__name__
 
 
+class Refinement:
+    """What is learned of a mechanical model before its residual: by default nothing.
+
+    Attributes
+    ----------
+    of_usual_geometry : bool
+        Whether it stands on the largest geometry that suits few rows.
+    """
+
+    of_usual_geometry = False
+
+    def refine(self, mechanical: ForwardModel, rows: Rows) -> ForwardModel:
+        """Return the mechanical model that fits the rows better."""
+        return mechanical
+
+
+UNREFINED = Refinement()
+
+
 class FitStart(NamedTuple):
     """Where the choices of a fit to a part of a log start: those of the fit to the whole log."""
 
     error_model: ErrorModel
     geometry: GeometryChoice | None
+    refinement: Refinement = UNREFINED
 
 
 @dataclass(frozen=True)
@@ -132,6 +161,9 @@ class Spec:
         None  # that of the whole log, where that choice starts
     )
     geometry: GeometryChoice | None = None  # how `calibrate` was chosen
+    refinement: Refinement = (
+        UNREFINED  # of the calibrated model, before its residual is learned
+    )
     calibration: CalibrationResult | None = None  # how `mechanical` was calibrated
     messages: tuple[str, ...] = ()  # warnings of that choice and calibration
     held_out: bool = True  # whether errors of held-out rows are computed
@@ -150,6 +182,7 @@ class Spec:
             self,
             error_model=self.error_model.starting_at(start.error_model),
             near=start.geometry,
+            refinement=start.refinement,
             held_out=False,
         )
 
@@ -176,8 +209,17 @@ class Spec:
                 parameters=None if automatic else self.calibrate,
                 starts=() if self.near is None else self.near.starts,
             )
+        refinement = self.refinement
+        if self.near is None:
+            refinement = self.error_model.refinement(self, geometry, rows)
+        if refinement.of_usual_geometry and geometry.usual is not None:
+            usual = replace(geometry.usual, starts=geometry.starts)
+            geometry = replace(
+                usual, errors=geometry.errors, messages=geometry.messages
+            )
         return replace(
             self,
+            refinement=refinement,
             mechanical=geometry.chain,
             calibrate=geometry.parameters,
             geometry=geometry,
@@ -214,11 +256,19 @@ class Spec:
     def recalibrated(self, rows: Rows) -> Spec:
         """Return the specification calibrated to other rows, without errors of held-out rows."""
         spec = replace(self, held_out=False)
-        if self.geometry is None or self.geometry.start is None:
-            return spec
-        counts = torch.from_numpy(rows.counts)
-        chain = refitted(self.geometry.start, rows.q, self.positions(rows), counts)
-        return replace(spec, mechanical=chain)
+        if self.geometry is not None and self.geometry.start is not None:
+            counts = torch.from_numpy(rows.counts)
+            start = self.geometry.start
+            chain = refitted(start, rows.q, self.positions(rows), counts)
+            spec = replace(spec, mechanical=chain)
+        return spec.refined(rows)
+
+    def refined(self, rows: Rows) -> Spec:
+        """Return the specification with the mechanical model refined by rows."""
+        if self.mechanical is None:
+            return self
+        refined = self.refinement.refine(self.mechanical, rows)
+        return replace(self, mechanical=refined)
 
     def positions(self, rows: Rows) -> Tensor:
         """Return the tip positions (N, 3) of rows, which may be poses [m]."""
@@ -229,10 +279,10 @@ class Spec:
 
     def by_marker(self, rows: Rows) -> list[tuple[Rows, Spec]]:
         """Return the rows and the specification of every marker; a single tip is one marker."""
-        tips = [self.mechanical]
-        if isinstance(self.mechanical, ArcChain):
-            tips = self.mechanical.tips()
-        elif self.mechanical is None and np.isnan(rows.tips).any():
+        tips: list[ForwardModel | None] = [None]
+        if self.mechanical is not None:
+            tips = [*self.mechanical.each_tip()]
+        elif np.isnan(rows.tips).any():
             tips = [None] * (rows.tips.shape[1] // 3)
         if len(tips) == 1:
             return [(rows, self)]

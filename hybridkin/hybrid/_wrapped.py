@@ -266,10 +266,10 @@ class Stacked(Hybrid):
     @property
     def mechanical(self) -> MarkedChain | None:  # pyright: ignore[reportIncompatibleVariableOverride]
         """The chain of all markers, with the geometry of the tip's."""
-        chain = self.tip_model.mechanical
+        chain = self.tip_model.nominal
         if not isinstance(chain, MarkedChain):
             return None
-        chains = cast("list[MarkedChain]", [tip.mechanical for tip in self._tips()])
+        chains = cast("list[MarkedChain]", [tip.nominal for tip in self._tips()])
         return chain._marked([chain.markers[-1] for chain in chains])
 
     def stored(self) -> Stored:

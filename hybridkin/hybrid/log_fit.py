@@ -20,7 +20,7 @@ from hybridkin.hybrid._module import Hybrid
 from hybridkin.hybrid._radius import Radius, conformal_radius
 from hybridkin.hybrid._range import TrainingRange, state_range
 from hybridkin.hybrid._rows import Rows
-from hybridkin.hybrid._spec import FitStart, FittedError, Spec
+from hybridkin.hybrid._spec import UNREFINED, FitStart, FittedError, Refinement, Spec
 from hybridkin.hybrid._worse import worse_than_mechanical
 from hybridkin.hybrid.cv_results import CvResults
 from hybridkin.hybrid.held_out import MEAN_LENGTH
@@ -48,6 +48,8 @@ class HybridFit:
         The attributes of the model.
     geometry : GeometryChoice or None
         How the parameters to calibrate were chosen.
+    refinement : Refinement
+        What was learned of the calibrated model before its residual.
     messages : tuple of str
         Warnings, which were not issued.
     """
@@ -61,6 +63,7 @@ class HybridFit:
     no_drift: Drift
     calibration: CalibrationResult | None = None
     geometry: GeometryChoice | None = None
+    refinement: Refinement = UNREFINED
     play: HysteresisOperator | None = None
     state_range: TrainingRange | None = None
     radius: Radius | None = None
@@ -69,7 +72,7 @@ class HybridFit:
     @property
     def start(self) -> FitStart:
         """Where the choices of fits to parts of the log start."""
-        return FitStart(self.error.settled, self.geometry)
+        return FitStart(self.error.settled, self.geometry, self.refinement)
 
     def expecting(self, distance: float) -> Self:
         """Return the same with the mean error of a comparison, which "auto" expects [m]."""
@@ -131,6 +134,7 @@ def fit_to_log(
         no_drift=Drift.of_range(rows.q, rows.tips.shape[1]),
         calibration=fitted.spec.calibration,
         geometry=chosen.geometry,
+        refinement=chosen.refinement,
         play=play,
         state_range=states,
         radius=radius,

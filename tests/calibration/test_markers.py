@@ -44,10 +44,10 @@ def test_a_missing_marker_counts_as_no_row_of_its_own():
     q, x = log(60)
     kept = np.eye(3, dtype=bool)[np.arange(60) % 3].repeat(3, axis=1)
     few = calibrate(NOMINAL, q, np.where(kept, x, np.nan), ("radii",), prior=1e3)
-    tips, errors = NOMINAL.tips(), []
+    tips, errors = NOMINAL.each_tip(), []
     for k, tip in enumerate(tips):
         rows = np.arange(60) % 3 == k
-        chain = few.chain.tips()[k]
+        chain = few.chain.each_tip()[k]
         found = chain(torch.from_numpy(q[rows])).numpy() - x[rows, 3 * k : 3 * k + 3]
         errors.append((found**2).sum(axis=1))
         assert tip.n_outputs == 3

@@ -119,7 +119,7 @@ def test_markers_keep_the_robot_and_move_its_outputs(kind):
             assert_close(found[name], numbers[name], rtol=0, atol=0, msg=name)
     for twin in (marked, chain.with_tip(2.0)):
         assert_close(twin(q)[:, -3:], chain.poses(q)[:, -1, :3, 3])
-    assert_close(torch.cat([tip(q) for tip in chain.tips()], dim=1), chain(q))
+    assert_close(torch.cat([tip(q) for tip in chain.each_tip()], dim=1), chain(q))
 
 
 @pytest.mark.parametrize("routing", ["segment", "base"])

@@ -76,7 +76,7 @@ def test_all_derivatives_of_several_markers(chain):
 def test_the_compiled_core_has_one_marker(chain, k):
     """Beside the backbone torch computes it."""
     marked, q = chain.with_markers(MARKERS), rows_of(chain)
-    one = marked.tips()[k]
+    one = marked.each_tip()[k]
     x, J = (part[:, 3 * k : 3 * k + 3] for part in marked.forward_and_jacobian(q))
     found, slope = evaluate(one, q.numpy(), jacobian=True)
     assert_close(torch.from_numpy(found), x, rtol=1e-11, atol=1e-13)

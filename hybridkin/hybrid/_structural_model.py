@@ -1,0 +1,135 @@
+"""The errors of a chain's structure as an error model, and below the candidates of "auto"."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from hybridkin._core.model import ForwardModel
+from hybridkin.calibration.choice import GeometryChoice
+from hybridkin.calibration.measured import distance, folds
+from hybridkin.chains.arc_chain import ArcChain
+from hybridkin.chains.structural import without_errors
+from hybridkin.hybrid._error_models import named
+from hybridkin.hybrid._rows import Rows
+from hybridkin.hybrid._spec import (
+    UNREFINED,
+    ErrorModel,
+    FittedError,
+    Refinement,
+    Spec,
+)
+from hybridkin.hybrid._structure import fit_structure
+
+_FACTORS = (1.0, 0.3, 3.0)  # of the prior, to choose from by held-out errors
+_FEW = 60  # rows; with fewer the prior is not changed
+_BETTER = 0.98  # of the held-out error, for another factor than one
+_MOST = 400  # rows by which the refinement is chosen
+_FOLDS = 3
+
+
+class Structure(Refinement):
+    """The errors of a chain's structure below another error model, see `fit_structure`.
+
+    Parameters
+    ----------
+    of_usual_geometry : bool, default=False
+        Whether they stand on the largest geometry that suits few rows.
+    """
+
+    def __init__(self, of_usual_geometry: bool = False) -> None:
+        self.of_usual_geometry = of_usual_geometry
+
+    def refine(self, mechanical: ForwardModel, rows: Rows) -> ForwardModel:
+        """Return the chain with the errors of its structure."""
+        chain = without_errors(mechanical)
+        if not isinstance(chain, ArcChain) or not chain.has_one_arc_per_segment:
+            return mechanical
+        return fit_structure(chain, rows, left_out=False).model
+
+
+class Candidate(NamedTuple):
+    """A geometry to calibrate, and how the calibrated chain is refined."""
+
+    geometry: GeometryChoice
+    refinement: Refinement
+
+
+def best_refinement(spec: Spec, geometry: GeometryChoice, rows: Rows) -> Refinement:
+    """Return the refinement of least error on three folds; none if that has the least.
+
+    The errors of the structure can stand on the chosen geometry, or on base and radii alone: other
+    parameters may have been chosen because they imitate a twist.
+    """
+    chain = geometry.chain
+    if not isinstance(chain, ArcChain) or not chain.has_one_arc_per_segment:
+        return UNREFINED
+    candidates = [Candidate(geometry, Structure())]
+    usual = geometry.usual
+    if usual is not None and usual.name != geometry.name:
+        candidates.append(Candidate(usual, Structure(of_usual_geometry=True)))
+    candidates.append(Candidate(geometry, UNREFINED))
+    rows = rows.thinned(_MOST)
+    groups = rows.groups
+    if groups is not None and len(np.unique(groups)) < 2:
+        groups = None
+    totals = np.zeros(len(candidates))
+    for train, test in folds(rows.X, groups, _FOLDS, shuffle=True):
+        part = replace(rows.take(train), groups=None)
+        held_out = rows.take(test)
+        for k, candidate in enumerate(candidates):
+            fitted = replace(spec, mechanical=candidate.geometry.chain)
+            fitted = replace(fitted, geometry=candidate.geometry)
+            fitted = replace(fitted, refinement=candidate.refinement)
+            model = fitted.recalibrated(part).mechanical
+            assert model is not None
+            with torch.no_grad():
+                predicted = model(held_out.q).numpy()
+            totals[k] += held_out.counts @ distance(predicted, held_out.tips)
+    return candidates[int(np.nanargmin(totals))].refinement
+
+
+@named("structural")
+class StructuralModel(ErrorModel):
+    """The errors of a chain's structure: zeros, rings, twist and sag under its load.
+
+    Parameters
+    ----------
+    factor : float, optional
+        Common factor of the prior. Default: 1 below 60 rows, else chosen by held-out errors.
+    """
+
+    couplings = ("serial",)
+
+    def __init__(self, factor: float | None = None) -> None:
+        self.factors = _FACTORS if factor is None else (factor,)
+
+    def fit(self, rows: Rows, spec: Spec) -> FittedError:
+        """Return the chain with the errors of its structure; there are no corrections of it."""
+        chain = spec.mechanical
+        if not isinstance(chain, ArcChain) or not chain.has_one_arc_per_segment:
+            raise TypeError(
+                "`mechanical_model` must be a chain of arcs, one for each segment, with "
+                f"error_model='structural', got {type(chain).__name__}; use "
+                "error_model='quadratic'."
+            )
+        fits = [fit_structure(chain, rows, self.factors[0], spec.held_out)]
+        if len(self.factors) > 1 and len(rows) >= _FEW:
+            for factor in self.factors[1:]:
+                fits.append(fit_structure(chain, rows, factor))
+        best = fits[0]
+        for fit in fits[1:]:
+            if fit.rmse < _BETTER * best.rmse:
+                best = fit
+        n_tips = rows.tips.shape[1] // 3
+        return FittedError(
+            best,
+            n_tips * [[]],
+            StructuralModel(best.factor),
+            best.rmse / 3**0.5,
+            held_out=True,
+            refined=best.model,
+        )

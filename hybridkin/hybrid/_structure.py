@@ -1,0 +1,325 @@
+"""The errors of a chain's structure from few rows, by a prior in natural units."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from hybridkin._core.arrays import identity
+from hybridkin._core.rotations import cross_matrix, rotation
+from hybridkin.calibration.measured import points
+from hybridkin.calibration.natural_scales import STRUCTURE
+from hybridkin.chains.arc_chain import ArcChain
+from hybridkin.chains.structural import Loads, StructuralChain, Weights, change_of
+from hybridkin.hybrid._linearised import members_of
+from hybridkin.hybrid._readout_fit import tips_of
+from hybridkin.hybrid._rows import Rows
+
+# Noise of a tip coordinate [reaches of the robot], and of an actuator [its spread in the log].
+_TIP_NOISE = 0.004
+_ACTUATOR_NOISE = 0.02
+_MOVES = 1e-9  # spread of a length over the reach of the robot, above which it varies
+_ROUNDS = 30  # of Gauss-Newton; five are usual
+_SHORTEST = 1e-3  # part of a step below which the cost is at its minimum
+_SETTLED = 1e-7  # largest change of a parameter, in units of its prior
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """The free errors of a structure as directions of its weights, in units of their prior.
+
+    Attributes
+    ----------
+    names : tuple of str
+        The block of every direction.
+    directions : Tensor of shape (P, 18 S)
+        Weights zeros, maps, twists and sags, one after the other, of one prior standard deviation.
+    """
+
+    names: tuple[str, ...]
+    directions: Tensor
+
+    @classmethod
+    def of(cls, varies: Tensor, scales: Mapping[str, float] = STRUCTURE) -> Blocks:
+        """Return the blocks of S segments; `varies` (S,) says whose lengths vary, bool."""
+        S = len(varies)
+        names: list[str] = []
+        directions: list[Tensor] = []
+
+        def add(name: str, **entries: Tensor) -> None:
+            weights = _nothing(S)._replace(**entries)
+            names.append(name)
+            directions.append(torch.cat([entry.flatten() for entry in weights]))
+
+        segments = identity(S, _nothing(S).zeros)
+        kinds = identity(3, segments)
+        along, across = torch.zeros(2, 3, 3, dtype=segments.dtype, device="cpu")
+        along[1, 1] = along[2, 2] = 1.0
+        across[1, 2] = -1.0
+        across[2, 1] = 1.0
+        for k, segment in enumerate(segments):
+            own = kinds[0 if varies[k] else 1 :]
+            for kind in own:
+                name = "zero bends" if kind[0] == 0.0 else "zero lengths"
+                add(name, zeros=scales[name] * torch.outer(segment, kind))
+            for name, ring in (("ring stretch", along), ("ring turn", across)):
+                add(name, maps=scales[name] * torch.einsum("k,ij->kij", segment, ring))
+            for out in own:
+                for of in own:
+                    entry = torch.einsum("k,i,j->kij", segment, out, of)
+                    add("ring maps", maps=scales["ring maps"] * entry)
+        every = torch.ones_like(segments[0])
+        for axis in kinds:
+            twists = scales["gravity"] * torch.outer(every, axis)
+            add("gravity", twists=twists, sags=scales["sag of a twist"] * twists)
+            for segment in segments:
+                load = torch.outer(segment, axis)
+                add("twists", twists=scales["twists"] * load)
+                add("sags", sags=scales["sags"] * load)
+        used = [k for k, name in enumerate(names) if scales[name] > 0.0]
+        return cls(
+            tuple(names[k] for k in used), torch.stack([directions[k] for k in used])
+        )
+
+    def weights(self, parameters: Tensor) -> Weights:
+        """Return the weights of parameters (P,) in units of their prior."""
+        return _weights(parameters @ self.directions)
+
+
+def _nothing(S: int) -> Weights:
+    return _weights(torch.zeros(18 * S, dtype=torch.float64, device="cpu"))
+
+
+def _weights(flat: Tensor) -> Weights:
+    """Return the weights from one tensor (..., 18 S)."""
+    S = flat.shape[-1] // 18
+    zeros, maps, twists, sags = flat.split([3 * S, 9 * S, 3 * S, 3 * S], dim=-1)
+    return Weights(
+        zeros.unflatten(-1, (S, 3)),
+        maps.unflatten(-1, (S, 3, 3)),
+        twists.unflatten(-1, (S, 3)),
+        sags.unflatten(-1, (S, 3)),
+    )
+
+
+class StructureFit(NamedTuple):
+    """A fitted structure, its posterior, and the residuals of held-out rows."""
+
+    model: StructuralChain
+    blocks: tuple[str, ...]  # block of every parameter; the base comes first
+    parameters: NDArray  # (P,), in units of their prior standard deviation
+    covariance: NDArray  # (P, P) of the posterior, in these units
+    factor: float  # common factor of the prior
+    residual: NDArray  # (N, m) [m], of every row from a fit without it, or its group
+    rmse: float  # weighted root mean square length of `residual` [m]
+
+
+class _Problem:
+    """The rows of a fit; theta are the base (6) and the blocks, in units of the prior."""
+
+    def __init__(
+        self, chain: ArcChain, rows: Rows, factor: float, scales: Mapping[str, float]
+    ) -> None:
+        self.chain = chain
+        q = rows.q
+        x = torch.from_numpy(rows.tips.astype(np.float64))
+        self.seen = ~x.isnan()
+        self.x = torch.where(self.seen, x, 0.0)
+        self.root = torch.from_numpy(rows.counts.astype(np.float64)).sqrt()
+        frames = chain.frames_and_moves(q)
+        S = chain.n_segments
+        lengths = frames.arcs[:S]
+        self.reach = chain.reach.to(q)
+        self.lengths = lengths.mean(1)
+        varies = lengths.std(1, correction=0) > _MOVES * self.reach
+        self.blocks = Blocks.of(varies, scales)
+        self.base = factor * torch.tensor(
+            [*3 * [scales["base turn"]], *3 * [scales["base move"] * self.reach]]
+        ).to(q)
+        self.factor = factor
+        loads = Loads.of(frames, self.lengths)
+        fields = torch.func.vmap(
+            lambda weights: change_of(loads, frames.arcs, self.lengths, weights)
+        )(_weights(factor * self.blocks.directions))
+        single = len(chain.markers) == 1
+        arcs = frames.arcs
+        fields = fields.transpose(0, 1)  # (3 S, P, N)
+        if single:
+            arcs = chain.up_to_tip(arcs)
+            fields = chain.up_to_tip(fields)
+        self.z = arcs.mT
+        self.fields = fields.permute(2, 0, 1).contiguous()
+        self.tips = tips_of(chain)
+        self.spread = _ACTUATOR_NOISE * q.std(0, correction=0)
+        self.pivot = chain.base[:3, 3].to(q)
+        J = chain.forward_and_jacobian(q)[1] * self.seen[..., None] * self.spread
+        noise = (_TIP_NOISE * self.reach) ** 2 * identity(x.shape[1], q)
+        # A noise of the rows (N, m, m), and what makes it one per row.
+        self.noise = torch.linalg.cholesky(noise + J @ J.mT)
+
+    @property
+    def n_parameters(self) -> int:
+        return 6 + len(self.blocks.names)
+
+    def motion(self, theta: Tensor) -> Tensor:
+        """Return the motion (4, 4) of the base."""
+        turn, move = (self.base * theta[:6]).split(3)
+        motion = identity(4, theta)
+        motion[:3, :3] = rotation(turn)[0]
+        motion[:3, 3] = self.pivot - motion[:3, :3] @ self.pivot + move
+        return motion
+
+    def model(self, theta: Tensor) -> StructuralChain:
+        """Return the chain with these errors."""
+        weights = self.blocks.weights(self.factor * theta[6:])
+        return StructuralChain(self.chain, self.lengths, *weights, self.motion(theta))
+
+    def residual(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return whitened residuals (N, m), tips (N, K, 3), their slopes (N, K, 3, C) by arcs."""
+        x, J = self.tips(self.z + self.fields @ theta[6:])
+        motion = self.motion(theta)
+        tips = x.unflatten(1, (-1, 3)) @ motion[:3, :3].mT + motion[:3, 3]
+        slope = motion[:3, :3] @ J.unflatten(1, (-1, 3))
+        rest = torch.where(self.seen, self.x - tips.flatten(1), 0.0)
+        return self.white(rest[..., None])[..., 0], tips, slope
+
+    def design(self, theta: Tensor, tips: Tensor, slope: Tensor) -> Tensor:
+        """Return the whitened derivative (N, m, P) of the tips by theta."""
+        turn = self.base[:3] * theta[:3]
+        spins = rotation(turn)[1] * self.base[:3]
+        arm = tips - self.pivot - self.base[3:] * theta[3:6]
+        turned = -cross_matrix(arm) @ spins
+        moved = torch.diag(self.base[3:]).expand_as(turned)
+        by_blocks = slope.flatten(1, 2) @ self.fields
+        by_base = torch.cat([turned, moved], dim=3).flatten(1, 2)
+        A = torch.cat([by_base, by_blocks], dim=2)
+        return self.white(torch.where(self.seen[..., None], A, 0.0))
+
+    def white(self, values: Tensor) -> Tensor:
+        """Return values (N, m, C) in units of the noise of their rows, times the row weights."""
+        white = torch.linalg.solve_triangular(self.noise, values, upper=False)
+        return self.root[:, None, None] * white
+
+    def in_metres(self, white: Tensor) -> Tensor:
+        """Return residuals (N, m) [m] from whitened ones."""
+        return (self.noise @ white[..., None])[..., 0] / self.root[:, None]
+
+    def minimum(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Return theta of the least cost, and the whitened residuals and design there."""
+        theta = self.x.new_zeros(self.n_parameters)
+        rest, *at = self.residual(theta)
+        for _ in range(_ROUNDS):
+            A = self.design(theta, *at).flatten(0, 1)
+            system = A.mT @ A + identity(len(theta), A)
+            slope = A.mT @ rest.flatten() - theta
+            step = torch.cholesky_solve(slope[:, None], torch.linalg.cholesky(system))[
+                :, 0
+            ]
+            cost = _cost(rest, theta)
+            part = 1.0
+            while part > _SHORTEST:  # a full step may overshoot
+                tried = theta + part * step
+                new, *new_at = self.residual(tried)
+                if _cost(new, tried) < cost:
+                    theta, rest, at = tried, new, new_at
+                    break
+                part *= 0.5
+            if part <= _SHORTEST or float((part * step).abs().max()) < _SETTLED:
+                break
+        return theta, rest, self.design(theta, *at)
+
+
+def _cost(rest: Tensor, theta: Tensor) -> float:
+    return float(rest.square().sum() + theta.square().sum())
+
+
+def fit_structure(
+    chain: ArcChain,
+    rows: Rows,
+    factor: float = 1.0,
+    left_out: bool = True,
+    scales: Mapping[str, float] = STRUCTURE,
+) -> StructureFit:
+    """Return the most probable errors of a chain's structure, given rows.
+
+    The errors have independent normal priors about zero, whose standard deviations are in
+    `natural_scales`. A row has the noise of its tip, and the noise of the actuators times dx/dq.
+
+    Parameters
+    ----------
+    chain : ArcChain
+        The calibrated chain.
+    rows : Rows
+        Different rows; tips are NaN for missing markers, whose residual is zero.
+    factor : float, default=1.0
+        Common factor of all standard deviations of the prior.
+    left_out : bool, default=True
+        Whether residuals of held-out rows, or groups, are computed; else they are NaN. They are
+        exact for the linearised problem.
+    scales : mapping of str to float
+        Standard deviations by block; a block of 0 is left out.
+
+    Returns
+    -------
+    StructureFit
+        The chain with its errors.
+
+    References
+    ----------
+    MacKay, Bayesian interpolation, Neural Computation 4 (1992), for the posterior; Hastie,
+    Tibshirani & Friedman, The Elements of Statistical Learning (2009), section 7.10, for held-out
+    residuals of linear fits.
+    """
+    with torch.no_grad():
+        problem = _Problem(chain, rows, factor, scales)
+        theta, rest, A = problem.minimum()
+        system = torch.einsum("nmp,nmq->pq", A, A) + identity(len(theta), A)
+        covariance = torch.cholesky_inverse(torch.linalg.cholesky(system))
+        residual = torch.full_like(rest, torch.nan)
+        if left_out:
+            residual = problem.in_metres(
+                _left_out(A, rest, theta, covariance, system, rows.groups)
+            )
+        model = problem.model(theta)
+    weights = rows.counts * points(problem.seen.numpy())[..., 0].sum(1)
+    squares = residual.square().sum(1).numpy()
+    return StructureFit(
+        model,
+        (*6 * ("base",), *problem.blocks.names),
+        theta.numpy(),
+        covariance.numpy(),
+        factor,
+        rows.as_given(residual.numpy()),
+        float(np.sqrt((rows.counts * squares).sum() / weights.sum())),
+    )
+
+
+def _left_out(
+    A: Tensor,
+    rest: Tensor,
+    theta: Tensor,
+    covariance: Tensor,
+    system: Tensor,
+    groups: NDArray | None,
+) -> Tensor:
+    """Return the residuals (N, m) of every row from a linearised fit without it, or its group."""
+    if groups is None:
+        leverage = A @ covariance @ A.mT
+        unexplained = identity(leverage.shape[1], leverage) - leverage
+        return torch.linalg.solve(unexplained, rest)
+    targets = rest + A @ theta
+    moment = torch.einsum("nmp,nm->p", A, targets)
+    left = torch.empty_like(rest)
+    for members in members_of(groups):
+        own = A[members].flatten(0, 1)
+        without = torch.linalg.cholesky(system - own.mT @ own)
+        right = moment - own.mT @ targets[members].flatten()
+        theta_without = torch.cholesky_solve(right[:, None], without)[:, 0]
+        left[members] = targets[members] - A[members] @ theta_without
+    return left
