@@ -124,11 +124,11 @@ class Refinement:
 
     Attributes
     ----------
-    of_usual_geometry : bool
-        Whether it stands on the largest geometry that suits few rows.
+    geometry : str
+        Name of the calibrated parameters that it is made for. Empty: the chosen ones.
     """
 
-    of_usual_geometry = False
+    geometry = ""
 
     def refine(self, mechanical: ForwardModel, rows: Rows) -> ForwardModel:
         """Return the mechanical model that fits the rows better."""
@@ -212,11 +212,7 @@ class Spec:
         refinement = self.refinement
         if self.near is None:
             refinement = self.error_model.refinement(self, geometry, rows)
-        if refinement.of_usual_geometry and geometry.usual is not None:
-            usual = replace(geometry.usual, starts=geometry.starts)
-            geometry = replace(
-                usual, errors=geometry.errors, messages=geometry.messages
-            )
+        geometry = geometry.smaller(refinement.geometry)
         return replace(
             self,
             refinement=refinement,

@@ -36,12 +36,12 @@ class Structure(Refinement):
 
     Parameters
     ----------
-    of_usual_geometry : bool, default=False
-        Whether they stand on the largest geometry that suits few rows.
+    geometry : str, default=""
+        Name of the calibrated parameters that they stand on. Empty: the chosen ones.
     """
 
-    def __init__(self, of_usual_geometry: bool = False) -> None:
-        self.of_usual_geometry = of_usual_geometry
+    def __init__(self, geometry: str = "") -> None:
+        self.geometry = geometry
 
     def refine(self, mechanical: ForwardModel, rows: Rows) -> ForwardModel:
         """Return the chain with the errors of its structure."""
@@ -61,16 +61,16 @@ class Candidate(NamedTuple):
 def best_refinement(spec: Spec, geometry: GeometryChoice, rows: Rows) -> Refinement:
     """Return the refinement of least error on three folds; none if that has the least.
 
-    The errors of the structure can stand on the chosen geometry, or on base and radii alone: other
-    parameters may have been chosen because they imitate a twist.
+    The errors of the structure can stand on the chosen geometry, or on the smaller ones that suit
+    few rows: other parameters may have been chosen because they imitate a twist.
     """
     chain = geometry.chain
     if not isinstance(chain, ArcChain) or not chain.has_one_arc_per_segment:
         return UNREFINED
     candidates = [Candidate(geometry, Structure())]
-    usual = geometry.usual
-    if usual is not None and usual.name != geometry.name:
-        candidates.append(Candidate(usual, Structure(of_usual_geometry=True)))
+    for usual in geometry.usual[::-1]:
+        if usual.name != geometry.name:
+            candidates.append(Candidate(usual, Structure(usual.name)))
     candidates.append(Candidate(geometry, UNREFINED))
     rows = rows.thinned(_MOST)
     groups = rows.groups
