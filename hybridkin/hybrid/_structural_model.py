@@ -68,7 +68,7 @@ def best_refinement(spec: Spec, geometry: GeometryChoice, rows: Rows) -> Refinem
     if not isinstance(chain, ArcChain) or not chain.has_one_arc_per_segment:
         return UNREFINED
     candidates = [Candidate(geometry, Structure())]
-    for usual in geometry.usual[::-1]:
+    for usual in geometry.usual[-1:]:
         if usual.name != geometry.name:
             candidates.append(Candidate(usual, Structure(usual.name)))
     candidates.append(Candidate(geometry, UNREFINED))
