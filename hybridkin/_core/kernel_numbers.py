@@ -7,11 +7,12 @@ hybridkin.
 from pathlib import Path
 from zlib import crc32
 
-# Kinds of the nodes of a plan, numbered from 1; the first three are the chains.
+# Kinds of the nodes of a plan, numbered from 1; the first four are the chains.
 KINDS = (
     "arcs",
     "elastic",
     "rigid",
+    "structural",
     "affine",
     "elm",
     "polynomial",

@@ -21,7 +21,7 @@ from hybridkin._core.kernel_numbers import (
 )
 from hybridkin._core.stored import KINDS_OF_MODELS, Stored
 
-CHAINS = KINDS[:3]
+CHAINS = KINDS[:4]
 # Largest sizes that the kernels support, in the order in which a plan begins.
 MOST = {
     "actuators": HK_MAX_N,

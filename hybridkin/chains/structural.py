@@ -1,17 +1,26 @@
-"""A chain of arcs with errors of its structure: zeros, maps of its rings, twist and sag by loads."""
+"""A chain of arcs with errors of its structure: zeros, maps of its rings, twist and sag."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from hybridkin._core.arrays import identity
 from hybridkin._core.blocks import in_blocks
 from hybridkin._core.model import ForwardModel
-from hybridkin._core.stored import Layout
-from hybridkin.chains.arc_chain import ArcChain, Frames
+from hybridkin._core.plan import Plan
+from hybridkin._core.stored import Layout, Stored
+from hybridkin.chains.arc_chain import (
+    ArcChain,
+    Frames,
+    each_marker,
+    frame_numbers,
+    write_whole_chain,
+)
 
 _BLOCK = 2048  # rows, whose temporaries stay in the cache
 
@@ -80,6 +89,35 @@ def change_of(loads: Loads, arcs: Tensor, lengths: Tensor, weights: Weights) -> 
     return torch.cat([lengths[:, None] * strain, by_x, by_y])
 
 
+def _write_plan(plan: Plan, stored: Stored) -> int:
+    """Write the node of a chain: its frame, moved by T, then numbers of its segments."""
+    chain = stored.part("chain")
+    tips = each_marker(chain)
+    if len(tips) > 1:
+        return plan.stack([replace(stored, parts={"chain": tip}) for tip in tips])
+    base = stored.array("motion") @ chain.array("base")
+    moved = replace(chain, arrays={**chain.arrays, "base": base})
+    lengths = stored.array("lengths")
+    reach = lengths.sum()
+    frame, parts = frame_numbers(plan, moved, reach)
+    robot = write_whole_chain(plan, chain)
+
+    n_segments = len(lengths)
+    has_length = lengths > 0.0
+    by_length = has_length / np.where(has_length, lengths, 1.0)
+    changes = np.dstack([stored.array("zeros"), stored.array("maps")])
+    changes[:, 0] *= lengths[:, None]
+    # Loads are means over the two ends of a segment; torques are relative to the robot's length.
+    twists = 0.5 / reach * stored.array("twists")
+    sags = 0.5 * stored.array("sags")
+    up_to_tip = np.append(parts, np.zeros(n_segments - len(parts)))
+    segments = [by_length, has_length, chain.array("offsets"), changes[:, :, 0]]
+    segments += [changes[:, :, 1:].reshape(n_segments, 9), twists, sags, up_to_tip]
+    numbers = [frame, np.column_stack(segments)]
+    n, _ = plan.lengths(robot)
+    return plan.node("structural", n, 3, numbers, len(parts), robot, n_segments)
+
+
 class StructuralChain(ForwardModel):
     """A chain of arcs with errors of its structure, x = T F(z + delta(z)).
 
@@ -91,12 +129,13 @@ class StructuralChain(ForwardModel):
         Phi_k     = phi_1 + ... + phi_(k-1) + phi_k / 2,   phi_k = (1 + e_k) twists_k . tau_k
         s_k       = (1 + 2 e_k) (x_k . sags_k, y_k . sags_k)
 
-    A load at the robot's end, such as its own weight, twists every segment by its torque tau_k about
-    the segment's axis. The twist turns the bending of all later segments, and half of it that of the
-    segment itself. The same load moves the end of a segment sideways, along its axes x_k and y_k,
-    without turning it: the segment bends, and the next one bends back. tau_k, x_k and y_k are means
-    over the two ends of the segment, see `Loads`. The three entries of `twists` and `sags` belong to
-    loads along the axes of the base, so the direction of gravity is learned. T moves the base.
+    A load at the robot's end, such as its own weight, twists every segment by its torque tau_k
+    about the segment's axis. The twist turns the bending of all later segments, and half of it that
+    of the segment itself. The same load moves the end of a segment sideways, along its axes x_k and
+    y_k, without turning it: the segment bends, and the next one bends back. tau_k, x_k and y_k are
+    means over the two ends of the segment, see `Loads`. The three entries of `twists` and `sags`
+    belong to loads along the axes of the base, so the direction of gravity is learned. T moves the
+    base.
 
     Parameters
     ----------
@@ -121,6 +160,7 @@ class StructuralChain(ForwardModel):
             "motion": "rr",
         },
         parts=("chain",),
+        write_plan=_write_plan,
     )
 
     def __init__(

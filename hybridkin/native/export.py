@@ -73,6 +73,7 @@ _OPERATIONS = {
     "elastic": lambda a, n, m, S: (
         (8 + 2 ** min(n, 12)) * (200 * S + 40 * n) + 25 * (S + 14) * S
     ),
+    "structural": lambda a, n, m, S: 8 * a + 600 * S + 25 * S * S,
     "rigid": lambda a, n, m, S: 10 * (a - 9) + 15 * n,  # the tip does not turn
     "hybrid": lambda a, n, m, S: (
         a * (25 * (S + 12) * S + 18 * S * n + 10 * m * (n + 2))
@@ -382,6 +383,8 @@ def _check_stack(plan: Plan, dtype: str) -> None:
     n, segments, m, features, powers, rows = plan.code[:6].tolist()
     numbers = 2 * (features + powers)
     numbers += max(n, 3 * segments, m) * (n + 41) + 200 * segments + 30
+    if "structural" in map(plan.kind, plan.places):
+        numbers += 2 * (103 * segments + 51)
     if rows:
         numbers += 8 * (rows + 1) * (n + 12)
         numbers += 2 * n * plan.entry(plan.root, IK_STATE_ROWS)

@@ -12,15 +12,24 @@ static inline int HK(n_coordinates)(const hk_plan *p, int at) {
     return (HK_CHAIN_IS(p, at, HK_RIGID) ? 1 : 3) * p->code[at + HK_MORE];
 }
 
+/* The place of a chain without errors of its structure: of one with them, that of its whole robot. */
+static inline int HK(robot)(const hk_plan *p, int at) {
+    return HK_CHAIN_IS(p, at, HK_STRUCTURAL) ? p->code[at + HK_MORE + 1] : at;
+}
+
 /* Memory for what `pull` needs. */
 static inline HK(inside) HK(inside_of)(const hk_plan *p, int at, V **work) {
-    HK(inside) in = {NULL, NULL};
-    if (HK_CHAIN_IS(p, at, HK_ELASTIC)) {
-        in.inverse = HK(take)(work, 6 * p->code[at + HK_MORE + 1]);
-        in.taut = HK(take)(work, p->code[at + HK_N]);
+    const int robot = HK(robot)(p, at);
+    HK(inside) in = {0};
+    if (HK_CHAIN_IS(p, robot, HK_ELASTIC)) {
+        in.inverse = HK(take)(work, 6 * p->code[robot + HK_MORE + 1]);
+        in.taut = HK(take)(work, p->code[robot + HK_N]);
     }
+    if (robot != at) in.loads = HK(loaded_of)(HK(structure_of)(p, at).S, work);
     return in;
 }
+
+#define HK_INSIDE_WORK(n, S) (HK_ELASTIC_WORK(n, S) + HK_LOADED_WORK(S))
 
 /* How far the n actuators of a rigid arm move its joints (joints, n), NULL where they are them. */
 static inline const real *HK(couplings)(const hk_plan *p, int at) {
@@ -28,9 +37,9 @@ static inline const real *HK(couplings)(const hk_plan *p, int at) {
     return more[1] ? hk_numbers(p, at) + 12 * more[0] + 12 : NULL;
 }
 
-/* The inner coordinates z of q, and what `pull` needs. */
-static inline void HK(coordinates)(const hk_plan *p, int at, const V *q, V *z,
-                                   const HK(inside) * in) {
+/* The inner coordinates z of q, and what `pull` needs, without errors of the structure. */
+static inline void HK(robot_coordinates)(const hk_plan *p, int at, const V *q, V *z,
+                                         const HK(inside) * in) {
     (void)in;
     if (HK_CHAIN_IS(p, at, HK_RIGID)) {
         const int n = p->code[at + HK_N];
@@ -58,6 +67,20 @@ static inline void HK(coordinates)(const hk_plan *p, int at, const V *q, V *z,
     }
 }
 
+/* The inner coordinates z of q, and what `pull` needs. */
+static inline void HK(coordinates)(const hk_plan *p, int at, const V *q, V *z,
+                                   const HK(inside) * in) {
+    const int robot = HK(robot)(p, at);
+    HK(robot_coordinates)(p, robot, q, robot == at ? z : in->loads.arcs, in);
+    if (robot == at) return;
+    HK(structure) s = HK(structure_of)(p, at);
+    if (HK_COMMON(s.S == 3 && s.tip == 3)) {
+        s.S = s.tip = 3;
+        HK(change_arcs)(s, &in->loads, z);
+    } else
+        HK(change_arcs)(s, &in->loads, z);
+}
+
 /* The tip x (3) of inner coordinates z, and its derivative C (3, k) where not NULL. */
 static inline void HK(from_coordinates)(const hk_plan *p, int at, const V *z, V *x, V *C, V *work) {
     const int32_t *more = p->code + at + HK_MORE;
@@ -68,9 +91,9 @@ static inline void HK(from_coordinates)(const hk_plan *p, int at, const V *z, V 
         HK(arcs_tip)(more[0], hk_numbers(p, at), z, x, C);
 }
 
-/* J (rows, n) += C dz/dq, for C (rows, k). */
-HK_INLINE void HK(pull_rows)(const hk_plan *p, int at, const HK(inside) * in, int rows, const V *C,
-                             V *J) {
+/* J (rows, n) += C dz/dq, for C (rows, k), without errors of the structure. */
+HK_INLINE void HK(pull_robot)(const hk_plan *p, int at, const HK(inside) * in, int rows, const V *C,
+                              V *J) {
     const int n = p->code[at + HK_N];
     (void)in, (void)n;
     if (HK_CHAIN_IS(p, at, HK_RIGID)) {
@@ -97,6 +120,22 @@ HK_INLINE void HK(pull_rows)(const hk_plan *p, int at, const HK(inside) * in, in
         else
             HK(pull_arcs)(a, rows, n, C, J);
     }
+}
+
+/* J (rows, n) += C dz/dq, for C (rows, k) of at most 6 rows. */
+HK_INLINE void HK(pull_rows)(const hk_plan *p, int at, const HK(inside) * in, int rows, const V *C,
+                             V *J) {
+    const int robot = HK(robot)(p, at);
+    if (robot != at) {
+        HK(structure) s = HK(structure_of)(p, at);
+        if (HK_COMMON(s.S == 3 && s.tip == 3)) {
+            s.S = s.tip = 3;
+            HK(pull_change)(s, &in->loads, rows, C);
+        } else
+            HK(pull_change)(s, &in->loads, rows, C);
+        C = in->loads.by_arcs;
+    }
+    HK(pull_robot)(p, robot, in, rows, C, J);
 }
 
 /* J (3, n) += C dz/dq, for C (3, k). */

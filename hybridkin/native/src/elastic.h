@@ -8,11 +8,12 @@
 
 /* What `pull` needs to know of a row besides z. */
 typedef struct {
-    V *inverse; /* of the reduced D_k (S, 6) */
-    V *taut;    /* (n), 1 or 0 */
+    V *inverse;       /* of the reduced D_k (S, 6) */
+    V *taut;          /* (n), 1 or 0 */
+    HK(loaded) loads; /* of a chain with errors of its structure */
 } HK(inside);
 
-#define HK_INSIDE_WORK(n, S) (HK_USES(HK_ELASTIC) * (6 * (S) + (n)))
+#define HK_ELASTIC_WORK(n, S) (HK_USES(HK_ELASTIC) * (6 * (S) + (n)))
 
 /* Sizes and numbers of a node. Of a segment these are its stiffnesses (3), its E (3), the arc at
    rest up to the tip (3), and the shares of t_k and of t_{k-1} in what is up to the tip; of a

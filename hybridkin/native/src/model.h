@@ -3,6 +3,8 @@
 
 #include "linear.h"
 #include "arcs.h"
+#include "frames.h"
+#include "structural.h"
 #include "elastic.h"
 #include "rigid.h"
 #include "chains.h"
@@ -64,7 +66,8 @@ static inline void HK(single)(const hk_plan *p, int at, const V *q, V *x, V *J, 
     if (distance) *distance = SPLAT(0.0);
     if (HK_IS(p, at, HK_HYBRID))
         HK(hybrid)(p, at, q, x, J, distance, work);
-    else if (HK_IS(p, at, HK_ARCS) || HK_IS(p, at, HK_ELASTIC) || HK_IS(p, at, HK_RIGID))
+    else if (HK_IS(p, at, HK_ARCS) || HK_IS(p, at, HK_ELASTIC) || HK_IS(p, at, HK_RIGID) ||
+             HK_IS(p, at, HK_STRUCTURAL))
         HK(chain)(p, at, q, x, J, work);
     else if (HK_IS(p, at, HK_WITH_POSE)) {
         V *e = HK(take)(&work, 6), *slope = HK(take)(&work, 6 * n);

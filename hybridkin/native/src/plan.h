@@ -27,7 +27,7 @@ typedef int64_t hk_bits;
    hysteresis (HK_HYSTERESIS). */
 #ifdef HK_KINDS
 #define HK_USES(kind) ((HK_KINDS >> (kind)) % 2u)
-#define HK_IS_ONLY_CHAIN(kind) ((HK_KINDS & 14u) == 1u << (kind)) /* of the first three kinds */
+#define HK_IS_ONLY_CHAIN(kind) ((HK_KINDS & 30u) == 1u << (kind)) /* of the first four kinds */
 #define HK_COMMON(sizes) 0
 #define HK_INLINE static inline
 #define HK_NOINLINE
