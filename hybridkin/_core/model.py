@@ -212,6 +212,11 @@ class ForwardModel(PortableModule):
         return self
 
     @property
+    def without_errors(self) -> ForwardModel:
+        """The model without errors of its structure; the model itself if it knows none."""
+        return self
+
+    @property
     def tip_model(self) -> ForwardModel:
         """The model of the tip alone: the last one of several markers, else the model itself."""
         return self

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -10,10 +11,10 @@ import torch
 from torch import Tensor
 
 from hybridkin._core.arrays import identity
-from hybridkin._core.blocks import in_blocks
 from hybridkin._core.model import ForwardModel
 from hybridkin._core.plan import Plan
-from hybridkin._core.stored import Layout, Stored
+from hybridkin._core.stored import Layout, Restore, Stored
+from hybridkin.chains._checks import pose
 from hybridkin.chains.arc_chain import (
     ArcChain,
     Frames,
@@ -21,6 +22,7 @@ from hybridkin.chains.arc_chain import (
     frame_numbers,
     write_whole_chain,
 )
+from hybridkin.chains.markers import Marker
 
 _BLOCK = 2048  # rows, whose temporaries stay in the cache
 
@@ -67,11 +69,13 @@ class Loads(NamedTuple):
     @classmethod
     def of(cls, frames: Frames, lengths: Tensor) -> Loads:
         """Return the loads at rows; `lengths` (S,) are the mean lengths of the segments [m]."""
-        torques, sideways = _at_ends(frames, lengths.sum())
+        length, _, _ = frames.arcs.unflatten(0, (3, -1))
+        has_length = (lengths > 0.0).to(lengths)[:, None]
+        at_ends = _Ends.of(frames, lengths)
         return cls(
-            _strain(frames.arcs, lengths),
-            _between(torques).transpose(0, 1),
-            _between(sideways).permute(0, 2, 1, 3),
+            _per_length(lengths)[:, None] * length - has_length,
+            _between_ends(at_ends.torques, 1).transpose(0, 1),
+            _between_ends(at_ends.axes[:2], 2).transpose(1, 2),
         )
 
 
@@ -81,12 +85,17 @@ def change_of(loads: Loads, arcs: Tensor, lengths: Tensor, weights: Weights) -> 
     own = torch.stack([loads.strain, x, y])
     linear = torch.einsum("kij,jkn->ikn", weights.maps, own)
     strain, by_x, by_y = weights.zeros.mT[..., None] + linear
-    angle = _turned((1.0 + loads.strain) * _along(weights.twists, loads.torques))
+    twist = (1.0 + loads.strain) * _along(weights.twists, loads.torques)
+    angle = _turned(twist)
     sag = (1.0 + 2.0 * loads.strain) * _along(weights.sags, loads.sideways)
-    sag_x, sag_y = _taken_back(sag, 1)
-    by_x = by_x - angle * y + sag_x
-    by_y = by_y + angle * x + sag_y
-    return torch.cat([lengths[:, None] * strain, by_x, by_y])
+    sag_x, sag_y = _taken_back(sag)
+    return torch.cat(
+        [
+            lengths[:, None] * strain,
+            by_x - angle * y + sag_x,
+            by_y + angle * x + sag_y,
+        ]
+    )
 
 
 def _write_plan(plan: Plan, stored: Stored) -> int:
@@ -189,34 +198,47 @@ class StructuralChain(ForwardModel):
         """The chain without these errors."""
         return self.chain
 
+    @property
+    def without_errors(self) -> ArcChain:
+        """The chain without these errors."""
+        return self.chain
+
+    @property
+    def markers(self) -> tuple[Marker, ...]:
+        """Places and offsets of the outputs, as in the chain."""
+        return self.chain.markers
+
+    @property
+    def tip_model(self) -> StructuralChain:
+        """The model of the last marker alone."""
+        return self.each_tip()[-1]
+
     def each_tip(self) -> list[StructuralChain]:
         """Return one model per marker, each mapping q (..., n) to x (..., 3)."""
-        weights = self.lengths, *self._weights(self.lengths)
-        return [
-            StructuralChain(tip, *weights, self.motion) for tip in self.chain.each_tip()
-        ]
+        return [self._around(tip) for tip in self.chain.each_tip()]
 
     def forward(self, q: Tensor) -> Tensor:
         """Return the tip (..., 3), or all markers (..., 3 K) [m]."""
-        return in_blocks(
-            lambda rows: (self.from_coordinates(self._arcs(rows)),), q, _BLOCK
-        )[0]
+        (x,) = self.chain._by_rows(self._x_of_rows, q, _BLOCK)
+        return x
 
     def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return the tip (..., 3) [m] and its Jacobian (..., 3, n) in closed form."""
-        x, J = in_blocks(self._rows_and_jacobian, q, _BLOCK)
+        x, J = self.chain._by_rows(self._x_and_jacobian, q, _BLOCK)
         return x, J
 
     def coordinates(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the arcs z + delta(z) up to the tip (N, 3 m), and their derivative (N, 3 m, n)."""
+        """Return the arcs z + delta(z) up to the tip (N, 3 m), and their derivative (N, 3 m, n).
+
+        With several markers these are the arcs of all segments.
+        """
         frames = self.chain.frames_and_moves(q)
-        slope = self._slope(frames)
-        return self._up_to_tip(self._changed(frames)).mT, self._up_to_tip(
-            slope
-        ).permute(2, 0, 1)
+        arcs = self._up_to_tip(self._changed(frames))
+        slope = self._up_to_tip(self._slope(frames))
+        return arcs.mT, slope.permute(2, 0, 1)
 
     def from_coordinates(self, z: Tensor) -> Tensor:
-        """Return the tip (N, 3), or all markers, at arcs (N, 3 m)."""
+        """Return the tip (N, 3), or all markers (N, 3 K), at arcs (N, 3 m)."""
         return self._moved(self.chain.from_coordinates(z))
 
     def from_coordinates_and_jacobian(self, z: Tensor) -> tuple[Tensor, Tensor]:
@@ -233,22 +255,43 @@ class StructuralChain(ForwardModel):
         """Return whether the chain has a shape at q, shape (...), bool."""
         return self.chain.has_shape(q)
 
-    def _weights(self, like: Tensor) -> Weights:
-        return Weights(
-            self.zeros.to(like),
-            self.maps.to(like),
-            self.twists.to(like),
-            self.sags.to(like),
-        )
+    @classmethod
+    def from_stored(cls, stored: Stored, restore: Restore) -> StructuralChain:
+        """Return the model built from a description."""
+        model = super().from_stored(stored, restore)
+        if not isinstance(model.chain, ArcChain):
+            need = "must be a chain of arcs"
+            raise ValueError(f"`chain` {need}, got {type(model.chain).__name__}")
+        n_arcs = model.chain.n_segments * model.chain.arcs_per_segment
+        lengths = model.lengths.tolist()
+        if len(lengths) != n_arcs or min(lengths) < 0.0 or max(lengths) == 0.0:
+            need = (
+                f"must hold the lengths of {n_arcs} arcs, zero or more and not all zero"
+            )
+            raise ValueError(f"`lengths` {need}, got {lengths}")
+        pose(model.motion, "motion", model.motion.dtype)
+        return model
 
-    def _rows_and_jacobian(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+    def _around(self, chain: ArcChain) -> StructuralChain:
+        """Return a model of another chain with the same errors."""
+        weights = self._weights(self.lengths)
+        return StructuralChain(chain, self.lengths, *weights, self.motion)
+
+    def _marked(self, markers: Sequence[Marker]) -> StructuralChain:
+        return self._around(self.chain._marked(markers))
+
+    def _weights(self, like: Tensor) -> Weights:
+        weights = self.zeros, self.maps, self.twists, self.sags
+        return Weights(*[weight.to(like) for weight in weights])
+
+    def _x_of_rows(self, rows: Tensor) -> tuple[Tensor]:
+        arcs = self._changed(self.chain.frames_and_moves(rows))
+        return (self.from_coordinates(self._up_to_tip(arcs).mT),)
+
+    def _x_and_jacobian(self, rows: Tensor) -> tuple[Tensor, Tensor]:
         z, slope = self.coordinates(rows)
         x, columns = self.from_coordinates_and_jacobian(z)
         return x, columns @ slope
-
-    def _arcs(self, rows: Tensor) -> Tensor:
-        """Return the arcs z + delta(z) up to the tip (N, 3 m) of rows (N, n)."""
-        return self._up_to_tip(self._changed(self.chain.frames_and_moves(rows))).mT
 
     def _changed(self, frames: Frames) -> Tensor:
         """Return the arcs z + delta(z) (3 S, N)."""
@@ -257,9 +300,18 @@ class StructuralChain(ForwardModel):
         loads = Loads.of(frames, lengths)
         return arcs + change_of(loads, arcs, lengths, self._weights(arcs))
 
+    def _slope(self, frames: Frames) -> Tensor:
+        """Return the derivative (3 S, n, N) of z + delta(z) by q."""
+        lengths = self.lengths.to(frames.arcs)
+        by_arcs = _derivative(frames, lengths, self._weights(frames.arcs))
+        whole = identity(len(by_arcs), by_arcs)[..., None] + by_arcs
+        if frames.slope.ndim == 2:
+            return torch.einsum("abn,bi->ain", whole, frames.slope)
+        return torch.einsum("abn,bin->ain", whole, frames.slope)
+
     def _up_to_tip(self, arcs: Tensor) -> Tensor:
         """Return arcs (3 S, ...) up to the tip, or all of them for several markers."""
-        if len(self.chain.markers) > 1:
+        if len(self.markers) > 1:
             return arcs
         return self.chain.up_to_tip(arcs)
 
@@ -269,123 +321,96 @@ class StructuralChain(ForwardModel):
         points = x.unflatten(1, (-1, 3)) @ motion[:3, :3].mT + motion[:3, 3]
         return points.flatten(1)
 
-    def _slope(self, frames: Frames) -> Tensor:
-        """Return the derivative (3 S, n, N) of z + delta(z) by q."""
-        arcs = frames.arcs
-        lengths = self.lengths.to(arcs)
-        weights = self._weights(arcs)
-        loads = Loads.of(frames, lengths)
-        by_arcs = _derivative(frames, loads, lengths, weights)
+
+class _Ends(NamedTuple):
+    """The frame of the base and those after all segments, S + 1, in the base frame."""
+
+    axes: Tensor  # (3, 3, S + 1, N): axis, component
+    torques: Tensor  # a x d / L, (3, S + 1, N)
+
+    @classmethod
+    def of(cls, frames: Frames, lengths: Tensor) -> _Ends:
+        """Return the ends for mean lengths (S,) of the segments [m]."""
+        axes, points = frames.axes, frames.points
+        at_base = identity(3, axes)[..., None, None].expand_as(axes[:, :, :1])
+        axes = torch.cat([at_base, axes], dim=2)
+        points = torch.cat([torch.zeros_like(points[:, :1]), points], dim=1)
+        levers = (points[:, -1:] - points) / lengths.sum()
+        return cls(axes, _cross(axes[2], levers))
+
+    def slopes(self, frames: Frames, lengths: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the derivatives of the torques and of the x- and y-axes by arcs (3, S).
+
+        Shapes (3, S + 1, 3, S, N) and (2, 3, S + 1, 3, S, N). An arc before a frame turns the frame
+        and its lever; an arc after it moves the end of the lever.
+        """
         S = len(lengths)
-        whole = by_arcs.reshape(3 * S, 3 * S, -1) + identity(3 * S, arcs)[..., None]
-        slope = frames.slope
-        if slope.ndim == 2:
-            return torch.einsum("abn,bi->ain", whole, slope)
-        return torch.einsum("abn,bin->ain", whole, slope)
+        place = torch.arange(S + 1, device=lengths.device)
+        before = (place[:S] < place[:, None])[:, None, :, None]  # (S + 1, 1, S, 1)
+        x_axis, y_axis, tangent = self.axes[:, :, :, None, None]
+        spins = frames.spins[:, None]
+        moves = frames.moves[:, None] / lengths.sum()
+        turned = _cross(spins, self.torques[:, :, None, None])
+        torques = torch.where(before, turned, _cross(tangent, moves))
+        axes = torch.stack([_cross(spins, x_axis), _cross(spins, y_axis)])
+        return torques, torch.where(before, axes, 0.0)
 
 
-def without_errors(model: ForwardModel) -> ForwardModel:
-    """Return the chain of a StructuralChain, any other model as it is."""
-    return model.chain if isinstance(model, StructuralChain) else model
+def _derivative(frames: Frames, lengths: Tensor, weights: Weights) -> Tensor:
+    """Return the derivative (3 S, 3 S, N) of `change_of` by the arcs.
 
-
-def _derivative(
-    frames: Frames, loads: Loads, lengths: Tensor, weights: Weights
-) -> Tensor:
-    """Return the derivative (3, S, 3, S, N) of `change_of` by the arcs, kind by kind."""
-    S = len(lengths)
+    In the subscripts, segment k has its strain or bending i, by the length or bending p of segment
+    l; j are the directions of loads, a those of sags.
+    """
+    loads = Loads.of(frames, lengths)
+    torques, axes = _Ends.of(frames, lengths).slopes(frames, lengths)
+    torques = _between_ends(torques, 1)
+    axes = _between_ends(axes, 2)
     _, x, y = frames.arcs.unflatten(0, (3, -1))
-    strain_of = _strain(identity(S, lengths), lengths) - _strain(
-        torch.zeros_like(lengths)[:, None], lengths
-    )
-    torques, sideways = _slopes_at_ends(frames, lengths.sum())
-    # The own strain, x- and y-bending (3, S) by all arcs (3, S): constant.
-    own = torch.stack([strain_of, identity(S, lengths), identity(S, lengths)])
-    kinds = identity(3, lengths)
-    by_own = torch.einsum("kij,jkl->ikjl", weights.maps, own)
-    # Twists.
+    kinds = identity(3, x)
+    segments = identity(len(lengths), x)
+
+    ones = torch.ones_like(lengths)
+    rates = torch.stack([_per_length(lengths), ones, ones])
+    linear = torch.einsum("kip,pk,kl->ikpl", weights.maps, rates, segments)
+    strain = torch.einsum("p,k,kl->kpl", kinds[0], rates[0], segments)[..., None]
+
     twist = _along(weights.twists, loads.torques)
-    by_twist = torch.einsum("kj,jkpln->kpln", weights.twists, _between(torques))
-    by_twist = (1.0 + loads.strain)[:, None, None] * by_twist
-    by_twist = by_twist + torch.einsum("p,kl,kn->kpln", kinds[0], strain_of, twist)
+    by_torques = torch.einsum("kj,jkpln->kpln", weights.twists, torques)
+    by_twist = (1.0 + loads.strain)[:, None, None] * by_torques
+    by_twist = _turned(by_twist + strain * twist[:, None, None])
     angle = _turned((1.0 + loads.strain) * twist)
-    by_angle = _turned(by_twist)
-    # Sags.
+    rotated = torch.einsum("kl,kn->kln", segments, angle)
+
     sag = _along(weights.sags, loads.sideways)
-    by_sag = torch.einsum("kj,ajkpln->akpln", weights.sags, _between(sideways))
-    by_sag = (1.0 + 2.0 * loads.strain)[:, None, None] * by_sag
-    by_sag = by_sag + 2.0 * torch.einsum("p,kl,akn->akpln", kinds[0], strain_of, sag)
-    by_sag = _taken_back(by_sag, 1)
-    diagonal = torch.einsum("kl,kn->kln", identity(S, lengths), angle)
-    by_x = by_sag[0] - y[:, None, None] * by_angle
-    by_x = by_x - kinds[2][:, None, None] * diagonal[:, None]
-    by_y = by_sag[1] + x[:, None, None] * by_angle
-    by_y = by_y + kinds[1][:, None, None] * diagonal[:, None]
-    none = torch.zeros_like(by_x)
-    change = torch.stack([none, by_x, by_y]) + by_own[..., None]
-    return torch.cat([lengths[:, None, None, None] * change[:1], change[1:]])
+    by_axes = torch.einsum("kj,ajkpln->akpln", weights.sags, axes)
+    by_sag = (1.0 + 2.0 * loads.strain)[:, None, None] * by_axes
+    by_sag = _taken_back(by_sag + 2.0 * strain * sag[:, :, None, None])
+
+    by_x = by_sag[0] - y[:, None, None] * by_twist
+    by_y = by_sag[1] + x[:, None, None] * by_twist
+    by_x = by_x - kinds[2][:, None, None] * rotated[:, None]
+    by_y = by_y + kinds[1][:, None, None] * rotated[:, None]
+    change = torch.stack([torch.zeros_like(by_x), by_x, by_y]) + linear[..., None]
+    sizes = torch.stack([lengths, ones, ones])
+    return (sizes[..., None, None, None] * change).flatten(0, 1).flatten(1, 2)
 
 
-def _strain(arcs: Tensor, lengths: Tensor) -> Tensor:
-    """Return l / lbar - 1 (S, N) of arcs (3 S, N); zero for segments of no length."""
+def _per_length(lengths: Tensor) -> Tensor:
+    """Return 1 / lbar (S,); zero for segments of no length."""
     has_length = lengths > 0.0
-    safe = torch.where(has_length, lengths, 1.0)[:, None]
-    strain = arcs[: len(lengths)] / safe - 1.0
-    return torch.where(has_length[:, None], strain, 0.0)
+    return torch.where(has_length, 1.0 / torch.where(has_length, lengths, 1.0), 0.0)
 
 
-def _at_ends(frames: Frames, length: Tensor) -> tuple[Tensor, Tensor]:
-    """Return a x d / L (3, S + 1, N) and the x- and y-axes (2, 3, S + 1, N) of all frames.
-
-    The first frame is that of the base.
-    """
-    axes, points = _with_base(frames)
-    lever = (points[:, -1:] - points) / length
-    return torch.linalg.cross(axes[2], lever, dim=0), axes[:2]
+def _cross(a: Tensor, b: Tensor) -> Tensor:
+    """Return a x b along the first axis."""
+    return torch.linalg.cross(a, b, dim=0)
 
 
-def _with_base(frames: Frames) -> tuple[Tensor, Tensor]:
-    """Return axes (3, 3, S + 1, N) and origins (3, S + 1, N) of all frames and of the base."""
-    at_base = identity(3, frames.axes)[..., None, None].expand_as(frames.axes[:, :, :1])
-    axes = torch.cat([at_base, frames.axes], dim=2)
-    origin = torch.zeros_like(frames.points[:, :1])
-    return axes, torch.cat([origin, frames.points], dim=1)
-
-
-def _slopes_at_ends(frames: Frames, length: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the derivatives of `_at_ends` by the arcs (3, S) of all segments.
-
-    Shapes (3, S + 1, 3, S, N) and (2, 3, S + 1, 3, S, N). An arc before a frame turns the frame and
-    its lever; an arc after it moves the end of the lever.
-    """
-    axes, _ = _with_base(frames)
-    torque, _ = _at_ends(frames, length)
-    S = frames.points.shape[1]
-    steps = torch.arange(S + 1, device=torque.device)
-    before = (steps[None, :S] < steps[:, None])[:, None, :, None]  # (S + 1, 1, S, 1)
-    spins = frames.spins[:, None]  # (3, 1, 3, S, N)
-    turned = torch.linalg.cross(*_shaped(spins, torque[:, :, None, None]), dim=0)
-    moves = frames.moves[:, None] / length
-    moved = torch.linalg.cross(*_shaped(axes[2][:, :, None, None], moves), dim=0)
-    sideways = []
-    for axis in axes[:2]:
-        spun = torch.linalg.cross(*_shaped(spins, axis[:, :, None, None]), dim=0)
-        sideways.append(torch.where(before, spun, 0.0))
-    return torch.where(before, turned, moved), torch.stack(sideways)
-
-
-def _shaped(a: Tensor, b: Tensor) -> tuple[Tensor, ...]:
-    return torch.broadcast_tensors(a, b)
-
-
-def _between(ends: Tensor) -> Tensor:
-    """Return the mean over both ends of every segment, from values at S + 1 ends.
-
-    The ends are the second-last axis of loads, and that before the arcs of derivatives.
-    """
-    at = 2 if ends.ndim in (4, 6) else 1
-    S = ends.shape[at] - 1
-    return 0.5 * (ends.narrow(at, 0, S) + ends.narrow(at, 1, S))
+def _between_ends(ends: Tensor, dim: int) -> Tensor:
+    """Return the mean over both ends of every segment, from S + 1 ends along `dim`."""
+    S = ends.shape[dim] - 1
+    return 0.5 * (ends.narrow(dim, 0, S) + ends.narrow(dim, 1, S))
 
 
 def _along(weights: Tensor, loads: Tensor) -> Tensor:
@@ -398,8 +423,7 @@ def _turned(twist: Tensor) -> Tensor:
     return twist.cumsum(0) - 0.5 * twist
 
 
-def _taken_back(sag: Tensor, at: int) -> Tensor:
-    """Return the sag of every segment minus that of the one before it, along an axis."""
-    first = torch.zeros_like(sag.narrow(at, 0, 1))
-    previous = torch.cat([first, sag.narrow(at, 0, sag.shape[at] - 1)], dim=at)
-    return sag - previous
+def _taken_back(sag: Tensor) -> Tensor:
+    """Return the sag (2, S, ...) of every segment minus that of the one before it."""
+    before = torch.cat([torch.zeros_like(sag[:, :1]), sag[:, :-1]], dim=1)
+    return sag - before

@@ -14,7 +14,6 @@ from hybridkin._core.blocks import in_blocks
 from hybridkin._core.model import ForwardModel, PortableModule
 from hybridkin._core.plan import CHAINS, NoKernel, Plan
 from hybridkin._core.stored import Layout, Stored
-from hybridkin.chains.structural import without_errors
 from hybridkin.hybrid._guards import GroupDistance, Guard, LeverageGuard, Plane
 from hybridkin.learning.regressor_modules import AffineModule
 
@@ -169,13 +168,8 @@ class Hybrid(ForwardModel):
 
     @property
     def robot(self) -> ForwardModel:
-        """The mechanical model without learned errors, or the module itself without one."""
-        return self if self.nominal is None else self.nominal
-
-    @property
-    def nominal(self) -> ForwardModel | None:
-        """The mechanical model without the learned errors of its structure."""
-        return None if self.mechanical is None else without_errors(self.mechanical)
+        """The robot of the mechanical model, or the module itself without one."""
+        return self if self.mechanical is None else self.mechanical.robot
 
     @property
     def corrects_inside(self) -> bool:
@@ -306,8 +300,11 @@ class HybridModule(Hybrid):
 
     @property
     def corrects_inside(self) -> bool:
-        """Whether a correction acts inside the robot, see `InnerCorrection`."""
-        return any(correction.inside for correction in self._corrections)
+        """Whether a correction acts inside the robot: an `InnerCorrection`, or its structure."""
+        mechanical = self.mechanical
+        if mechanical is not None and mechanical.without_errors is not mechanical:
+            return True
+        return self._has_inner_corrections
 
     @property
     def plane(self) -> tuple[Tensor, Tensor] | None:
@@ -367,6 +364,10 @@ class HybridModule(Hybrid):
         return self.mechanical.has_shape(q)
 
     @property
+    def _has_inner_corrections(self) -> bool:
+        return any(correction.inside for correction in self._corrections)
+
+    @property
     def _corrections(self) -> list[TipCorrection]:
         return cast("list[TipCorrection]", [*self.corrections])
 
@@ -377,7 +378,7 @@ class HybridModule(Hybrid):
 
     def _inside(self, q: Tensor) -> Inside | None:
         """Return the mechanical model inside at rows q, where a correction acts there."""
-        if self.mechanical is None or not self.corrects_inside:
+        if self.mechanical is None or not self._has_inner_corrections:
             return None
         return Inside(self.mechanical, q)
 

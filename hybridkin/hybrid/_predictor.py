@@ -326,13 +326,13 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def _follow_robot(self) -> None:
         """Set the module and its mechanical model after the change and the drift of the robot."""
         hybrid = self.fitted_module_
-        mechanical = hybrid.nominal
+        mechanical = hybrid.mechanical
         drift = self._drift.correction()
         if drift is not None:
             hybrid = hybrid.with_drift(drift)
         self.module_ = self.change_.after(hybrid)
         if mechanical is not None:
-            mechanical = self.change_.after(mechanical)
+            mechanical = self.change_.after(mechanical.without_errors)
         self.mechanical_model_ = mechanical
         self._plausible_rows = None
         self._plain_rows = None

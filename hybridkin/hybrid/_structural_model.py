@@ -12,7 +12,6 @@ from hybridkin._core.model import ForwardModel
 from hybridkin.calibration.choice import GeometryChoice
 from hybridkin.calibration.measured import distance, folds
 from hybridkin.chains.arc_chain import ArcChain
-from hybridkin.chains.structural import without_errors
 from hybridkin.hybrid._error_models import named
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._spec import (
@@ -45,7 +44,7 @@ class Structure(Refinement):
 
     def refine(self, mechanical: ForwardModel, rows: Rows) -> ForwardModel:
         """Return the chain with the errors of its structure."""
-        chain = without_errors(mechanical)
+        chain = mechanical.without_errors
         if not isinstance(chain, ArcChain) or not chain.has_one_arc_per_segment:
             return mechanical
         return fit_structure(chain, rows, left_out=False).model

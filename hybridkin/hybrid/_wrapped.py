@@ -18,6 +18,7 @@ from hybridkin._core.rotations import rotation, rotation_vector
 from hybridkin._core.stored import Layout, Stored
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.markers import MarkedChain
+from hybridkin.chains.structural import StructuralChain
 from hybridkin.hybrid._guards import GroupDistance, Plane
 from hybridkin.hybrid._module import Hybrid, HybridModule, TipCorrection
 from hybridkin.learning.regressor_modules import AffineModule
@@ -264,12 +265,12 @@ class Stacked(Hybrid):
         self.n_outputs = 3 * len(tips)
 
     @property
-    def mechanical(self) -> MarkedChain | None:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def mechanical(self) -> MarkedChain | StructuralChain | None:  # pyright: ignore[reportIncompatibleVariableOverride]
         """The chain of all markers, with the geometry of the tip's."""
-        chain = self.tip_model.nominal
-        if not isinstance(chain, MarkedChain):
+        chain = self.tip_model.mechanical
+        if not isinstance(chain, (MarkedChain, StructuralChain)):
             return None
-        chains = cast("list[MarkedChain]", [tip.nominal for tip in self._tips()])
+        chains = cast("list[MarkedChain]", [tip.mechanical for tip in self._tips()])
         return chain._marked([chain.markers[-1] for chain in chains])
 
     def stored(self) -> Stored:

@@ -28,6 +28,7 @@ from hybridkin.chains import (  # noqa: F401
     elastic_tendons,
     force_tendons,
     rigid,
+    structural,
 )
 from hybridkin.chains.creep import CreepOperator
 from hybridkin.chains.hysteresis import HysteresisOperator

@@ -26,7 +26,7 @@ from hybridkin.native import export_c
 
 LOOP = Path(__file__).parents[2] / "examples" / "c" / "loop.c"
 MODELS = ("chain_of_all_parts", "elastic_chain", "rigid", "serial_pose", "blend")
-MODELS += ("drift_and_radius", "elm", "adapted")
+MODELS += ("drift_and_radius", "elm", "adapted", "structural_chain")
 WARNINGS = "-Wall -Wextra -pedantic -Wconversion -Wdouble-promotion -Werror".split()
 CC = shutil.which("cc")
 needs_cc = pytest.mark.skipif(CC is None, reason="needs a C compiler")

@@ -16,6 +16,7 @@ ACTIVATIONS = ("logistic", "tanh", "sin")
 SAVED = (
     "chain",
     "elastic_chain",
+    "structural_chain",
     "rigid",
     "parallel_elm",
     "parallel_kernel",

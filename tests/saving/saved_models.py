@@ -23,6 +23,7 @@ from hybridkin import (
     RigidChain,
     save_model,
 )
+from hybridkin.chains.structural import StructuralChain
 
 FOLDER = Path(__file__).parent / "models"
 
@@ -60,6 +61,17 @@ def elastic_chain(**options):
         base=np.diag([1.0, -1.0, -1.0, 1.0]),
         **options,
     )
+
+
+def structural_chain(chain, size=0.03):
+    """A chain of arcs with errors of its structure, all of them, and a motion of its base."""
+    rng = np.random.default_rng(0)
+    lengths = np.linspace(0.06, 0.05, chain.n_segments)
+    shapes = (3,), (3, 3), (3,), (3,)
+    errors = [size * rng.normal(size=(chain.n_segments, *shape)) for shape in shapes]
+    motion = np.eye(4)
+    motion[:2] = [[0.8, -0.6, 0.0, 0.01], [0.6, 0.8, 0.0, -0.02]]
+    return StructuralChain(chain, *map(torch.from_numpy, [lengths, *errors, motion]))
 
 
 def arm(**options):
@@ -163,6 +175,7 @@ def models() -> dict[str, tuple[Any, Any]]:
         "chain": (tendon_chain(), tendons),
         "chain_of_all_parts": (bent_chain(dtype=torch.float32).with_tip(1.5), tendons),
         "elastic_chain": (elastic_chain(), tendons),
+        "structural_chain": (structural_chain(bent_chain().with_tip(1.5)), tendons),
         "rigid": (arm(), np.linspace(-1.0, 1.0, 9).reshape(3, 3)),
         "elm": _network(apart),
         "elm_cv": _network(chosen),

@@ -34,7 +34,7 @@ KINDS = (
     *("parallel_elm", "parallel_kernel", "parallel_regression", "parallel_linear"),
     *("parallel_quadratic", "serial_quadratic", "serial_pose", "serial_elm", "pose_output"),
     *("data_only", "drift_and_radius", "rigid_hybrid", "elastic_hybrid", "blend", "play"),
-    *("adapted", "adapted_pose"),
+    *("adapted", "adapted_pose", "structural_chain"),
 )
 
 
