@@ -17,7 +17,7 @@ import pytest
 import torch
 from mechanical_models import CHAINS
 from operators import operators
-from saved_models import models, trunk, trunk_log
+from saved_models import models, structural_chain, tendon_chain, trunk, trunk_log
 from torch.autograd import forward_ad
 from torch.func import functional_call, jacfwd, jacrev, vmap
 from torch.testing import assert_close
@@ -33,6 +33,8 @@ from hybridkin import (
 )
 from hybridkin._core.derived import derived
 from hybridkin._core.stored import KINDS_OF_MODELS
+from hybridkin.hybrid._features import PoseFeatures, Readout
+from hybridkin.hybrid._module import HybridModule, InnerCorrection
 from hybridkin.hybrid.description import restorer
 from hybridkin.learning.regressor_modules import (
     AffineModule,
@@ -83,11 +85,22 @@ def marked():
     return HybridForwardModel(chain, "linear").fit(q, x, groups=groups).module_, q[:3]
 
 
+def structural_hybrid():
+    """A correction by the poses of a robot, on top of errors of its structure."""
+    chain = tendon_chain()
+    _, q = CHAINS["tendons"]
+    features = PoseFeatures.of_range(torch.from_numpy(q), chain)
+    weights = 1e-3 * np.random.default_rng(0).normal(size=(6, 38))
+    correction = InnerCorrection(Readout(features, torch.from_numpy(weights)))
+    return HybridModule(structural_chain(chain), [correction], torch.ones(1).double()), q
+
+
 def all_models():
     """Return modules of all kinds, with rows of q."""
     force = ForceTendonChain([0.01], [0.1], 0.02, 200.0, weight=0.5, taper=0.3, arcs=2)
     found = {**CHAINS, **smooth(), "force": (force, FORCES)}
     found |= {"balanced": balanced(), "two markers": marked(), "rescaled": rescaled()}
+    found["structural hybrid"] = structural_hybrid()
     for name, (model, q) in models().items():
         module = getattr(model, "module_", model)
         found.setdefault(f"saved {name}", (module, q[:3]))

@@ -16,7 +16,7 @@ from hybridkin.saving.header import model_header
 STORED = sorted(FOLDER.glob("*.safetensors"))
 NAMES = [path.stem for path in STORED]
 NOT_LEARNING = {"adapted_pose", "chain", "chain_of_all_parts", "elastic_chain", "elm", "elm_cv"}
-NOT_LEARNING |= {"pose_output", "rigid"}  # that have no `partial_fit` of tips
+NOT_LEARNING |= {"pose_output", "rigid", "structural_chain"}  # that have no `partial_fit` of tips
 LEARNING = [path for path in STORED if path.stem not in NOT_LEARNING]
 # Arrays with an entry for every row of the training, and one that nothing uses.
 LENGTHS = {"error_model.residual": ("short", "empty"), "fitted_rows": ("short", "empty")}
