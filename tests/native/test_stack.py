@@ -8,6 +8,7 @@ import pytest
 import torch
 from numpy.testing import assert_array_equal
 from painted import CC, LIMIT, painted, stacks
+from saved_models import structural_chain
 
 from hybridkin import (
     ConstantCurvatureChain,
@@ -70,6 +71,8 @@ def largest(kind):
         model = as_forward_model(wide.fit(q, np.sin(100.0 * q)))
     elif kind in CHAINS:
         model = CHAINS[kind]()
+    elif kind == "structural":
+        model = structural_chain(elastic(), size=1e-3)
     elif kind == "inside":
         model = hybrid(elastic(4), "pose", coupling="serial")  # a larger one takes minutes to fit
     else:
@@ -80,7 +83,7 @@ def largest(kind):
     return model, q
 
 
-KINDS = (*CHAINS, "regressor", "inside", "tip")
+KINDS = (*CHAINS, "structural", "regressor", "inside", "tip")
 
 
 def write_plan(path, plan, q):
