@@ -43,6 +43,11 @@ def error_model_of(setting: object, coupling: str, random_state: Seed) -> ErrorM
         error_model = network_model(setting, coupling, random_state)
     else:
         error_model = ForeignModel(setting)
+    if coupling not in error_model.couplings and coupling == "parallel":
+        raise TypeError(
+            f"`coupling` must be 'serial' with error_model={setting!r}, whose errors act inside "
+            f"the robot, got {coupling!r}; use coupling='serial'."
+        )
     if coupling not in error_model.couplings:
         raise TypeError(
             "`error_model` must be a name of features, an ELMRegressor or an ELMRegressorCV with "

@@ -12,6 +12,7 @@ from hybridkin._core.model import ForwardModel
 from hybridkin.calibration.choice import GeometryChoice
 from hybridkin.calibration.measured import distance, folds
 from hybridkin.chains.arc_chain import ArcChain
+from hybridkin.hybrid._drift import too_far
 from hybridkin.hybrid._error_models import named
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._spec import (
@@ -115,10 +116,15 @@ class StructuralModel(ErrorModel):
                 f"error_model='structural', got {type(chain).__name__}; use "
                 "error_model='quadratic'."
             )
-        fits = [fit_structure(chain, rows, self.factors[0], spec.held_out)]
-        if len(self.factors) > 1 and len(rows) >= _FEW:
-            for factor in self.factors[1:]:
-                fits.append(fit_structure(chain, rows, factor))
+        factors = self.factors if len(rows) >= _FEW else self.factors[:1]
+        compared = len(factors) > 1
+        fits = []
+        try:
+            for factor in factors:
+                left_out = spec.held_out or compared
+                fits.append(fit_structure(chain, rows, factor, left_out))
+        except torch.linalg.LinAlgError as error:  # pyright: ignore
+            raise too_far() from error
         best = fits[0]
         for fit in fits[1:]:
             if fit.rmse < _BETTER * best.rmse:

@@ -323,13 +323,13 @@ def test_markers_stand_side_by_side():
     g, q = drawn("mixed", 3)
     many = g._marked([(0.5, 0.0, 0.0, 0.0), (2.0, 0.0, 0.0, 0.01), (3.0, 0.0, 0.0, 0.0)])
     x, J = many.forward_and_jacobian(q)
-    for k, tip in enumerate(many.tips()):
+    for k, tip in enumerate(many.each_tip()):
         at = slice(3 * k, 3 * k + 3)
         assert_close(x[:, at], tip(q), rtol=0, atol=1e-14)
         assert_close(J[:, at], tip.jacobian(q), rtol=0, atol=1e-13)
     assert_close(many.tip_model(q), g(q), rtol=0, atol=0)
     none = torch.zeros(0).double()
-    stacked = Stacked(None, [HybridModule(tip, [], none) for tip in many.tips()])
+    stacked = Stacked(None, [HybridModule(tip, [], none) for tip in many.each_tip()])
     assert_close(stacked.mechanical(q), x, rtol=0, atol=1e-14)
     assert stacked.robot.markers == many.markers
     assert_close(stacked.forward_and_jacobian(q)[1], J, rtol=0, atol=1e-13)
