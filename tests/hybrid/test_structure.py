@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from torch.testing import assert_close
+
 from hybridkin import (
     ConstantCurvatureChain,
     ElasticTendonChain,
@@ -17,7 +19,6 @@ from hybridkin.calibration.natural_scales import STRUCTURE
 from hybridkin.chains.structural import StructuralChain
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._structure import Blocks, fit_structure
-from torch.testing import assert_close
 
 TRUNK = robots.bionic_handling_assistant()
 TENDONS = ConstantCurvatureChain([0.01, 0.008], lengths=[0.12, 0.1])
