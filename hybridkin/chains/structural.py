@@ -213,6 +213,10 @@ class StructuralChain(ForwardModel):
         """The model of the last marker alone."""
         return self.each_tip()[-1]
 
+    def with_tip(self, at: float) -> StructuralChain:
+        """Return a model of another point of the same robot, see `MarkedChain.with_tip`."""
+        return self._around(self.chain.with_tip(at))
+
     def each_tip(self) -> list[StructuralChain]:
         """Return one model per marker, each mapping q (..., n) to x (..., 3)."""
         return [self._around(tip) for tip in self.chain.each_tip()]

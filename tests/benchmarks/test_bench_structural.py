@@ -19,7 +19,7 @@ AGAINST = "serial quadratic hybrid"
 @pytest.fixture(scope="module")
 def quadratic(chain, trunk):
     model = HybridForwardModel(chain, "quadratic", coupling="serial", guard=None)
-    return model.fit(trunk.q, trunk.x).module_
+    return model.fit(trunk.q[::10], trunk.x[::10]).module_
 
 
 @pytest.fixture(scope="module")

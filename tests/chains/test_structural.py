@@ -24,6 +24,7 @@ from hybridkin.hybrid._adapt import Change
 from hybridkin.hybrid._features import PoseFeatures, QuadraticFeatures, Readout
 from hybridkin.hybrid._module import HybridModule, InnerCorrection, TipCorrection
 from hybridkin.hybrid._wrapped import Stacked
+from hybridkin.ik.tasks import PointsTask
 from hybridkin.native.library import Program
 from hybridkin.plots.models import body_of
 
@@ -186,7 +187,7 @@ def test_weights_have_natural_units():
 @pytest.mark.parametrize(("S", "tip"), [(1, 1.0), (3, 3.0), (3, 1.5), (4, 2.0)])
 def test_the_jacobian_is_that_of_autograd_and_of_differences(kind, S, tip):
     g, q = drawn(kind, S)
-    g = g._around(g.chain.with_tip(tip))
+    g = g.with_tip(tip)
     x, J = g.forward_and_jacobian(q)
     assert_close(g(q), x, rtol=0, atol=1e-14)
     assert_close(J, jacobian(lambda rows: g(rows), q), rtol=0, atol=1e-11)
@@ -251,12 +252,12 @@ def test_a_segment_of_no_length_has_no_strain(chain):
 
 @pytest.mark.needs_core
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("S", [1, 2, 3, 4, 6])
+@pytest.mark.parametrize("S", [1, 2, 3, 5])
 def test_the_core_computes_the_same(kind, S):
     """Of blocks and of single rows, with partial tips; relative to the robot and to J."""
     for seed, tip in enumerate((S, 0.5, S - 0.3, max(S - 1, 0.7))):
         g, q = drawn(kind, S, seed)
-        check_core(g._around(g.chain.with_tip(tip)), q)
+        check_core(g.with_tip(tip), q)
 
 
 @pytest.mark.needs_core
@@ -303,10 +304,11 @@ def hybrids(g, q):
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_hybrids_of_it(kind):
-    g, q = drawn(kind, 3)
-    g = g._around(g.chain.with_tip(2.5))
+    g, q = drawn(kind, 3, n_rows=4)
+    g = g.with_tip(2.5)
     for name, hybrid in hybrids(g, q).items():
         assert hybrid.robot is g.chain
         assert hybrid.corrects_inside is True
@@ -357,6 +359,7 @@ def test_a_robot_that_has_changed():
         check_core(after, q)
 
 
+@pytest.mark.slow
 def test_inverse_kinematics_reaches_its_tips():
     g, q = drawn("extensible", 3)
     ik = InverseKinematics(hybrids(g, q)["inside"], q_min=0.05, q_max=0.15)
@@ -365,6 +368,9 @@ def test_inverse_kinematics_reaches_its_tips():
     for _ in range(30):
         tracker.step(target)
     np.testing.assert_allclose(tracker.x, target, rtol=0, atol=1e-6)
+    points = InverseKinematics(PointsTask(g, [1.5, 3.0]), q_min=0.05, q_max=0.15)
+    targets = torch.stack([g.with_tip(1.5)(q[1]), g(q[1])])
+    assert points.solve(targets, q[2]).converged
 
 
 def fitted_on(g, q):

@@ -11,7 +11,7 @@ import rounding
 import torch
 from operators import operators, with_hysteresis
 from painted import LIMIT, painted, stacks
-from saved_models import FOLDER, tendon_chain, trunk
+from saved_models import FOLDER, elastic_chain, structural_chain, tendon_chain, trunk
 
 from hybridkin import (
     ConstantCurvatureChain,
@@ -21,12 +21,14 @@ from hybridkin import (
     load_model,
 )
 from hybridkin._core.plan import NoKernel
+from hybridkin.hybrid._features import PoseFeatures, Readout
+from hybridkin.hybrid._module import HybridModule, InnerCorrection
 from hybridkin.ik.tasks import PointsTask, PoseTask, as_task
 from hybridkin.native import export_c
 
 LOOP = Path(__file__).parents[2] / "examples" / "c" / "loop.c"
 MODELS = ("chain_of_all_parts", "elastic_chain", "rigid", "serial_pose", "blend")
-MODELS += ("drift_and_radius", "elm", "adapted", "structural_chain")
+MODELS += ("drift_and_radius", "elm", "adapted")
 WARNINGS = "-Wall -Wextra -pedantic -Wconversion -Wdouble-promotion -Werror".split()
 CC = shutil.which("cc")
 needs_cc = pytest.mark.skipif(CC is None, reason="needs a C compiler")
@@ -77,6 +79,19 @@ def test_a_model_in_float32_is_written_as_its_twin_in_float64(tmp_path, name):
     model = as_forward_model(load_model(FOLDER / f"{name}.safetensors")).float()
     assert agrees(tmp_path, model)
     assert torch.float32 in {entry.dtype for entry in model.state_dict().values()}
+
+
+@needs_cc
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_the_code_of_a_correction_on_errors_of_the_structure(tmp_path, dtype):
+    chain = elastic_chain()
+    rows = torch.linspace(-0.003, 0.003, 28).double().reshape(4, 7)
+    features = PoseFeatures.of_range(rows, chain)
+    weights = 1e-3 * np.random.default_rng(0).normal(size=(6, 38))
+    correction = InnerCorrection(Readout(features, torch.from_numpy(weights)))
+    hybrid = HybridModule(structural_chain(chain), [correction], torch.ones(1).double())
+    assert agrees(tmp_path, hybrid, dtype=dtype)
 
 
 TASKS = {
