@@ -14,6 +14,7 @@ from hybridkin.ik.trajectories import figure_eight
 from hybridkin.native.library import evaluate
 
 AGAINST = "serial quadratic hybrid"
+SHAPES = (3,), (3, 3), (3,), (3,)  # of the errors of a segment
 
 
 @pytest.fixture(scope="module")
@@ -29,9 +30,6 @@ def structural(chain):
     lengths = torch.full((3,), 0.25, dtype=torch.float64)
     g = StructuralChain(chain, lengths, *errors, torch.eye(4, dtype=torch.float64))
     return HybridModule(g, [], lengths[:0])
-
-
-SHAPES = (3,), (3, 3), (3,), (3,)  # of the errors of a segment
 
 
 def test_rows(race, structural, quadratic, draw, batch):
