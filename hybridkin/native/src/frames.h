@@ -1,7 +1,7 @@
 /* The frames along a chain of arcs, and how arcs move and turn what follows them. */
 
-/* What is needed of segment k: the frame before it, vectors of the frame after it, and
-   in the frame before it how the end of its arc moves and turns by its length and bendings. */
+/* What is needed of segment k: the frame before it, vectors of the frame after it, and in the frame
+   before it how the end of its arc moves and turns by its length and bendings. */
 typedef struct {
     V before[9]; /* axes of the frame before the segment, in the base frame */
     V vectors[6]

@@ -71,7 +71,9 @@ static inline V HK(along)(const real *w, const V *a, const V *b) {
 }
 
 /* The strain of segment k. */
-static inline V HK(strain)(const real *own, V length) { return length * own[0] - own[HK_NO_LENGTH]; }
+static inline V HK(strain)(const real *own, V length) {
+    return length * own[0] - own[HK_NO_LENGTH];
+}
 
 /* The frames of the arcs, in that of the base, with the torque vectors of a load at the end. */
 HK_INLINE void HK(load_frames)(HK(structure) s, const HK(loaded) * a) {
@@ -203,7 +205,8 @@ HK_INLINE void HK(pull_change)(HK(structure) s, const HK(loaded) * a, int rows, 
             a->forces[3 * k + 1] = (R(1.0) + e + e) * on_x;
             a->forces[3 * k + 2] = (R(1.0) + e + e) * on_y;
             V on[3];
-            for (int j = 0; j < 3; j++) on[j] = c[0] * map[j] + c[1] * map[3 + j] + c[2] * map[6 + j];
+            for (int j = 0; j < 3; j++)
+                on[j] = c[0] * map[j] + c[1] * map[3 + j] + c[2] * map[6 + j];
             const V sags = on_x * a->sag[2 * k] + on_y * a->sag[2 * k + 1];
             const V on_strain = on[0] + on_twist * a->twist[k] + (sags + sags);
             by_arcs[k] = c[0] + on_strain * own[0];
@@ -219,7 +222,8 @@ HK_INLINE void HK(pull_change)(HK(structure) s, const HK(loaded) * a, int rows, 
                 const V *move = a->moves + 9 * k + 3 * part, *spin = a->spins + 9 * k + 3 * part;
                 V *sum = by_arcs + part * s.S + k;
                 *sum = *sum + (pull[0] * move[0] + pull[1] * move[1] + pull[2] * move[2]);
-                if (part) *sum = *sum + (turn[0] * spin[0] + turn[1] * spin[1] + turn[2] * spin[2]);
+                if (part)
+                    *sum = *sum + (turn[0] * spin[0] + turn[1] * spin[1] + turn[2] * spin[2]);
             }
         }
     }
