@@ -17,6 +17,9 @@ MEAN_LENGTH = 1.596
 _PICKS = 10  # picks of a blend; each is a weight of 0.1
 _EQUAL = 1e-8  # scores this close are equal: readouts end at 1e-9 of their gradient
 _OUTSIDE = 0.1  # share of the outer rows in the score of a blend
+# Standard errors that the gain of a blend must exceed, by the first candidate: errors of the
+# structure hold for rows that the log does not contain, so corrections of them must be sure.
+_SURE = {"mechanical": 1.0, "structural": 2.0}
 
 
 class Predictions(NamedTuple):
@@ -83,8 +86,8 @@ def chosen_blend(
 ) -> tuple[NDArray, CvResults]:
     """Return the weights of the candidates, and the errors of all candidates and their blend.
 
-    If the gain of the blend over the mechanical model, paired by motion or fold, is within its
-    standard error, the mechanical model is chosen.
+    If the gain of the blend over the first candidate, paired by motion or fold, is within its
+    standard error, or twice that over structural errors, the first candidate is chosen.
     """
     n = held_out.n
     counts = held_out.counts
@@ -104,7 +107,7 @@ def chosen_blend(
     gains = by_motion[0] - by_motion[-1]
     weights = held_out.blend_weights(np.ones(len(blend), dtype=bool))
     standard_error = gains.std(ddof=1) / np.sqrt(len(gains))
-    if gains.mean() <= standard_error:
+    if gains.mean() <= _SURE.get(names[0], 1.0) * standard_error:
         weights = np.eye(len(weights))[0]
     held_out_means = np.average(of_held_out, axis=1, weights=counts[:n])
     outer_means = np.average(distances[:, n:], axis=1, weights=counts[n:])
