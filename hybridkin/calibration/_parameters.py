@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from hybridkin._core.rotations import cross_matrix, rotation
+from hybridkin.calibration.natural_scales import GEOMETRY
 from hybridkin.chains.arc_chain import ALIASES, ArcChain
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.rigid import RigidChain
@@ -27,7 +28,6 @@ _FACTORS = {
     "axial_stiffness": 1e4,
     "weight": 1e4,
 }
-PRIOR = 0.5
 _WIDEST = 1e6  # a prior of a million natural units has no effect, and is finite
 _LARGEST_TAPER = 0.95
 _SHORTEST = -0.1  # of the robot's length: a marker may sit a little before the end
@@ -280,7 +280,9 @@ class Problem:
     high: NDArray
 
     @classmethod
-    def of(cls, chain: Chain, names: tuple[str, ...], prior: float = PRIOR) -> Problem:
+    def of(
+        cls, chain: Chain, names: tuple[str, ...], prior: float = GEOMETRY
+    ) -> Problem:
         """Return the problem for these names; the priors have the same standard deviation."""
         parameters = tuple(parameter(chain, name) for name in names)
         lows = []

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from hybridkin.calibration._initial_guesses import Guess, initial_guesses
 from hybridkin.calibration._least_squares import ROUGH, Fit, Rows, solve
-from hybridkin.calibration._parameters import PRIOR, Problem
+from hybridkin.calibration._parameters import Problem
+from hybridkin.calibration.natural_scales import GEOMETRY
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
 from hybridkin.chains.elastic_tendons import ElasticTendonChain
@@ -33,7 +34,7 @@ def search(
     rows: Rows,
     names: tuple[str, ...],
     loss: str,
-    prior: float = PRIOR,
+    prior: float = GEOMETRY,
 ) -> Start:
     """Return the best start of a fit of the parameters with these names."""
     with torch.no_grad():

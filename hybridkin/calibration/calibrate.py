@@ -26,7 +26,7 @@ from hybridkin._core.distinct import distinct_rows, targets_that_count
 from hybridkin._core.model import Portable
 from hybridkin._core.units import motion_message
 from hybridkin.calibration._least_squares import HELD_OUT, LOSSES, Fit, Rows, solve
-from hybridkin.calibration._parameters import PRIOR, parameter_names
+from hybridkin.calibration._parameters import parameter_names
 from hybridkin.calibration._search import Start, search
 from hybridkin.calibration._unidentified import sentences
 from hybridkin.calibration.measured import (
@@ -35,6 +35,7 @@ from hybridkin.calibration.measured import (
     points,
     with_missing_markers,
 )
+from hybridkin.calibration.natural_scales import GEOMETRY
 from hybridkin.chains.arc_chain import ALIASES
 from hybridkin.chains.chain import Chain
 
@@ -135,7 +136,7 @@ def calibrate(
     parameters: Sequence[str] = ("radii", "base"),
     *,
     loss: str = "linear",
-    prior: float = PRIOR,
+    prior: float = GEOMETRY,
     groups: ArrayLike | None = None,
     sample_weight: Numbers | None = None,
 ) -> CalibrationResult:
@@ -229,7 +230,7 @@ def fit_geometry(
     x: Numbers,
     parameters: Sequence[str],
     loss: str = "linear",
-    prior: float = PRIOR,
+    prior: float = GEOMETRY,
     groups: ArrayLike | None = None,
     sample_weight: Numbers | None = None,
     start: Start | None = None,
