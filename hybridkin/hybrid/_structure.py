@@ -120,21 +120,33 @@ class StructureFit(NamedTuple):
     rmse: float  # weighted root mean square length of `residual` [m]
 
 
-class _Problem:
-    """The rows of a fit; theta are the base (6) and the blocks, in units of the prior."""
+class StructureDesign:
+    """How the tips of a chain follow the errors of its structure.
+
+    theta are the base (6) and the blocks, in units of the prior.
+
+    Parameters
+    ----------
+    chain : ArcChain
+        The chain, with one arc for each segment.
+    q : Tensor of shape (N, n)
+        Rows of the log, which give the mean lengths and the noise of the actuators.
+    factor : float
+        Common factor of all standard deviations of the prior.
+    scales : mapping of str to float
+        Standard deviations by block.
+    """
 
     def __init__(
-        self, chain: ArcChain, rows: Rows, factor: float, scales: Mapping[str, float]
+        self,
+        chain: ArcChain,
+        q: Tensor,
+        factor: float = 1.0,
+        scales: Mapping[str, float] = STRUCTURE,
     ) -> None:
         self.chain = chain
-        q = rows.q
-        x = torch.from_numpy(rows.tips.astype(np.float64))
-        self.seen = ~x.isnan()
-        self.x = torch.where(self.seen, x, 0.0)
-        self.root = torch.from_numpy(rows.counts.astype(np.float64)).sqrt()
-        frames = chain.frames_and_moves(q)
-        S = chain.n_segments
-        lengths = frames.arcs[:S]
+        self.factor = factor
+        lengths = chain.frames_and_moves(q).arcs[: chain.n_segments]
         self.reach = chain.reach.to(q)
         self.lengths = lengths.mean(1)
         varies = lengths.std(1, correction=0) > _MOVES * self.reach
@@ -142,30 +154,33 @@ class _Problem:
         self.base = factor * torch.tensor(
             [*3 * [scales["base turn"]], *3 * [scales["base move"] * self.reach]]
         ).to(q)
-        self.factor = factor
+        self.pivot = chain.base[:3, 3].to(q)
+        self.spread = _ACTUATOR_NOISE * q.std(0, correction=0)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The block of every entry of theta."""
+        return (*6 * ("base",), *self.blocks.names)
+
+    def arcs(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the arcs (N, C) up to the tip at rows q, and their change (N, C, P) by blocks."""
+        frames = self.chain.frames_and_moves(q)
         loads = Loads.of(frames, self.lengths)
         fields = torch.func.vmap(
             lambda weights: change_of(loads, frames.arcs, self.lengths, weights)
-        )(_weights(factor * self.blocks.directions))
-        single = len(chain.markers) == 1
+        )(_weights(self.factor * self.blocks.directions))
         arcs = frames.arcs
         fields = fields.transpose(0, 1)  # (3 S, P, N)
-        if single:
-            arcs = chain.up_to_tip(arcs)
-            fields = chain.up_to_tip(fields)
-        self.z = arcs.mT
-        self.fields = fields.permute(2, 0, 1).contiguous()
-        self.tips = tips_of(chain)
-        self.spread = _ACTUATOR_NOISE * q.std(0, correction=0)
-        self.pivot = chain.base[:3, 3].to(q)
-        J = chain.forward_and_jacobian(q)[1] * self.seen[..., None] * self.spread
-        noise = (_TIP_NOISE * self.reach) ** 2 * identity(x.shape[1], q)
-        # A noise of the rows (N, m, m), and what makes it one per row.
-        self.noise = torch.linalg.cholesky(noise + J @ J.mT)
+        if len(self.chain.markers) == 1:
+            arcs = self.chain.up_to_tip(arcs)
+            fields = self.chain.up_to_tip(fields)
+        return arcs.mT, fields.permute(2, 0, 1).contiguous()
 
-    @property
-    def n_parameters(self) -> int:
-        return 6 + len(self.blocks.names)
+    def noise(self, q: Tensor, J: Tensor) -> Tensor:
+        """Return A noise (N, m, m) of rows, A A' its covariance; J (N, m, n) are dx/dq."""
+        moved = J * self.spread
+        of_tip = (_TIP_NOISE * self.reach) ** 2 * identity(J.shape[1], q)
+        return torch.linalg.cholesky(of_tip + moved @ moved.mT)
 
     def motion(self, theta: Tensor) -> Tensor:
         """Return the motion (4, 4) of the base."""
@@ -180,25 +195,49 @@ class _Problem:
         weights = self.blocks.weights(self.factor * theta[6:])
         return StructuralChain(self.chain, self.lengths, *weights, self.motion(theta))
 
+    def slopes(
+        self, tips: Tensor, by_arcs: Tensor, fields: Tensor, base: Tensor
+    ) -> Tensor:
+        """Return the derivative (N, m, P) of tips (N, K, 3) by theta [m].
+
+        `by_arcs` (N, K, 3, C) are the derivatives by the arcs, and `base` (6,) the entries of theta
+        for the base.
+        """
+        turn, move = (self.base * base).split(3)
+        spins = rotation(turn)[1] * self.base[:3]
+        turned = -cross_matrix(tips - self.pivot - move) @ spins
+        moved = torch.diag(self.base[3:]).expand_as(turned)
+        by_base = torch.cat([turned, moved], dim=3).flatten(1, 2)
+        return torch.cat([by_base, by_arcs.flatten(1, 2) @ fields], dim=2)
+
+
+class _Problem:
+    """The rows of a fit, and the fit of theta."""
+
+    def __init__(self, design: StructureDesign, rows: Rows) -> None:
+        self.design = design
+        chain = design.chain
+        x = torch.from_numpy(rows.tips.astype(np.float64))
+        self.seen = ~x.isnan()
+        self.x = torch.where(self.seen, x, 0.0)
+        self.root = torch.from_numpy(rows.counts.astype(np.float64)).sqrt()
+        self.z, self.fields = design.arcs(rows.q)
+        self.tips = tips_of(chain)
+        J = chain.forward_and_jacobian(rows.q)[1]
+        self.noise = design.noise(rows.q, J * self.seen[..., None])
+
     def residual(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return whitened residuals (N, m), tips (N, K, 3), their slopes (N, K, 3, C) by arcs."""
         x, J = self.tips(self.z + self.fields @ theta[6:])
-        motion = self.motion(theta)
+        motion = self.design.motion(theta)
         tips = x.unflatten(1, (-1, 3)) @ motion[:3, :3].mT + motion[:3, 3]
         slope = motion[:3, :3] @ J.unflatten(1, (-1, 3))
         rest = torch.where(self.seen, self.x - tips.flatten(1), 0.0)
         return self.white(rest[..., None])[..., 0], tips, slope
 
-    def design(self, theta: Tensor, tips: Tensor, slope: Tensor) -> Tensor:
+    def slopes(self, theta: Tensor, tips: Tensor, by_arcs: Tensor) -> Tensor:
         """Return the whitened derivative (N, m, P) of the tips by theta."""
-        turn = self.base[:3] * theta[:3]
-        spins = rotation(turn)[1] * self.base[:3]
-        arm = tips - self.pivot - self.base[3:] * theta[3:6]
-        turned = -cross_matrix(arm) @ spins
-        moved = torch.diag(self.base[3:]).expand_as(turned)
-        by_blocks = slope.flatten(1, 2) @ self.fields
-        by_base = torch.cat([turned, moved], dim=3).flatten(1, 2)
-        A = torch.cat([by_base, by_blocks], dim=2)
+        A = self.design.slopes(tips, by_arcs, self.fields, theta[:6])
         return self.white(torch.where(self.seen[..., None], A, 0.0))
 
     def white(self, values: Tensor) -> Tensor:
@@ -212,10 +251,10 @@ class _Problem:
 
     def minimum(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return theta of the least cost, and the whitened residuals and design there."""
-        theta = self.x.new_zeros(self.n_parameters)
+        theta = self.x.new_zeros(len(self.design.names))
         rest, *at = self.residual(theta)
         for _ in range(_ROUNDS):
-            A = self.design(theta, *at).flatten(0, 1)
+            A = self.slopes(theta, *at).flatten(0, 1)
             system = A.mT @ A + identity(len(theta), A)
             slope = A.mT @ rest.flatten() - theta
             step = torch.cholesky_solve(slope[:, None], torch.linalg.cholesky(system))[
@@ -232,7 +271,7 @@ class _Problem:
                 part *= 0.5
             if part <= _SHORTEST or float((part * step).abs().max()) < _SETTLED:
                 break
-        return theta, rest, self.design(theta, *at)
+        return theta, rest, self.slopes(theta, *at)
 
 
 def _cost(rest: Tensor, theta: Tensor) -> float:
@@ -277,7 +316,8 @@ def fit_structure(
     residuals of linear fits.
     """
     with torch.no_grad():
-        problem = _Problem(chain, rows, factor, scales)
+        design = StructureDesign(chain, rows.q, factor, scales)
+        problem = _Problem(design, rows)
         theta, rest, A = problem.minimum()
         system = torch.einsum("nmp,nmq->pq", A, A) + identity(len(theta), A)
         covariance = torch.cholesky_inverse(torch.linalg.cholesky(system))
@@ -286,12 +326,12 @@ def fit_structure(
             residual = problem.in_metres(
                 _left_out(A, rest, theta, covariance, system, rows.groups)
             )
-        model = problem.model(theta)
+        model = design.model(theta)
     weights = rows.counts * points(problem.seen.numpy())[..., 0].sum(1)
     squares = residual.square().sum(1).numpy()
     return StructureFit(
         model,
-        (*6 * ("base",), *problem.blocks.names),
+        design.names,
         theta.numpy(),
         covariance.numpy(),
         factor,
