@@ -66,17 +66,24 @@ class HybridForwardModel(HybridPredictor):
         scale, and see metres.) Names:
 
         - "elm", the same as None: ``ELMRegressor(random_state=random_state)``;
+        - "structural": the errors of a chain's structure, which are a moved base, zeros and rings
+          of the segments, and twist and sag under a load. Their prior is in natural units, so a
+          dozen rows are enough; from 60 rows held-out errors choose its width. For chains of arcs,
+          coupling="serial";
         - "linear" or "quadratic": features of all actuators; "pose": features of a chain's shape
           on which loads act. Linear and other features have separate penalties, chosen by the
           leave-one-out error of rows, or of groups; an infinite penalty means no correction;
         - "kernel": Gaussian kernel ridge tuned on 5 folds, for up to 10 000 rows;
         - "drop": the mechanical model alone;
         - "auto": the blend of these models with the least error on held-out groups, or rows; rows
-          outside the fitted ones have a small weight in it. Linear and quadratic features are
+          outside the fitted ones have a small weight in it. All of them correct the errors of the
+          structure, too, if these lower the errors of the mechanical model on three folds; they
+          stand on the chosen geometry, or on radii and base. Linear and quadratic features are
           serial, pose features in both couplings; mechanical models without a shape have parallel
           quadratic features instead. Kernel ridge takes part up to 2000 rows. If the gain over the
-          mechanical model is within its standard error, nothing is added. Group rows by what will
-          be new in use. Without a mechanical model: a linear function, a network and kernel ridge.
+          model without further corrections is within its standard error, nothing is added. Group
+          rows by what will be new in use. Without a mechanical model: a linear function, a network
+          and kernel ridge.
     coupling : {"parallel", "serial"}, default="parallel"
         Where the correction acts. "parallel": at the tip, f_mech(q) + eps(q), eq. (2). "serial":
         inside the robot, f_mech(z(q) + delta(q)). z holds the lengths and bendings of a chain's
@@ -98,7 +105,8 @@ class HybridForwardModel(HybridPredictor):
         f_mech remains. "box": the domain is the training range, and eps fades out outside it.
         None: everywhere. With `groups`, the domain (`in_domain`) also excludes rows where no
         held-out group has tested the model. With a guard, f_hyb differs from f_mech by at most 1.5
-        times the longest correction of a training row.
+        times the longest correction of a training row. f_mech has the errors of its structure, if
+        these are learned; they have no guard.
     play : float, array-like of shape (n,), HysteresisOperator or "auto", optional
         Backlash (also called play) of the actuators [unit of q]. Rows are then commands in order of
         time, see `Commands`, and the model maps the motion of the actuators. "auto" chooses by the
@@ -124,27 +132,31 @@ class HybridForwardModel(HybridPredictor):
         q -> x in torch, with ``jacobian``, ``forward_and_jacobian`` and ``in_domain``. For poses:
         q -> tip position, also with ``pose``, ``pose_jacobian`` and ``tip_transform``.
     mechanical_model_ : ForwardModel or None
-        The mechanical model, calibrated if asked; `adapt` moves its base and its actuator zeros.
+        The mechanical model, calibrated if asked, without errors of its structure; `adapt` moves
+        its base and its actuator zeros.
     fitted_module_ : nn.Module
         `module_` of the fit, without what `adapt` and `partial_fit` have learned since.
     change_ : Change
         What `adapt` has found: the ``shift`` of the actuator zeros (n,) [unit of q], and the
         ``motion`` of the base (4, 4); zero and the identity after a fit.
-    error_model_ : estimator, ReadoutFit, FittedBlend, tuple or None
+    error_model_ : estimator, ReadoutFit, StructureFit, FittedBlend, tuple or None
         The fitted error model; a tuple has one for each marker. A regressor that sees scaled
         residuals is the ``regressor_`` of a ``TransformedTargetRegressor``, which predicts [m], as
         does its ``module_``. A blend has ``weights`` and ``error_models``. With serial coupling or
         named features it holds the chosen ``alphas`` and the ``residual`` of every row from a fit
         without that row or its group [m]. A model from a file has none.
     cv_results_ : dict or None
-        For error_model="auto". By candidate, the last of which is the blend: the mean distance on
-        held-out rows and its standard deviation over the folds [m], and ``io_distance``, the mean
-        distance on the outer 35 % of the rows after a fit to the inner 40 % [m]. ``weights`` of the
-        blend; ``chosen``: "blend", or the only candidate with a weight. ``parameters``: the set
-        that was calibrated; ``mechanical_model``: the same two errors of every set, "cv" and "io",
-        without backlash [m]. On each fold the blend has weights chosen without that fold.
-        ``expected_distance``: the mean distance to expect on new motions like those of the log [m].
-        With few groups or rows, the penalties are for this chosen without each of three folds.
+        For error_model="auto". By candidate, of which the first has no further correction
+        ("structural" with errors of the structure, else "mechanical") and the last is the blend:
+        the mean distance on held-out rows and its standard deviation over the folds [m], and
+        ``io_distance``, the mean distance on the outer 35 % of the rows after a fit to the inner
+        40 % [m]. ``weights`` of the blend; ``chosen``: "blend", or the only candidate with a
+        weight. ``parameters``: the set that was calibrated, of which errors of the structure may
+        prefer radii and base; ``mechanical_model``: the same two errors of every set without such
+        errors, "cv" and "io", without backlash [m]. On each fold the blend has weights chosen
+        without that fold. ``expected_distance``: the mean distance to expect on new motions like
+        those of the log [m]. With few groups or rows, the penalties are for this chosen without
+        each of three folds.
     candidates_ : dict of str to nn.Module, or None
         For error_model="auto": every candidate of ``cv_results_``, fitted to all rows; a module
         from q to x as ``module_``, with `play` from the motion of the actuators. `adapt` and
