@@ -59,10 +59,11 @@ def hybrid_figures():
     folds = [
         case for case in hybrid_cases.motion_cases(None, 2) if "5 folds" in case.tests
     ]
-    studies = {
-        "few rows": hybrid_cases.armlab_cases((25, 50, 100), 3, 1000, None),
-        "held-out motions": folds,
-    }
+    studies = {"held-out motions": folds}
+    robot = hybrid_cases.armlab(None)
+    if robot is not None:
+        few = hybrid_cases.recorded_cases(robot, (25, 50, 100), 5, 1000)
+        studies["few rows"] = few
     figures = {}
     for study, cases in studies.items():
         for _, case, test, rows, model, mean, *_ in csv_lines(

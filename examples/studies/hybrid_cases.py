@@ -39,9 +39,13 @@ NOMINAL, CALIBRATED = "mechanical, nominal", "mechanical, calibrated"
 PAPER, AUTO, AUTO_PLAY = "parallel, the paper's ELM", "auto", 'auto, play="auto"'
 DATA_ONLY = ("data alone, quadratic", "data alone, kernel ridge")
 AUTO_MECHANICS = "mechanical, as auto took it"
+STRUCTURAL = "serial, structural"
 COUPLINGS, READOUTS = ("parallel", "serial"), ("quadratic", "pose")
 INNER = (0.6, 0.8)
 """Parts of the range of every actuator of the trunks that are learned from; the rest is tested."""
+
+KERNEL_ROWS = 2000
+"""Largest number of rows with kernel ridge, as in auto: 180 fits choose its width and penalty."""
 
 _CABLE_NOISE, _MOCAP_NOISE = 1e-3, 5e-4  # as the defaults of `make_trunk` [m]
 _LOW, _HIGH = 0.19, 0.31  # the range of `paper_protocol` [m]
@@ -93,6 +97,7 @@ def examined(case: Case, names: Sequence[str] | None) -> list[dict[str, Any]]:
                     results["candidate"], results["mean_distance"].tolist(), strict=True
                 )
                 entry |= {"chosen": results["chosen"], "scores": dict(scores)}
+                entry |= {key: results[key] for key in ("expected_distance", "weights")}
                 entry["parameters"] = results["parameters"]
                 entry["mechanics"] = results["mechanical_model"]
             errors = {test: _errors(model, *rows) for test, rows in case.tests.items()}
@@ -137,12 +142,13 @@ def _learners(case: Case) -> dict[str, Callable[[], HybridForwardModel]]:
         NOMINAL: lambda: HybridForwardModel(case.chain, "drop", calibrate=case.frame),
         CALIBRATED: lambda: hybrid("drop"),
         DATA_ONLY[0]: lambda: HybridForwardModel(None, _quadratic()),
-        DATA_ONLY[1]: lambda: HybridForwardModel(None, _kernel(q, x, folds)),
         PAPER: lambda: hybrid(ELMRegressor(**PAPER_ELM, random_state=seed)),
-        "parallel, kernel ridge": lambda: hybrid(
-            _kernel(q, x - calibrated.predict(q), folds)
-        ),
     }
+    if len(q) <= KERNEL_ROWS:
+        learners[DATA_ONLY[1]] = lambda: HybridForwardModel(None, _kernel(q, x, folds))
+        learners["parallel, kernel ridge"] = lambda: hybrid(
+            _kernel(q, x - calibrated.predict(q), folds)
+        )
     for coupling in COUPLINGS:
         for kind in READOUTS:
             learners[f"{coupling}, {kind}"] = partial(hybrid, kind, coupling=coupling)
@@ -247,28 +253,105 @@ def recording(load: Callable[[Any], Any], data_home: Any) -> Any:
         return None
 
 
-def armlab_cases(
-    sizes: Sequence[int], n_draws: int, n_test: int, data_home: Any, inner: bool = False
+class Robot(NamedTuple):
+    """The rows of a recorded robot, with its nominal kinematics; see `Case`."""
+
+    name: str
+    chain: Any
+    frame: tuple[str, ...]
+    calibrate: tuple[str, ...] | str
+    q: NDArray
+    x: NDArray
+    groups: NDArray
+
+    def drawn(
+        self, draw: int, rows: NDArray, test: NDArray, sizes: Sequence[int]
+    ) -> list[Case]:
+        """Return a case for every size: the first ones of these rows, tested on others."""
+        tests = {"measured": (self.q[test], self.x[test])}
+        cases = []
+        for n in sizes:
+            some = rows[:n]
+            data = self.q[some], self.x[some], self.groups[some]
+            mechanics = self.chain, self.frame, self.calibrate
+            cases.append(Case(self.name, draw, *mechanics, *data, tests))
+        return cases
+
+
+def recorded_cases(
+    robot: Robot, sizes: Sequence[int], n_draws: int, n_test: int
 ) -> list[Case]:
-    """Return the cases of armlab_3cable, none where the recording is absent."""
-    data = recording(datasets.load_armlab, data_home)
-    if data is None:
-        return []
-    turns = -2.0 * np.pi / 3.0 * np.arange(3)[None]
-    chain = ConstantCurvatureChain([0.003], angles=turns, lengths=[0.15])
-    parameters, cases = ("radii", "lengths", "base", "tool"), []
-    name = f"armlab_3cable{', pulls up to 6 mm' if inner else ''}"
-    lines, near = np.unique(data.groups), (data.q >= -_NEAR).all(1)
+    """Return the cases of a recorded robot: single rows, a fifth of its groups held out.
+
+    The rows and the groups are drawn at random. Sizes with more rows than there are are left out.
+    """
+    cases, motions = [], np.unique(robot.groups)
     for draw in range(n_draws):
         rng = np.random.default_rng(draw)
-        out = np.isin(data.groups, rng.permutation(lines)[: len(lines) // 5])
-        rows, test = (near, ~near) if inner else (~out, out)
-        rows, test = (rng.permutation(np.flatnonzero(part)) for part in (rows, test))
-        tests = {"measured": (data.q[test[:n_test]], data.x[test[:n_test]])}
-        for n in sizes:
-            some = data.q[rows[:n]], data.x[rows[:n]], data.groups[rows[:n]]
-            cases.append(Case(name, draw, chain, ("base",), parameters, *some, tests))
+        held_out = rng.permutation(motions)[: len(motions) // 5]
+        out = np.isin(robot.groups, held_out)
+        rows, test = (rng.permutation(np.flatnonzero(part)) for part in (~out, out))
+        within = [n for n in sizes if n <= len(rows)]
+        cases += robot.drawn(draw, rows, test[:n_test], within)
     return cases
+
+
+def armlab(data_home: Any) -> Robot | None:
+    """Return armlab_3cable, groups are lines of its grid; None where it is absent."""
+    data = recording(datasets.load_armlab, data_home)
+    if data is None:
+        return None
+    turns = -2.0 * np.pi / 3.0 * np.arange(3)[None]
+    chain = ConstantCurvatureChain([0.003], angles=turns, lengths=[0.15])
+    parameters = ("radii", "lengths", "base", "tool")
+    rows = data.q, data.x, data.groups
+    return Robot("armlab_3cable", chain, ("base",), parameters, *rows)
+
+
+def pull_cases_of_armlab(
+    n: int, n_draws: int, n_test: int, data_home: Any
+) -> list[Case]:
+    """Return the cases of armlab_3cable that are learned from small pulls."""
+    robot = armlab(data_home)
+    if robot is None:
+        return []
+    robot = robot._replace(name="armlab_3cable, pulls up to 6 mm")
+    near = (robot.q >= -_NEAR).all(1)
+    cases = []
+    for draw in range(n_draws):
+        rng = np.random.default_rng(draw)
+        rng.permutation(np.unique(robot.groups))  # as in `recorded_cases`: same stream
+        rows, test = (rng.permutation(np.flatnonzero(part)) for part in (near, ~near))
+        cases += robot.drawn(draw, rows, test[:n_test], [n])
+    return cases
+
+
+def plain_ftdcr(data_home: Any) -> Robot | None:
+    """Return ftdcr_v4 with its plain chain, groups are motions; None where it is absent."""
+    data = recording(datasets.load_ftdcr, data_home)
+    if data is None:
+        return None
+    chain, parameters = nine_tendons()["plain chain"]
+    return Robot("ftdcr_v4", chain, ("base",), parameters, data.q, data.x, data.groups)
+
+
+def asl_trunk(data_home: Any) -> Robot | None:
+    """Return asl_trunk_static, groups are runs; None where it is absent.
+
+    Each motor pulls one tendon of its segment and releases the opposite one.
+    """
+    data = recording(datasets.load_asl_trunk, data_home)
+    if data is None:
+        return None
+    q = np.hstack(
+        [SPOOL * sign * data.q[:, pair] for pair in _PAIRS for sign in (-1.0, 1.0)]
+    )
+    chain = ConstantCurvatureChain(
+        np.full(3, 0.02), n_actuators=4, lengths=(0.107, 0.098, 0.12)
+    )
+    return Robot(
+        "asl_trunk_static", chain, ("base",), "default", q, data.x, data.groups
+    )
 
 
 def nine_tendons() -> dict[str, tuple[Any, tuple[str, ...]]]:
@@ -306,27 +389,18 @@ def pull_cases(data_home: Any, thin: int) -> list[Case]:
 
 
 def run_cases(data_home: Any, thin: int) -> list[Case]:
-    """Return the cases of asl_trunk_static, whole runs in five folds; none without the data.
-
-    Each motor pulls one tendon of its segment and releases the opposite one.
-    """
-    data = recording(datasets.load_asl_trunk, data_home)
-    if data is None:
+    """Return the cases of asl_trunk_static, whole runs in five folds; none without the data."""
+    robot = asl_trunk(data_home)
+    if robot is None:
         return []
-    q = np.hstack(
-        [SPOOL * sign * data.q[:, pair] for pair in _PAIRS for sign in (-1.0, 1.0)]
-    )
-    chain = ConstantCurvatureChain(
-        np.full(3, 0.02), n_actuators=4, lengths=(0.107, 0.098, 0.12)
-    )
     cases = []
-    for k, (train, test) in enumerate(GroupKFold(5).split(q, groups=data.groups)):
+    splits = GroupKFold(5).split(robot.q, groups=robot.groups)
+    for k, (train, test) in enumerate(splits):
         rows = train[::thin]
-        part = q[rows], data.x[rows], data.groups[rows]
-        tests = {"5 folds": (q[test], data.x[test], data.groups[test])}
-        cases.append(
-            Case("asl_trunk_static", k, chain, ("base",), "default", *part, tests)
-        )
+        part = robot.q[rows], robot.x[rows], robot.groups[rows]
+        tests = {"5 folds": (robot.q[test], robot.x[test], robot.groups[test])}
+        mechanics = robot.chain, robot.frame, robot.calibrate
+        cases.append(Case(robot.name, k, *mechanics, *part, tests))
     return cases
 
 

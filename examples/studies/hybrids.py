@@ -30,11 +30,16 @@ from hybrid_cases import (
     INNER,
     NOMINAL,
     PAPER,
+    STRUCTURAL,
     Case,
-    armlab_cases,
+    armlab,
+    asl_trunk,
     examined,
     motion_cases,
+    plain_ftdcr,
     pull_cases,
+    pull_cases_of_armlab,
+    recorded_cases,
     run_cases,
     trunk_cases,
 )
@@ -43,9 +48,11 @@ from joblib import Parallel, delayed
 from hybridkin import plots
 from hybridkin.workflow.report import Report
 
-SIZES = (25, 50, 100, 200, 400, 800, 1600)
+SIZES = (12, 25, 50, 100, 200, 400, 800, 1600, 3200)
 
-_PANELS = 4  # in a line of a figure
+_PANELS = 4  # in a line of the figure outside the range
+_IN_LINE = 3  # panels of the learning curves
+_TICKS = (0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500)
 
 Progress = Callable[[str, int, int], None]
 """Called with (what, done, total)."""
@@ -57,12 +64,16 @@ _LOOKS |= {
     "parallel, kernel ridge": ("#0072B2", "o-"),
     "serial, quadratic": ("#56B4E9", "s-"),
 }
-_LOOKS |= {"serial, pose": ("#CC79A7", "^-"), AUTO: ("#009E73", "D-")}
+_LOOKS |= {"parallel, pose": ("#CC79A7", "v:"), "serial, pose": ("#CC79A7", "^-")}
+_LOOKS |= {STRUCTURAL: ("#882255", "P-"), AUTO: ("#009E73", "D-")}
+
+CURVES = tuple(_LOOKS)
+"""The models that `learning_curves` compares."""
 
 
 def learning_curves(
     sizes: Sequence[int] = SIZES,
-    n_draws: int = 3,
+    n_draws: int = 5,
     *,
     n_test: int = 1000,
     models: Sequence[str] | None = None,
@@ -74,19 +85,20 @@ def learning_curves(
     """Return the errors of all models against the number of training rows.
 
     Two simulated trunks: fully random rows with the noise of `make_trunk`, tested on other
-    rows without noise and with it. armlab_3cable: tested on a fifth of its grid lines, groups are
-    lines.
+    rows without noise and with it. Recorded robots: single rows, tested on a fifth of the groups:
+    armlab_3cable (lines of its grid), ftdcr_v4 with a plain chain (motions), asl_trunk_static
+    (runs). Sizes with more rows than there are are left out.
 
     Parameters
     ----------
     sizes : sequence of int
         Training rows; fewer rows are part of more rows of the same draw.
-    n_draws : int, default=3
-        Draws of these rows and of the noise; of armlab_3cable also of the lines held out.
+    n_draws : int, default=5
+        Draws of these rows and of the noise; of recorded robots also of the groups held out.
     n_test : int, default=1000
         Test rows.
     models : sequence of str, optional
-        Names of the models, as in the result. Default: all.
+        Names of the models, as in the result. Default: `CURVES`; of the other studies all.
     data_home : path-like, optional
         Folder of the recordings, see `datasets.load_armlab`. One that is absent is left out with
         a warning.
@@ -99,16 +111,15 @@ def learning_curves(
     -------
     list of dict
         One entry per case and model: "case", "draw", "n", "model", "seconds" (CPU time of the fit)
-        and by "errors" of every test "mean", "max" [m] and "n_test". Of "auto" also "chosen" and
-        "scores", its cross-validated errors by candidate [m].
+        and by "errors" of every test "mean", "max" [m] and "n_test". Of "auto" also "chosen",
+        "weights", "scores", its cross-validated errors by candidate, and "expected_distance" [m].
     """
     cases = trunk_cases(sizes, n_draws, n_test, folder, n_jobs)
-    return examine(
-        cases + armlab_cases(sizes, n_draws, n_test, data_home),
-        models,
-        n_jobs,
-        progress,
-    )
+    for load in (armlab, plain_ftdcr, asl_trunk):
+        robot = load(data_home)
+        if robot is not None:
+            cases += recorded_cases(robot, sizes, n_draws, n_test)
+    return examine(cases, CURVES if models is None else models, n_jobs, progress)
 
 
 def extrapolation(
@@ -144,7 +155,7 @@ def extrapolation(
         trunk_cases([n], n_draws, n_test, folder, n_jobs, inner=part) for part in INNER
     )
     cases = [case for one in trunks for case in one]
-    cases += armlab_cases([n], n_draws, n_test, data_home, inner=True)
+    cases += pull_cases_of_armlab(n, n_draws, n_test, data_home)
     cases += pull_cases(data_home, thin=2)
     return examine(cases, models, n_jobs, progress)
 
@@ -224,10 +235,10 @@ def hybrids_report(
         report.text(f"{case}, {test}:")
         rows = []
         for model in dict.fromkeys(model for model, _ in means):
-            values = (1e3 * np.array(means[model, n]) for n in sizes)
-            rows.append(
-                [model, *(f"{mean:.2f} ± {std:.2f}" for mean, std, _ in values)]
-            )
+            cells = [
+                _spread(means[model, n]) if (model, n) in means else "" for n in sizes
+            ]
+            rows.append([model, *cells])
         report.table(["rows", *map(str, sizes)], rows)
     if curves:
         report.figure(
@@ -269,7 +280,7 @@ def hybrids_report(
 
 
 _COLUMNS = ("study", "case", "test", "rows", "model", "mean_mm", "std_mm", "max_mm")
-_COLUMNS += ("cross_validated_mm",)
+_COLUMNS += ("cross_validated_mm", "expected_mm")
 
 
 def stored_entries(path: Any) -> dict[str, list[dict[str, Any]]]:
@@ -290,7 +301,7 @@ def stored_entries(path: Any) -> dict[str, list[dict[str, Any]]]:
 
 
 def csv_lines(study: str, entries: list[dict[str, Any]]) -> list[list[Any]]:
-    """Return one line for each model, size and test; of auto with its cross-validated error."""
+    """Return one line for each model, size and test; of auto with the error that it expects."""
     lines, by_size = [], study == "few rows"
     for case, test in _tests(entries):
         for key, found in _means(entries, case, test, by_size=by_size).items():
@@ -302,9 +313,17 @@ def csv_lines(study: str, entries: list[dict[str, Any]]) -> list[list[Any]]:
                 "" if size is None and len({e["n"] for e in some}) > 1 else some[0]["n"]
             )
             errors = [1e3 * float(error) for error in found]
-            held_out = 1e3 * float(np.mean(scores)) if scores else ""
-            lines.append([study, case, test, rows, model, *errors, held_out])
+            expected = [e["expected_distance"] for e in some if "scores" in e]
+            promised = ["", ""]
+            if scores:
+                promised = [1e3 * float(np.mean(part)) for part in (scores, expected)]
+            lines.append([study, case, test, rows, model, *errors, *promised])
     return lines
+
+
+def _spread(errors: tuple[float, float, float]) -> str:
+    mean, std, _ = 1e3 * np.array(errors)
+    return f"{mean:.2f} ± {std:.2f}"
 
 
 _CHOICES = ("case", "draw", "model", "calibrated", "chosen", "cross-validated", "test")
@@ -349,21 +368,27 @@ def _means(
 
 def _curves_figure(curves: list[dict[str, Any]]) -> Any:
     cases = [(case, test) for case, test in _tests(curves) if test != "with noise"]
-    figure, axes = plots.new_figure(3.4 * len(cases), 4.2, 1, len(cases), squeeze=False)
-    for ax, (case, test) in zip(axes[0], cases, strict=True):
+    n_lines = -(-(len(cases) + 1) // _IN_LINE)  # the last panel is the legend
+    shape = n_lines, min(_IN_LINE, len(cases) + 1)
+    figure, axes = plots.new_figure(10.5, 4.0 * n_lines, *shape, squeeze=False)
+    for ax, (case, test) in zip(axes.flat, cases, strict=False):
         means = _means(curves, case, test, by_size=True)
         sizes = sorted({n for _, n in means})
-        errors = {
-            m: [means[m, n][0] for n in sizes] for m in _LOOKS if (m, sizes[0]) in means
-        }
+        errors = {}
+        for model in _LOOKS:
+            by_size = [means.get((model, n), [np.nan])[0] for n in sizes]
+            if np.isfinite(by_size).any():
+                errors[model] = by_size
         plots.LearningCurveDisplay(sizes, errors).plot(ax, unit="mm", styles=_LOOKS)
         ax.get_legend().remove()
-        ax.set(
-            title=f"{case}, {test}",
-            ylabel="mean tip error [mm]" if ax is axes[0, 0] else "",
-        )
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
+        _plain_ticks(ax.yaxis)
+        ax.set(title=f"{case}, {test}", ylabel="")
+    for ax in axes[:, 0]:
+        ax.set_ylabel("mean tip error [mm]")
+    for ax in axes.flat[len(cases) :]:
+        ax.set_axis_off()
+    lines = axes[0, 0].get_legend_handles_labels()
+    axes.flat[-1].legend(*lines, loc="center", frameon=False)
     return figure
 
 
@@ -417,7 +442,7 @@ def _outside_figure(outside: list[dict[str, Any]]) -> Any:
 
 def _plain_ticks(axis: Any) -> None:
     low, high = axis.get_view_interval()
-    ticks = [t for t in (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500) if low < t < high]
+    ticks = [t for t in _TICKS if low < t < high]
     axis.set_ticks(ticks, [f"{t:g}" for t in ticks])
     axis.set_ticks([], minor=True)
 
@@ -436,7 +461,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "--sizes", type=int, nargs="+", default=SIZES, help="training rows"
     )
     parser.add_argument(
-        "--draws", type=int, default=3, help="draws of rows and noise; default: 3"
+        "--draws", type=int, default=5, help="draws of the few rows; default: 5"
     )
     parser.add_argument("--test-rows", type=int, default=1000, help="default: 1000")
     parser.add_argument(
@@ -469,7 +494,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     common["progress"] = shown
     trunks = {"n_test": given.test_rows, "folder": given.rows, **common}
     curves = learning_curves(given.sizes, given.draws, **trunks)
-    outside = extrapolation(min(400, max(given.sizes)), given.draws, **trunks)
+    outside = extrapolation(min(400, max(given.sizes)), min(3, given.draws), **trunks)
     for path in hybrids_report(curves, outside, held_out_motions(**common)).write(
         given.out
     ):
