@@ -155,6 +155,7 @@ def _learners(case: Case) -> dict[str, Callable[[], HybridForwardModel]]:
     learners["serial, pose, no guard"] = partial(
         hybrid, "pose", coupling="serial", guard=None
     )
+    learners[STRUCTURAL] = partial(hybrid, "structural", coupling="serial")
     auto = partial(HybridForwardModel, case.chain, AUTO, random_state=seed)
     learners[AUTO] = auto
     if case.in_time:
