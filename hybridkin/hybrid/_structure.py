@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -48,52 +48,58 @@ class Blocks:
     @classmethod
     def of(cls, varies: Tensor, scales: Mapping[str, float] = STRUCTURE) -> Blocks:
         """Return the blocks of S segments; `varies` (S,) says whose lengths vary, bool."""
-        S = len(varies)
-        names: list[str] = []
-        directions: list[Tensor] = []
-
-        def add(name: str, **entries: Tensor) -> None:
-            weights = _nothing(S)._replace(**entries)
-            names.append(name)
-            directions.append(torch.cat([entry.flatten() for entry in weights]))
-
-        segments = identity(S, _nothing(S).zeros)
-        kinds = identity(3, segments)
-        along, across = torch.zeros(2, 3, 3, dtype=segments.dtype, device="cpu")
-        along[1, 1] = along[2, 2] = 1.0
-        across[1, 2] = -1.0
-        across[2, 1] = 1.0
-        for k, segment in enumerate(segments):
-            own = kinds[0 if varies[k] else 1 :]
-            for kind in own:
-                name = "zero bends" if kind[0] == 0.0 else "zero lengths"
-                add(name, zeros=scales[name] * torch.outer(segment, kind))
-            for name, ring in (("ring stretch", along), ("ring turn", across)):
-                add(name, maps=scales[name] * torch.einsum("k,ij->kij", segment, ring))
-            for out in own:
-                for of in own:
-                    entry = torch.einsum("k,i,j->kij", segment, out, of)
-                    add("ring maps", maps=scales["ring maps"] * entry)
-        every = torch.ones_like(segments[0])
-        for axis in kinds:
-            twists = scales["gravity"] * torch.outer(every, axis)
-            add("gravity", twists=twists, sags=scales["sag of a twist"] * twists)
-            for segment in segments:
-                load = torch.outer(segment, axis)
-                add("twists", twists=scales["twists"] * load)
-                add("sags", sags=scales["sags"] * load)
-        used = [k for k, name in enumerate(names) if scales[name] > 0.0]
-        return cls(
-            tuple(names[k] for k in used), torch.stack([directions[k] for k in used])
-        )
+        names = []
+        directions = []
+        for name, error in _errors(varies, scales["sag of a twist"]):
+            if scales[name] > 0.0:
+                flat = torch.cat([entry.flatten() for entry in error])
+                names.append(name)
+                directions.append(scales[name] * flat)
+        return cls(tuple(names), torch.stack(directions))
 
     def weights(self, parameters: Tensor) -> Weights:
         """Return the weights of parameters (P,) in units of their prior."""
         return _weights(parameters @ self.directions)
 
 
-def _nothing(S: int) -> Weights:
-    return _weights(torch.zeros(18 * S, dtype=torch.float64, device="cpu"))
+def _errors(varies: Tensor, sag_of_a_twist: float) -> Iterator[tuple[str, Weights]]:
+    """Yield every free error of S segments of size one, with the name of its block."""
+    S = len(varies)
+    nothing = _weights(torch.zeros(18 * S, dtype=torch.float64, device="cpu"))
+    segments = identity(S, nothing.zeros)
+    axes = identity(3, segments)
+    for k, segment in enumerate(segments):
+        for name, zero in _zeros(bool(varies[k]), axes):
+            yield name, nothing._replace(zeros=torch.outer(segment, zero))
+        for name, ring in _rings(bool(varies[k]), axes):
+            yield name, nothing._replace(maps=segment[:, None, None] * ring)
+    for axis in axes:
+        load = axis.expand(S, 3)
+        yield "gravity", nothing._replace(twists=load, sags=sag_of_a_twist * load)
+        for segment in segments:
+            of_segment = torch.outer(segment, axis)
+            yield "twists", nothing._replace(twists=of_segment)
+            yield "sags", nothing._replace(sags=of_segment)
+
+
+def _zeros(has_strain: bool, axes: Tensor) -> Iterator[tuple[str, Tensor]]:
+    """Yield the constant errors (3,) of strain and bending."""
+    strain, x, y = axes
+    if has_strain:
+        yield "zero lengths", strain
+    yield "zero bends", x
+    yield "zero bends", y
+
+
+def _rings(has_strain: bool, axes: Tensor) -> Iterator[tuple[str, Tensor]]:
+    """Yield the linear maps (3, 3) of a segment's own strain and bending."""
+    _, x, y = axes
+    yield "ring stretch", torch.outer(x, x) + torch.outer(y, y)
+    yield "ring turn", torch.outer(y, x) - torch.outer(x, y)
+    own = axes if has_strain else axes[1:]
+    for changed in own:
+        for by in own:
+            yield "ring maps", torch.outer(changed, by)
 
 
 def _weights(flat: Tensor) -> Weights:
@@ -319,7 +325,8 @@ def fit_structure(
         design = StructureDesign(chain, rows.q, factor, scales)
         problem = _Problem(design, rows)
         theta, rest, A = problem.minimum()
-        system = torch.einsum("nmp,nmq->pq", A, A) + identity(len(theta), A)
+        flat = A.flatten(0, 1)
+        system = flat.mT @ flat + identity(len(theta), A)
         covariance = torch.cholesky_inverse(torch.linalg.cholesky(system))
         residual = torch.full_like(rest, torch.nan)
         if left_out:
@@ -354,7 +361,7 @@ def _left_out(
         unexplained = identity(leverage.shape[1], leverage) - leverage
         return torch.linalg.solve(unexplained, rest)
     targets = rest + A @ theta
-    moment = torch.einsum("nmp,nm->p", A, targets)
+    moment = A.flatten(0, 1).mT @ targets.flatten()
     left = torch.empty_like(rest)
     for members in members_of(groups):
         own = A[members].flatten(0, 1)
