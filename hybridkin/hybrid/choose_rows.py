@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import warnings
+from abc import ABC, abstractmethod
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -17,15 +19,20 @@ from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
 from hybridkin.hybrid import _linearised
 from hybridkin.hybrid._features import PoseFeatures, QuadraticFeatures
+from hybridkin.hybrid._module import Hybrid
+from hybridkin.hybrid._structure import StructureDesign
 from hybridkin.hybrid.estimator import HybridForwardModel
 
-# Standard deviations at the tip, in reaches of the robot. Priors: weights of linear features and of
-# other features, translation of the base, its rotation [rad]. Last: noise of a measured tip.
+# For models without the errors of a structure: standard deviations at the tip, in reaches of the
+# robot. Priors: weights of linear features and of other features, translation of the base, its
+# rotation [rad]. Last: noise of a measured tip.
 _LINEAR = 0.055
 _OTHER = 0.0165
 _SHIFT = 0.033
 _TURN = 0.1
 _NOISE = 0.0055
+# For the errors of a structure: what they leave, of a coordinate, in reaches of the robot.
+_MISFIT = 0.009
 _LARGEST = 1000  # parameters above which features are reduced
 _MOST = 5000  # parameters
 _BLOCK = 1000  # rows whose design matrix is in memory at once
@@ -45,10 +52,11 @@ def choose_rows(
     """Return which candidates to measure next, in order, and the error expected after each.
 
     Greedy Bayesian I-optimality: each chosen row reduces the expected error over the target most.
-    The error of the mechanical model is assumed linear in unknown parameters: weights of pose
-    features that act inside the robot (quadratic features if the model is not a chain of arcs), and
-    a small motion of the base. The choice depends on the actuator vectors, not on measured tips, so
-    all rows can be chosen before the first measurement.
+    The error of the mechanical model is assumed linear in unknown parameters: of a chain with one
+    arc for each segment the errors of its structure, which ``error_model="structural"`` and "auto"
+    learn, with the same prior and noise; of another chain of arcs the weights of pose features,
+    else of quadratic features, and a small motion of the base. The choice depends on the actuator
+    vectors, not on measured tips, so all rows can be chosen before the first measurement.
 
     Do not use rows chosen for learning for a calibration without learning. They lie where the
     mechanical model has its largest errors, and make such a calibration worse.
@@ -57,7 +65,7 @@ def choose_rows(
     ----------
     model : ForwardModel, HybridForwardModel or callable
         A chain, any other model that `as_forward_model` accepts, or a fitted hybrid. Of a hybrid,
-        the mechanical model is used.
+        the mechanical model with the learned errors of its structure is used.
     candidates : array-like of shape (N, n_actuators)
         Actuator vectors that can be measured, for example a few thousand over the whole range
         [unit of q]. With backlash: the motion of the actuators, not the commands.
@@ -97,8 +105,8 @@ def choose_rows(
 
     Notes
     -----
-    For three segments on one core, 100 of 2000 candidates take a second and 80 MB, 100 of 20,000
-    six seconds and 350 MB.
+    For three segments on one core, 100 of 2000 candidates take a second and 70 MB, 100 of 20,000
+    four seconds and 150 MB.
 
     References
     ----------
@@ -119,7 +127,10 @@ def choose_rows(
             "for learning are worse than random rows. Set an error model, or measure random rows.",
             stacklevel=2,
         )
-    robot = as_forward_model(model).robot
+    forward_model = as_forward_model(model)
+    robot = forward_model.robot
+    if isinstance(forward_model, Hybrid) and forward_model.mechanical is not None:
+        forward_model = forward_model.mechanical
     q = _actuators(robot, candidates, "candidates")
     if measured is None:
         measured_rows = q[:0]
@@ -134,7 +145,11 @@ def choose_rows(
         names, places = _few_rows_of(labels(groups, len(q)))
     n = whole(n, "n", 1, len(names))  # of the candidates
     with torch.no_grad():
-        errors = _TipErrors(robot, torch.cat([q, measured_rows, aim]))
+        rows = torch.cat([q, measured_rows, aim])
+        if isinstance(robot, ArcChain) and robot.has_one_arc_per_segment:
+            errors = _StructuralErrors(robot, forward_model, rows)
+        else:
+            errors = _TipErrors(robot, rows)
         chosen, error = _greedy(
             errors, q[torch.from_numpy(places)], n, measured_rows, aim
         )
@@ -164,8 +179,75 @@ def _actuators(robot: ForwardModel, value: ArrayLike, name: str) -> Tensor:
     return rows
 
 
-class _TipErrors:
-    """The tip error as A theta, with theta ~ N(0, 1): the part that a serial hybrid can learn.
+class _Errors(ABC):
+    """The tip error as A theta, with theta ~ N(0, 1), and the noise of a measured tip."""
+
+    @abstractmethod
+    def design(self, q: Tensor) -> Tensor:
+        """Return A for rows q (N, n), shape (N, m, P) [m]."""
+
+    @abstractmethod
+    def noise(self, q: Tensor) -> Tensor:
+        """Return the covariance of the noise of rows, shape (N, m, m) [m^2]."""
+
+    @abstractmethod
+    def times(self, q: Tensor) -> Callable[[Tensor], Tensor]:
+        """Return the function of X (P, K) that gives A X for rows q (N, n), shape (N, m, K)."""
+
+    def gram(self, q: Tensor) -> Tensor:
+        """Return sum_n A_n' A_n over rows q (N, n), shape (P, P)."""
+        blocks = (self.design(rows).flatten(0, 1) for rows in q.split(_BLOCK))
+        return sum((A.mT @ A for A in blocks), q.new_zeros(()))
+
+    def information(self, q: Tensor) -> Tensor:
+        """Return sum_n A_n' R_n^-1 A_n over measured rows with noise R_n, shape (P, P)."""
+        total = q.new_zeros(())
+        for rows in q.split(_BLOCK):
+            A = self.design(rows)
+            factor = torch.linalg.cholesky(self.noise(rows))
+            white = torch.linalg.solve_triangular(factor, A, upper=False).flatten(0, 1)
+            total = total + white.mT @ white
+        return total
+
+
+class _StructuralErrors(_Errors):
+    """The tip error by the errors of a chain's structure, see `fit_structure`.
+
+    Parameters
+    ----------
+    chain : ArcChain
+        The chain without these errors, one arc for each segment.
+    model : ForwardModel
+        Where it is linearised: the chain, or the chain with its learned errors.
+    q : Tensor of shape (N, n)
+        All rows, which give the mean lengths and the noise of the actuators.
+    """
+
+    def __init__(self, chain: ArcChain, model: ForwardModel, q: Tensor) -> None:
+        self.structure = StructureDesign(chain, q)
+        self.model = model
+
+    def design(self, q: Tensor) -> Tensor:
+        z, _ = self.model.coordinates(q)
+        x, J = self.model.from_coordinates_and_jacobian(z)
+        _, fields = self.structure.arcs(q)
+        tips = x.unflatten(1, (-1, 3))
+        return self.structure.slopes(
+            tips, J.unflatten(1, (-1, 3)), fields, q.new_zeros(6)
+        )
+
+    def noise(self, q: Tensor) -> Tensor:
+        factor = self.structure.noise(q, self.model.forward_and_jacobian(q)[1])
+        misfit = (_MISFIT * self.structure.reach) ** 2
+        return factor @ factor.mT + misfit * identity(factor.shape[1], q)
+
+    def times(self, q: Tensor) -> Callable[[Tensor], Tensor]:
+        A = torch.cat([self.design(rows) for rows in q.split(_BLOCK)])
+        return lambda X: A @ X
+
+
+class _TipErrors(_Errors):
+    """The tip error that a serial hybrid can learn by features.
 
     The rows of A are [J_z D (x) phi | base]. Weights of the features phi(q) act on the coordinates
     z inside the robot, in units D that move the tip by 1 m (rms); the base moves and rotates.
@@ -216,39 +298,47 @@ class _TipErrors:
         return J * self.units, self.features(q) @ self.basis, base
 
     def design(self, q: Tensor) -> Tensor:
-        """Return A for rows q (N, n), shape (N, m, P)."""
         J, phi, base = self.parts(q)
         return torch.cat([_linearised.design(J, phi), base], dim=2)
 
-    def gram(self, q: Tensor) -> Tensor:
-        """Return sum_n A_n' A_n over rows q (N, n), shape (P, P)."""
-        blocks = (self.design(rows).flatten(0, 1) for rows in q.split(_BLOCK))
-        return sum((A.mT @ A for A in blocks), q.new_zeros(()))
+    def noise(self, q: Tensor) -> Tensor:
+        m = len(self.center)
+        return (self.variance * identity(m, q)).expand(len(q), -1, -1)
+
+    def times(self, q: Tensor) -> Callable[[Tensor], Tensor]:
+        J, phi, base = self.parts(q)
+        C = J.shape[2]
+        K = phi.shape[1]
+
+        def product(X: Tensor) -> Tensor:
+            weights, moves = X.tensor_split([C * K])
+            inside = phi @ weights.view(C, K, -1).transpose(0, 1).flatten(1)
+            return J @ inside.unflatten(1, (C, -1)) + base @ moves
+
+        return product
 
 
 def _greedy(
-    errors: _TipErrors, q: Tensor, n: int, known: Tensor, aim: Tensor
+    errors: _Errors, q: Tensor, n: int, known: Tensor, aim: Tensor
 ) -> tuple[list[int], NDArray]:
     """Return n of the motions q (G, R, n), each the best given those before, and the errors.
 
-    With S the covariance of theta, M the mean of A' A over the target and s^2 the noise, a motion
-    with rows A reduces the mean squared error tr(M S) by tr[(A S A' + s^2)^-1 A S M S A']. A chosen
+    With S the covariance of theta, M the mean of A' A over the target and R the noise, a motion
+    with rows A reduces the mean squared error tr(M S) by tr[(A S A' + R)^-1 A S M S A']. A chosen
     motion changes S by a matrix of low rank, with which both products are updated for all motions.
     """
     size = q.shape[1]
-    J, phi, base = errors.parts(q.flatten(0, 1))
-    (_, m, C) = J.shape
-    K = phi.shape[1]
+    flat = q.flatten(0, 1)
+    times = errors.times(flat)
+    noise = _of_motions(errors.noise(flat), size)
     M = errors.gram(aim) / len(aim)
-    information = identity(len(M), M) + errors.gram(known) / errors.variance
+    information = identity(len(M), M) + errors.information(known)
     S = torch.cholesky_inverse(torch.linalg.cholesky(information))
     SMS = S @ M @ S
     blocks = (errors.design(part.flatten(0, 1)) for part in q.split(_BLOCK // size))
-    designs = (A.flatten(0, 1).unflatten(0, (-1, size * m)) for A in blocks)
+    designs = (A.flatten(0, 1).unflatten(0, (-1, size * A.shape[1])) for A in blocks)
     about = [(A @ S @ A.mT, A @ SMS @ A.mT) for A in designs]
     spread, worth = (torch.cat(part) for part in zip(*about, strict=True))
-    # Rows of a motion have similar errors.
-    noise = max(1.0, size / _WORTH) * errors.variance * identity(size * m, q)
     left = (M * S).sum()
     chosen = []
     squares = []
@@ -258,13 +348,11 @@ def _greedy(
         k = int(torch.where(free, gain, -1.0).argmax())
         free[k] = False
         A = errors.design(q[k]).flatten(0, 1)
-        L = torch.linalg.cholesky(spread[k] + noise)
+        L = torch.linalg.cholesky(spread[k] + noise[k])
         G = torch.linalg.solve_triangular(L, A @ S, upper=False).mT
         MG = M @ G
-        weights, moves = torch.cat([G, S @ MG], dim=1).split([C * K, len(S) - C * K])
-        inside = phi @ weights.view(C, K, -1).transpose(0, 1).flatten(1)
-        moved = J @ inside.unflatten(1, (C, -1)) + base @ moves
-        a, b = moved.view(len(q), size * m, -1).split(size * m, dim=2)
+        moved = times(torch.cat([G, S @ MG], dim=1)).view(len(q), len(A), -1)
+        a, b = moved.split(len(A), dim=2)
         cross = a @ b.mT
         worth = worth - cross - cross.mT + a @ (G.mT @ MG) @ a.mT
         spread = spread - a @ a.mT
@@ -273,3 +361,13 @@ def _greedy(
         chosen.append(k)
         squares.append(float(left))
     return chosen, np.sqrt(np.maximum(squares, 0.0))
+
+
+def _of_motions(noise: Tensor, size: int) -> Tensor:
+    """Return the covariances (G, R m, R m) of motions of R rows from those of rows (G R, m, m).
+
+    Rows of a motion have similar errors.
+    """
+    blocks = max(1.0, size / _WORTH) * noise.unflatten(0, (-1, size))
+    own = identity(size, noise)[:, None, :, None]
+    return (own * blocks[:, :, :, None]).flatten(3, 4).flatten(1, 2)

@@ -8,7 +8,7 @@ from saved_models import arm, elastic_chain, tendon_chain
 
 from hybridkin import ConstantCurvatureChain, HybridForwardModel, as_forward_model, choose_rows
 from hybridkin._core.rotations import rotation
-from hybridkin.hybrid.choose_rows import _TipErrors
+from hybridkin.hybrid.choose_rows import _StructuralErrors, _TipErrors
 
 
 def trunk(size=1.0):
@@ -31,13 +31,19 @@ def explicit(robot, q, measured, target, times=1.0):
     """
     q, measured, target = map(torch.from_numpy, (q, measured, target))
     with torch.no_grad():
-        errors = _TipErrors(robot, torch.cat([q, measured, target]))
+        rows = torch.cat([q, measured, target])
+        if isinstance(robot, ConstantCurvatureChain):
+            errors = _StructuralErrors(robot, robot, rows)
+        else:
+            errors = _TipErrors(robot, rows)
         information = torch.eye(errors.design(q).shape[2], dtype=q.dtype)
 
+        def of(rows, times=1.0):
+            A, R = errors.design(rows), times * errors.noise(rows)
+            return (A.mT @ torch.linalg.solve(R, A)).sum(0)
+
         def after(rows):
-            A, B = (errors.design(part).flatten(0, 1) for part in (measured, q[rows]))
-            data = A.mT @ A / errors.variance + B.mT @ B / (times * errors.variance)
-            S = torch.linalg.inv(information + data)
+            S = torch.linalg.inv(information + of(measured) + of(q[rows], times))
             spread = [torch.trace(A @ S @ A.mT) for A in errors.design(target)]
             return float(torch.stack(spread).mean())
 
