@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from math import degrees
 from typing import NamedTuple
 
 import numpy as np
@@ -192,6 +193,30 @@ class StructuralChain(ForwardModel):
         self.register_buffer("motion", motion)
         self.n_actuators = chain.n_actuators
         self.n_outputs = chain.n_outputs
+
+    def extra_repr(self) -> str:
+        """Return the sizes of the errors: the largest segment's, and the motion of the base."""
+
+        def largest(entries: Tensor) -> float:
+            return float(entries.flatten(1).norm(dim=1).max())
+
+        turn = 2.0 * torch.asin(
+            (self.motion[:3, :3] - identity(3, self.motion)).norm() / 8**0.5
+        )
+        origin = self.chain.base[:3, 3].to(self.motion)
+        move = self.motion[:3, :3] @ origin + self.motion[:3, 3] - origin
+        sizes = {
+            "twist": (degrees(largest(self.twists)), "deg"),
+            "sag": (degrees(largest(self.sags)), "deg"),
+            "ring maps": (100.0 * largest(self.maps), "%"),
+            "zero strain": (100.0 * largest(self.zeros[:, :1]), "%"),
+            "zero bend": (degrees(largest(self.zeros[:, 1:])), "deg"),
+            "base turn": (degrees(float(turn)), "deg"),
+            "base move": (1e3 * float(move.norm()), "mm"),
+        }
+        return ", ".join(
+            f"{name} {size:.2g} {unit}" for name, (size, unit) in sizes.items()
+        )
 
     @property
     def robot(self) -> ArcChain:

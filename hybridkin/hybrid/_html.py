@@ -21,6 +21,9 @@ def fitted_rows(model: HybridPredictor) -> dict[str, object]:
         "training rows": f"{len(model._fitted.fitted_rows)} different rows",
         "domain": _domain(model),
     }
+    words = model._fitted.error.structure_in_words()
+    if words:
+        rows["structure"] = " ".join(words)
     if model.radius_ is not None:
         rows["estimated error radius"] = str(model.radius_)
     if model.play_ is not None:

@@ -39,12 +39,14 @@ from hybridkin.hybrid._spec import (
     residuals,
 )
 from hybridkin.hybrid._structural_model import best_refinement
+from hybridkin.hybrid._structure import fit_structure
 from hybridkin.hybrid.held_out import (
     MEAN_LENGTH,
     HeldOut,
     Predictions,
     chosen_blend,
 )
+from hybridkin.hybrid.structure_fit import StructureFit
 from hybridkin.learning.elm_cv import growing_network
 
 _MOST = 2000  # rows for kernel ridge, whose cost grows with the cube of their number
@@ -148,6 +150,7 @@ class Auto(ErrorModel):
             held_out=True,
             comparison=comparison,
             refined=_errors_of_structure(spec),
+            structure=_structure_of(spec, rows),
             candidates={name: fitted.module for name, fitted in fits.items()},
         )
 
@@ -220,6 +223,14 @@ def _errors_of_structure(spec: Spec) -> StructuralChain | None:
     """Return the refined mechanical model, if it is refined."""
     model = spec.mechanical
     return model if isinstance(model, StructuralChain) else None
+
+
+def _structure_of(spec: Spec, rows: Rows) -> StructureFit | None:
+    """Return the fit of the refined mechanical model, if it is refined."""
+    model = _errors_of_structure(spec)
+    if model is None:
+        return None
+    return fit_structure(model.without_errors, rows, left_out=False)
 
 
 def _fitted(

@@ -27,7 +27,8 @@ from hybridkin.hybrid._module import Hybrid, TipCorrection
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._wrapped import pose_errors, posed
 from hybridkin.hybrid.cv_results import CvResults
-from hybridkin.hybrid.held_out import Predictions
+from hybridkin.hybrid.held_out import MEAN_LENGTH, Predictions
+from hybridkin.hybrid.structure_fit import StructureFit
 
 Seed = int | np.random.RandomState | None
 Play = ArrayLike | HysteresisOperator | str | None
@@ -93,6 +94,8 @@ class FittedError:
         Of "auto": `HybridForwardModel.cv_results_`.
     refined : StructuralChain or None
         The refined mechanical model that the corrections are added to. None: the calibrated one.
+    structure : StructureFit or None
+        The fit of the refined model to the same rows. None: not refined, or of a part of a log.
     candidates : dict of str to Hybrid, or None
         Of "auto": every candidate, fitted to all rows.
     outside : Predictions or None
@@ -107,6 +110,7 @@ class FittedError:
     held_out: bool = False
     comparison: CvResults | None = None
     refined: StructuralChain | None = None
+    structure: StructureFit | None = None
     candidates: dict[str, Hybrid] | None = None
     outside: Predictions | None = None
 
@@ -117,6 +121,13 @@ class FittedError:
         if type(result) is tuple:
             result = result[0]
         return None if result is None else type(result).__name__
+
+    def structure_in_words(self) -> list[str]:
+        """Return the errors of the structure, and a forecast for more rows; nothing without one."""
+        if self.structure is None:
+            return []
+        forecast = self.structure.forecast_in_words(MEAN_LENGTH * self.noise)
+        return [forecast, f"{self.structure.in_words()}."]
 
 
 class Refinement:

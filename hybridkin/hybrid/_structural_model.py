@@ -137,4 +137,5 @@ class StructuralModel(ErrorModel):
             best.rmse / 3**0.5,
             held_out=True,
             refined=best.model,
+            structure=best,
         )

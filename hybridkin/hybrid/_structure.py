@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -20,6 +19,7 @@ from hybridkin.chains.structural import Loads, StructuralChain, Weights, change_
 from hybridkin.hybrid._linearised import members_of
 from hybridkin.hybrid._readout_fit import tips_of
 from hybridkin.hybrid._rows import Rows
+from hybridkin.hybrid.structure_fit import StructureFit
 
 # Noise of a tip coordinate [reaches of the robot], and of an actuator [its spread in the log].
 _TIP_NOISE = 0.004
@@ -114,18 +114,6 @@ def _weights(flat: Tensor) -> Weights:
     )
 
 
-class StructureFit(NamedTuple):
-    """A fitted structure, its posterior, and the residuals of held-out rows."""
-
-    model: StructuralChain
-    blocks: tuple[str, ...]  # block of every parameter; the base comes first
-    parameters: NDArray  # (P,), in units of their prior standard deviation
-    covariance: NDArray  # (P, P) of the posterior, in these units
-    factor: float  # common factor of the prior
-    residual: NDArray  # (N, m) [m], of every row from a fit without it, or its group
-    rmse: float  # weighted root mean square length of `residual` [m]
-
-
 class StructureDesign:
     """How the tips of a chain follow the errors of its structure.
 
@@ -166,7 +154,12 @@ class StructureDesign:
     @property
     def names(self) -> tuple[str, ...]:
         """The block of every entry of theta."""
-        return (*6 * ("base",), *self.blocks.names)
+        return (*3 * ("base turn",), *3 * ("base move",), *self.blocks.names)
+
+    def units(self, scales: Mapping[str, float]) -> Tensor:
+        """Return one prior standard deviation of every entry of theta (P,) [rad], [m] or [-]."""
+        of_blocks = [self.factor * scales[name] for name in self.blocks.names]
+        return torch.cat([self.base, torch.tensor(of_blocks).to(self.base)])
 
     def arcs(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return the arcs (N, C) up to the tip at rows q, and their change (N, C, P) by blocks."""
@@ -336,6 +329,8 @@ def fit_structure(
         model = design.model(theta)
     weights = rows.counts * points(problem.seen.numpy())[..., 0].sum(1)
     squares = residual.square().sum(1).numpy()
+    in_metres = (problem.noise @ A).flatten(0, 1)
+    spread = (in_metres.mT @ in_metres).numpy() / weights.sum()
     return StructureFit(
         model,
         design.names,
@@ -344,6 +339,9 @@ def fit_structure(
         factor,
         rows.as_given(residual.numpy()),
         float(np.sqrt((rows.counts * squares).sum() / weights.sum())),
+        design.units(scales).numpy(),
+        spread,
+        len(rows),
     )
 
 

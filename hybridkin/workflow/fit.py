@@ -199,8 +199,8 @@ def _calibration(
 
 
 def _in_words(loaded: LoadedModel, model: HybridForwardModel) -> list[str]:
-    """Return what a model chose, its error radius, and motions that its log lacks."""
-    words = auto_in_words(model)
+    """Return what a model chose and expects, its error radius, and motions that its log lacks."""
+    words = [*auto_in_words(model), *model._fitted.error.structure_in_words()]
     if model.radius_ is not None:
         words.append(f"Estimated error radius: {model.radius_}.")
     if loaded.plane_in_words():
