@@ -2,6 +2,9 @@
 
 import inspect
 import re
+import runpy
+import shlex
+import sys
 import textwrap
 from enum import Enum
 from pathlib import Path
@@ -12,6 +15,7 @@ import torch
 
 import hybridkin
 from hybridkin import ForwardModel
+from hybridkin.cli.main import main
 
 DOCS = Path(__file__).parent.parent / "docs"
 PAGES = sorted(DOCS.glob("*.md"))
@@ -129,6 +133,26 @@ def test_code_of_the_learners_page_runs_as_printed(capsys):
     new_rows, left_out = map(float, capsys.readouterr().out.split()[:2])
     assert new_rows < 0.6  # against the truth without noise
     assert 0.9 < left_out < 1.2  # the noise is 1
+
+
+@pytest.mark.slow
+def test_commands_of_two_minutes_at_the_robot_run(tmp_path, monkeypatch, capsys):
+    """Those up to the fit, which is done without auto."""
+    pytest.importorskip("mujoco", reason='needs MuJoCo: pip install "hybridkin[sim]"')
+    studies = DOCS.parent / "examples" / "studies"
+    monkeypatch.setattr(sys, "path", [*sys.path, str(studies)])
+    monkeypatch.chdir(tmp_path)
+    lines = "".join(blocks("two_minutes.md", "console")).splitlines()
+    describe, plan, measure, fit = (shlex.split(line) for line in lines[:4])
+    assert main(describe[1:]) == 0
+    robot = Path("trunk.toml")
+    geometry, _, _ = robot.read_text(encoding="utf-8").partition("[limits]")
+    robot.write_text(geometry + blocks("two_minutes.md", "toml")[0], encoding="utf-8")
+    assert main(plan[1:]) == 0
+    runpy.run_path(str(DOCS.parent / measure[1]))["main"](measure[2:])
+    assert main([*fit[1:], "--folds", "2", "--jobs", "1", "--no-auto"]) == 0
+    assert "25 rows" in capsys.readouterr().out
+    assert Path("model/model.safetensors").is_file()
 
 
 # The gallery

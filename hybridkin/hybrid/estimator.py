@@ -81,7 +81,8 @@ class HybridForwardModel(HybridPredictor):
           stand on the chosen geometry, or on radii and base. Linear and quadratic features are
           serial, pose features in both couplings; mechanical models without a shape have parallel
           quadratic features instead. Kernel ridge takes part up to 2000 rows. If the gain over the
-          model without further corrections is within its standard error, nothing is added. Group
+          model without further corrections is within its standard error, twice that over errors of
+          the structure, nothing is added. Group
           rows by what will be new in use. Without a mechanical model: a linear function, a network
           and kernel ridge.
     coupling : {"parallel", "serial"}, default="parallel"
