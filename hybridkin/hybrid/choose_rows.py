@@ -31,8 +31,11 @@ _OTHER = 0.0165
 _SHIFT = 0.033
 _TURN = 0.1
 _NOISE = 0.0055
-# For the errors of a structure: what they leave, of a coordinate, in reaches of the robot.
-_MISFIT = 0.009
+# What the errors of a structure leave, of a coordinate, in reaches of the robot: from row to row,
+# and as a quadratic function of q, by which rows spread over the range.
+_ROUGH = 0.009
+_SMOOTH = 0.02
+_MOST_SMOOTH = 60  # quadratic functions
 _LARGEST = 1000  # parameters above which features are reduced
 _MOST = 5000  # parameters
 _BLOCK = 1000  # rows whose design matrix is in memory at once
@@ -52,11 +55,12 @@ def choose_rows(
     """Return which candidates to measure next, in order, and the error expected after each.
 
     Greedy Bayesian I-optimality: each chosen row reduces the expected error over the target most.
-    The error of the mechanical model is assumed linear in unknown parameters: of a chain with one
-    arc for each segment the errors of its structure, which ``error_model="structural"`` and "auto"
-    learn, with the same prior and noise; of another chain of arcs the weights of pose features,
-    else of quadratic features, and a small motion of the base. The choice depends on the actuator
-    vectors, not on measured tips, so all rows can be chosen before the first measurement.
+    The error of the mechanical model is assumed linear in unknown parameters. Of a chain with one
+    arc for each segment they are the errors of its structure, which ``error_model="structural"``
+    and "auto" learn, with the same prior and noise, and a smooth function that these leave. Of
+    another chain of arcs they are weights of pose features, else of quadratic features, and a small
+    motion of the base. The choice depends on the actuator vectors, not on measured tips, so all
+    rows can be chosen before the first measurement.
 
     Do not use rows chosen for learning for a calibration without learning. They lie where the
     mechanical model has its largest errors, and make such a calibration worse.
@@ -211,7 +215,11 @@ class _Errors(ABC):
 
 
 class _StructuralErrors(_Errors):
-    """The tip error by the errors of a chain's structure, see `fit_structure`.
+    """The tip error by the errors of a chain's structure, see `fit_structure`, and what they leave.
+
+    The rows of A are [structure | phi]. What the errors of the structure leave is partly a smooth
+    function of q, here quadratic features phi of unit mean square. Without it, many rows would be
+    at the ends of the range, where each of them alone says most of the structure.
 
     Parameters
     ----------
@@ -226,19 +234,28 @@ class _StructuralErrors(_Errors):
     def __init__(self, chain: ArcChain, model: ForwardModel, q: Tensor) -> None:
         self.structure = StructureDesign(chain, q)
         self.model = model
+        self.features = QuadraticFeatures.of_range(q)
+        phi = self.features(q)
+        n_linear = self.features.n_linear
+        basis = _linearised.basis(phi, n_linear, _MOST_SMOOTH)[:, n_linear:]
+        size = (phi @ basis).square().sum(1).mean().sqrt()
+        unit = torch.where(size > 0.0, _SMOOTH * self.structure.reach / size, 0.0)
+        self.basis = unit * basis
 
     def design(self, q: Tensor) -> Tensor:
         z, _ = self.model.coordinates(q)
         x, J = self.model.from_coordinates_and_jacobian(z)
         _, fields = self.structure.arcs(q)
         tips = x.unflatten(1, (-1, 3))
-        return self.structure.slopes(
-            tips, J.unflatten(1, (-1, 3)), fields, q.new_zeros(6)
-        )
+        by_arcs = J.unflatten(1, (-1, 3))
+        A = self.structure.slopes(tips, by_arcs, fields, q.new_zeros(6))
+        phi = self.features(q) @ self.basis
+        smooth = torch.einsum("ij,nk->nijk", identity(x.shape[1], q), phi)
+        return torch.cat([A, smooth.flatten(2)], dim=2)
 
     def noise(self, q: Tensor) -> Tensor:
         factor = self.structure.noise(q, self.model.forward_and_jacobian(q)[1])
-        misfit = (_MISFIT * self.structure.reach) ** 2
+        misfit = (_ROUGH * self.structure.reach) ** 2
         return factor @ factor.mT + misfit * identity(factor.shape[1], q)
 
     def times(self, q: Tensor) -> Callable[[Tensor], Tensor]:
