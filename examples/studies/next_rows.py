@@ -34,10 +34,17 @@ from hybridkin import (
 )
 from hybridkin.workflow.report import Report
 
-SIZES = (25, 50, 100, 200)
-MORE = (150, 300, 400)  # of random rows, to find how many are as good as chosen ones
+SIZES = (12, 25, 50, 100)
+MORE = (
+    18,
+    35,
+    70,
+    150,
+    200,
+)  # of random rows, to find how many are as good as chosen ones
 MOTIONS = (5, 10, 20)
 CHOSEN, FARTHEST, SOBOL, RANDOM = "chosen", "farthest point", "Sobol", "random"
+STRUCTURAL = "structural"  # the error model of the range and the path
 _LOW, _HIGH = 0.19, 0.31  # range of the lengths [m]
 _NOISE = 1e-3, 5e-4  # of lengths and tips, as the defaults of `make_trunk` [m]
 _TEST_SHARE = 0.25  # of the motions
@@ -101,7 +108,12 @@ def box_entries(
             for n in [*sizes, *(more if way == RANDOM else ())]:
                 entries.append(
                     _entry(
-                        case, way, "pose", case.q[order[:n]], case.x[order[:n]], test
+                        case,
+                        way,
+                        STRUCTURAL,
+                        case.q[order[:n]],
+                        case.x[order[:n]],
+                        test,
                     )
                 )
                 if way == CHOSEN:
@@ -117,7 +129,7 @@ def box_entries(
 
 def along_a_path(
     n: int = 50,
-    more: Sequence[int] = (50, 100, 150, 200, 300),
+    more: Sequence[int] = (50, 100, 150, 200),
     n_draws: int = 3,
     *,
     n_points: int = 60,
@@ -175,7 +187,9 @@ def along_a_path(
             *((RANDOM, pool, random[:k]) for k in more),
         ]
         for way, (lengths, tips), rows in ways:
-            entries.append(_entry(case, way, "pose", lengths[rows], tips[rows], test))
+            entries.append(
+                _entry(case, way, STRUCTURAL, lengths[rows], tips[rows], test)
+            )
     return entries
 
 
@@ -309,7 +323,7 @@ def worth(
     of = [
         e
         for e in entries
-        if (e["case"], e["way"], e["model"]) == (case, RANDOM, "pose")
+        if (e["case"], e["way"], e["model"]) == (case, RANDOM, STRUCTURAL)
     ]
     sizes = sorted({e["n"] for e in of})
     means = [np.mean([e[key] for e in of if e["n"] == n]) for n in sizes]
@@ -352,7 +366,7 @@ def next_report(
             )
             report.table(["way", *map(str, sizes)], rows)
             lines += _lines(title, some)
-            if model == "pose":
+            if model == STRUCTURAL:
                 report.text(*_worths(some, case))
     add_csv(report, "next_rows.csv", _COLUMNS, lines)
     return report

@@ -92,7 +92,7 @@ def choose_rows(
     expected_error : ndarray of shape (n,)
         Expected root mean square tip error over the target after each row [m]. If it falls slowly,
         more rows bring little. It is computed from the size of the robot, not from data: use it to
-        compare rows, not as an accuracy.
+        compare rows, not as an accuracy. Of the errors of a structure, without what they leave.
 
     Raises
     ------
@@ -198,6 +198,10 @@ class _Errors(ABC):
     def times(self, q: Tensor) -> Callable[[Tensor], Tensor]:
         """Return the function of X (P, K) that gives A X for rows q (N, n), shape (N, m, K)."""
 
+    def reported(self, M: Tensor) -> Tensor:
+        """Return the part of the mean M of A' A (P, P) whose error is reported."""
+        return M
+
     def gram(self, q: Tensor) -> Tensor:
         """Return sum_n A_n' A_n over rows q (N, n), shape (P, P)."""
         blocks = (self.design(rows).flatten(0, 1) for rows in q.split(_BLOCK))
@@ -257,6 +261,12 @@ class _StructuralErrors(_Errors):
         factor = self.structure.noise(q, self.model.forward_and_jacobian(q)[1])
         misfit = (_ROUGH * self.structure.reach) ** 2
         return factor @ factor.mT + misfit * identity(factor.shape[1], q)
+
+    def reported(self, M: Tensor) -> Tensor:
+        n = len(self.structure.names)  # the smooth function only spreads the rows
+        of_structure = torch.zeros_like(M)
+        of_structure[:n, :n] = M[:n, :n]
+        return of_structure
 
     def times(self, q: Tensor) -> Callable[[Tensor], Tensor]:
         A = torch.cat([self.design(rows) for rows in q.split(_BLOCK)])
@@ -356,7 +366,8 @@ def _greedy(
     designs = (A.flatten(0, 1).unflatten(0, (-1, size * A.shape[1])) for A in blocks)
     about = [(A @ S @ A.mT, A @ SMS @ A.mT) for A in designs]
     spread, worth = (torch.cat(part) for part in zip(*about, strict=True))
-    left = (M * S).sum()
+    reported = errors.reported(M)
+    left = (reported * S).sum()
     chosen = []
     squares = []
     free = torch.ones_like(spread[:, 0, 0], dtype=torch.bool)
@@ -374,7 +385,7 @@ def _greedy(
         worth = worth - cross - cross.mT + a @ (G.mT @ MG) @ a.mT
         spread = spread - a @ a.mT
         S = S - G @ G.mT
-        left = left - (G * MG).sum()
+        left = left - (G * (reported @ G)).sum()
         chosen.append(k)
         squares.append(float(left))
     return chosen, np.sqrt(np.maximum(squares, 0.0))
