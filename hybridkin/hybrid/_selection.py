@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import copy
+import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import LinAlgWarning
 from sklearn.linear_model import LinearRegression
 from typing_extensions import Self
 
+from hybridkin._core.turns import TURNS
 from hybridkin.calibration.choice import GeometryChoice
 from hybridkin.calibration.measured import distance, inner_and_outer
 from hybridkin.chains.arc_chain import ArcChain
@@ -73,7 +76,9 @@ class Part(NamedTuple):
 
     def predicted(self, model: ErrorModel, rows: Rows) -> NDArray:
         """Return the predictions (M, m) of an error model for the test rows."""
-        fitted = fit_hybrid(replace(self.spec, error_model=model), self.rows)
+        with TURNS.filters, warnings.catch_warnings():  # the full fit gives them
+            warnings.simplefilter("ignore", LinAlgWarning)
+            fitted = fit_hybrid(replace(self.spec, error_model=model), self.rows)
         return fitted.predict(rows.X[self.test])
 
 

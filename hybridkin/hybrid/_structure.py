@@ -145,9 +145,9 @@ class StructureDesign:
         self.lengths = lengths.mean(1)
         varies = lengths.std(1, correction=0) > _MOVES * self.reach
         self.blocks = Blocks.of(varies, scales)
-        self.base = factor * torch.tensor(
-            [*3 * [scales["base turn"]], *3 * [scales["base move"] * self.reach]]
-        ).to(q)
+        turn = q.new_full((3,), factor * scales["base turn"])
+        move = q.new_full((3,), factor * scales["base move"])
+        self.base = torch.cat([turn, self.reach * move])
         self.pivot = chain.base[:3, 3].to(q)
         self.spread = _ACTUATOR_NOISE * q.std(0, correction=0)
 
@@ -159,7 +159,7 @@ class StructureDesign:
     def units(self, scales: Mapping[str, float]) -> Tensor:
         """Return one prior standard deviation of every entry of theta (P,) [rad], [m] or [-]."""
         of_blocks = [self.factor * scales[name] for name in self.blocks.names]
-        return torch.cat([self.base, torch.tensor(of_blocks).to(self.base)])
+        return torch.cat([self.base, self.base.new_tensor(of_blocks)])
 
     def arcs(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return the arcs (N, C) up to the tip at rows q, and their change (N, C, P) by blocks."""
