@@ -1,4 +1,4 @@
-"""Few rows: whether auto keeps its promises, and what each part of the structural model brings.
+"""Few rows: whether models keep their promises, and what each part of the structural model brings.
 
 The figures of the docs page "Choosing coupling and error model", section "Few rows"::
 
@@ -21,6 +21,7 @@ import torch
 from csv_tables import add_csv
 from hybrid_cases import (
     AUTO,
+    STRUCTURAL,
     Case,
     armlab,
     plain_ftdcr,
@@ -54,14 +55,19 @@ def promise_cases(
 
 
 def promises(
-    cases: Sequence[Case], n_covered: int = 5, n_jobs: int | None = 1
+    cases: Sequence[Case],
+    name: str = AUTO,
+    n_covered: int = 5,
+    n_jobs: int | None = 1,
 ) -> list[dict[str, Any]]:
-    """Return what auto promises of each case, and what is true on its test rows.
+    """Return what a model promises of each case, and what is true on its test rows.
 
     Parameters
     ----------
     cases : sequence of Case
         Training rows, and test rows that are measured, or have the noise of the training rows.
+    name : {"auto", "serial, structural"}, default="auto"
+        The model.
     n_covered : int, default=5
         Draws whose models also estimate the radius that covers 90 % of the tips: five more fits.
     n_jobs : int, optional
@@ -70,27 +76,31 @@ def promises(
     Returns
     -------
     list of dict
-        One for each case: "case", "draw", "n", "expected" and "true", mean errors [m]; in covered
-        draws also "covered", the share of test rows within the radius, and its mean "radius" [m].
+        One for each case: "case", "model", "draw", "n", "expected" and "true", mean errors [m];
+        in covered draws also "covered", the share of test rows within the radius, and its mean
+        "radius" [m].
     """
     return Parallel(n_jobs)(
-        delayed(promise)(case, covered=case.draw < n_covered) for case in cases
+        delayed(promise)(case, name, case.draw < n_covered) for case in cases
     )
 
 
 @threadpool_limits.wrap(limits=1)
-def promise(case: Case, covered: bool) -> dict[str, Any]:
+def promise(case: Case, name: str, covered: bool) -> dict[str, Any]:
     """Return the entry of a case, see `promises`."""
     q, x = [*case.tests.values()][-1]
     model = HybridForwardModel(case.chain, AUTO, random_state=case.draw)
+    if name == STRUCTURAL:
+        structural = {"error_model": "structural", "coupling": "serial"}
+        model.set_params(**structural, calibrate=case.calibrate)
     if covered:
         model.set_params(coverage=COVERAGE)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # few rows, slack tendons
         model.fit(case.q, case.x, groups=case.groups)
     errors = np.linalg.norm(model.predict(q) - x, axis=1)
-    entry = {"case": case.name, "draw": case.draw, "n": len(case.q)}
-    entry["expected"] = model.cv_results_["expected_distance"]
+    entry = {"case": case.name, "model": name, "draw": case.draw, "n": len(case.q)}
+    entry["expected"] = expected_error(model)
     entry["true"] = float(errors.mean())
     if covered:
         _, radius = model.predict(q, return_radius=True)
@@ -99,11 +109,22 @@ def promise(case: Case, covered: bool) -> dict[str, Any]:
     return entry
 
 
+def expected_error(model: HybridForwardModel) -> float:
+    """Return the mean error to expect on new rows like those of the log [m]."""
+    if model.cv_results_ is not None:
+        return model.cv_results_["expected_distance"]
+    held_out = model.error_model_.residual
+    return float(np.linalg.norm(held_out, axis=1).mean())
+
+
 def promise_lines(entries: Sequence[dict[str, Any]]) -> list[list[Any]]:
     """Return one line for each case and size, with the columns of `PROMISES`."""
     lines = []
-    for name, n in dict.fromkeys((entry["case"], entry["n"]) for entry in entries):
-        draws = [entry for entry in entries if (entry["case"], entry["n"]) == (name, n)]
+    by_point: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
+    for entry in entries:
+        point = entry["case"], entry["model"], entry["n"]
+        by_point.setdefault(point, []).append(entry)
+    for point, draws in by_point.items():
         expected = np.array([entry["expected"] for entry in draws])
         true = np.array([entry["true"] for entry in draws])
         ratios = expected / true
@@ -112,8 +133,7 @@ def promise_lines(entries: Sequence[dict[str, Any]]) -> list[list[Any]]:
         radii = [1e3 * entry["radius"] for entry in covered]
         lines.append(
             [
-                name,
-                n,
+                *point,
                 len(draws),
                 1e3 * float(expected.mean()),
                 1e3 * float(true.mean()),
@@ -130,7 +150,15 @@ def promise_lines(entries: Sequence[dict[str, Any]]) -> list[list[Any]]:
     return lines
 
 
-PROMISES = ("case", "rows", "draws", "expected_mm", "true_mm", "ratio_of_means")
+PROMISES = (
+    "case",
+    "model",
+    "rows",
+    "draws",
+    "expected_mm",
+    "true_mm",
+    "ratio_of_means",
+)
 PROMISES += ("median_ratio", "least_ratio", "largest_ratio")
 PROMISES += ("covered_draws", "mean_coverage", "least_coverage", "mean_radius_mm")
 
@@ -225,7 +253,7 @@ def few_rows_report(
 ) -> Report:
     """Return the report of `promise_lines` and `ablation_lines`, with their tables as files."""
     report = Report("Few rows", {})
-    report.text("## What auto promises", "Errors on rows with noise.")
+    report.text("## What the models promise", "Errors on rows with noise.")
     report.table(PROMISES, [_texts(line) for line in promised])
     report.text("## Parts of the structural model", "Errors on rows without noise.")
     report.table(ABLATION, [_texts(line) for line in ablated])
@@ -248,12 +276,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--rows", help="folder that stores the simulated rows")
     parser.add_argument("--draws", type=int, default=20, help="default: 20")
     parser.add_argument(
-        "--covered", type=int, default=5, help="draws with a radius; default: 5"
+        "--covered", type=int, default=5, help="draws of auto with a radius; default: 5"
     )
     parser.add_argument("--jobs", type=int, default=1, help="processes; default: 1")
     given = parser.parse_args(arguments)
     cases = promise_cases(given.draws, data_home=given.data, folder=given.rows)
-    promised = promise_lines(promises(cases, given.covered, given.jobs))
+    promised = []
+    for name, n_covered in ((STRUCTURAL, given.draws), (AUTO, given.covered)):
+        promised += promise_lines(promises(cases, name, n_covered, given.jobs))
     ablated = ablation_lines(
         ablation((25, 100, 400), 5, folder=given.rows, n_jobs=given.jobs)
     )

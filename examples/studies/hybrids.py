@@ -280,7 +280,7 @@ def hybrids_report(
 
 
 _COLUMNS = ("study", "case", "test", "rows", "model", "mean_mm", "std_mm", "max_mm")
-_COLUMNS += ("cross_validated_mm", "expected_mm")
+_COLUMNS += ("cross_validated_mm", "expected_mm", "draws")
 
 
 def stored_entries(path: Any) -> dict[str, list[dict[str, Any]]]:
@@ -317,7 +317,9 @@ def csv_lines(study: str, entries: list[dict[str, Any]]) -> list[list[Any]]:
             promised = ["", ""]
             if scores:
                 promised = [1e3 * float(np.mean(part)) for part in (scores, expected)]
-            lines.append([study, case, test, rows, model, *errors, *promised])
+            lines.append(
+                [study, case, test, rows, model, *errors, *promised, len(some)]
+            )
     return lines
 
 
