@@ -109,8 +109,8 @@ def choose_rows(
 
     Notes
     -----
-    For three segments on one core, 100 of 2000 candidates take a second and 70 MB, 100 of 20,000
-    four seconds and 150 MB.
+    For three segments on one core, 100 of 2000 candidates take a second and 80 MB, 100 of 20,000
+    five seconds and 200 MB.
 
     References
     ----------
