@@ -22,7 +22,7 @@ STRUCTURE = {
     # segments, as they carry the same load, and the part of each one.
     "gravity": 0.5,
     "twists": 0.1,
-    # Sideways bend [rad] by the same load, per twist, and the part of each segment. For a rod that is
+    # Sideways bend [rad] by the same load, per twist, and the part of each segment. For a rod
     # clamped at both ends the ratio is GJ / (12 S EI), 0.02 to 0.06 for three segments; actuators
     # make real segments softer sideways. From 0.03 to 0.1 the errors differ by less than 6 %.
     "sag of a twist": 0.1,
