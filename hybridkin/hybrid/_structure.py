@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hybridkin._core.arrays import identity
+from hybridkin._core.blocks import in_blocks
 from hybridkin._core.rotations import cross_matrix, rotation
 from hybridkin.calibration.measured import points
 from hybridkin.calibration.natural_scales import STRUCTURE
@@ -25,6 +26,7 @@ from hybridkin.hybrid.structure_fit import StructureFit
 _TIP_NOISE = 0.004
 _ACTUATOR_NOISE = 0.02
 _MOVES = 1e-9  # spread of a length over the reach of the robot, above which it varies
+_BLOCK = 512  # rows whose derivatives are computed at once
 _ROUNDS = 30  # of Gauss-Newton; five are usual
 _SHORTEST = 1e-3  # part of a step below which the cost is at its minimum
 _SETTLED = 1e-7  # largest change of a parameter, in units of its prior
@@ -163,6 +165,10 @@ class StructureDesign:
 
     def arcs(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return the arcs (N, C) up to the tip at rows q, and their change (N, C, P) by blocks."""
+        z, fields = in_blocks(self._arcs_of_rows, q, _BLOCK)
+        return z, fields
+
+    def _arcs_of_rows(self, q: Tensor) -> tuple[Tensor, Tensor]:
         frames = self.chain.frames_and_moves(q)
         loads = Loads.of(frames, self.lengths)
         fields = torch.func.vmap(
