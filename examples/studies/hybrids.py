@@ -384,6 +384,8 @@ def _curves_figure(curves: list[dict[str, Any]]) -> Any:
         plots.LearningCurveDisplay(sizes, errors).plot(ax, unit="mm", styles=_LOOKS)
         ax.get_legend().remove()
         _plain_ticks(ax.yaxis)
+        ax.set_xticks(sizes[::2], [str(n) for n in sizes[::2]])
+        ax.set_xticks([], minor=True)
         ax.set(title=f"{case}, {test}", ylabel="")
     for ax in axes[:, 0]:
         ax.set_ylabel("mean tip error [mm]")
