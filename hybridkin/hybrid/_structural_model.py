@@ -30,7 +30,9 @@ _BETTER = 0.98  # of the held-out error, for another factor than one
 _ENOUGH = 5000  # rows that determine the few errors below other corrections
 _MOST = 400  # rows by which the refinement is chosen
 _FOLDS = 3
-_CLEARLY = 0.9  # of the held-out error of the chain alone: smaller gains are often chance
+_CLEARLY = (
+    0.9  # of the held-out error of the chain alone: smaller gains are often chance
+)
 
 
 class Structure(Refinement):

@@ -148,16 +148,36 @@ def choose_rows(
     if groups is not None:
         names, places = _few_rows_of(labels(groups, len(q)))
     n = whole(n, "n", 1, len(names))  # of the candidates
+    rows = torch.cat([q, measured_rows, aim])
+    places = torch.from_numpy(places)
+    try:
+        chosen, error = _chosen(
+            robot, forward_model, rows, q[places], n, measured_rows, aim
+        )
+    except torch.linalg.LinAlgError as failure:  # pyright: ignore
+        raise ValueError(
+            "`candidates`, `measured` or `target` hold numbers too large for the model; check "
+            "their unit."
+        ) from failure
+    return names[chosen], error
+
+
+def _chosen(
+    robot: ForwardModel,
+    model: ForwardModel,
+    rows: Tensor,
+    q: Tensor,
+    n: int,
+    known: Tensor,
+    aim: Tensor,
+) -> tuple[list[int], NDArray]:
+    """Return n of the motions q (G, R, n), and the errors; `rows` set the units."""
     with torch.no_grad():
-        rows = torch.cat([q, measured_rows, aim])
         if isinstance(robot, ArcChain) and robot.has_one_arc_per_segment:
-            errors = _StructuralErrors(robot, forward_model, rows)
+            errors = _StructuralErrors(robot, model, rows)
         else:
             errors = _TipErrors(robot, rows)
-        chosen, error = _greedy(
-            errors, q[torch.from_numpy(places)], n, measured_rows, aim
-        )
-    return names[chosen], error
+        return _greedy(errors, q, n, known, aim)
 
 
 def _few_rows_of(groups: NDArray) -> tuple[NDArray, NDArray]:

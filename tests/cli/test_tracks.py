@@ -58,7 +58,8 @@ def test_next_counts_what_is_measured_and_where_the_error_matters(robot, log, tm
     path = ["--path", tmp_path / "path.csv", "--dt", 1, "--unit", "mm"]
     _, record = document(capsys, *plan, *path)
     assert record["where"].startswith("along the path")
-    assert record["expected_errors"][-1] < 0.3 * fresh["expected_errors"][-1]
+    # A base that is not known to the end moves a path as it moves all tips.
+    assert record["expected_errors"][-1] < fresh["expected_errors"][-1]
 
 
 class Enough(ValueError):
