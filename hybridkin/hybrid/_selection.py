@@ -41,7 +41,7 @@ from hybridkin.hybrid._spec import (
     Spec,
     residuals,
 )
-from hybridkin.hybrid._structural_model import best_refinement
+from hybridkin.hybrid._structural_model import ENOUGH, best_refinement
 from hybridkin.hybrid._structure import fit_structure
 from hybridkin.hybrid.held_out import (
     MEAN_LENGTH,
@@ -231,9 +231,9 @@ def _errors_of_structure(spec: Spec) -> StructuralChain | None:
 
 
 def _structure_of(spec: Spec, rows: Rows) -> StructureFit | None:
-    """Return the fit of the refined mechanical model, if it is refined."""
+    """Return the fit of the refined mechanical model, if it is refined and more rows could help."""
     model = _errors_of_structure(spec)
-    if model is None:
+    if model is None or len(rows) > ENOUGH:
         return None
     return fit_structure(model.without_errors, rows, left_out=False)
 

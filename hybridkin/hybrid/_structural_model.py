@@ -12,7 +12,6 @@ from hybridkin._core.model import ForwardModel
 from hybridkin.calibration.choice import GeometryChoice
 from hybridkin.calibration.measured import distance, folds
 from hybridkin.chains.arc_chain import ArcChain
-from hybridkin.hybrid._drift import too_far
 from hybridkin.hybrid._error_models import named
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._spec import (
@@ -27,7 +26,8 @@ from hybridkin.hybrid._structure import fit_structure
 _FACTORS = (1.0, 0.3, 3.0)  # of the prior, to choose from by held-out errors
 _FEW = 60  # rows; with fewer the prior is not changed
 _BETTER = 0.98  # of the held-out error, for another factor than one
-_ENOUGH = 5000  # rows that determine the few errors below other corrections
+ENOUGH = 5000
+"""Rows that determine the few errors below other corrections."""
 _MOST = 400  # rows by which the refinement is chosen
 _FOLDS = 3
 _CLEARLY = (
@@ -52,10 +52,10 @@ class Structure(Refinement):
         chain = mechanical.without_errors
         if not isinstance(chain, ArcChain) or not chain.has_one_arc_per_segment:
             return mechanical
-        return fit_structure(chain, rows.thinned(_ENOUGH), left_out=False).model
+        return fit_structure(chain, rows.thinned(ENOUGH), left_out=False).model
 
 
-class Candidate(NamedTuple):
+class RefinedGeometry(NamedTuple):
     """A geometry to calibrate, and how the calibrated chain is refined."""
 
     geometry: GeometryChoice
@@ -71,11 +71,11 @@ def best_refinement(spec: Spec, geometry: GeometryChoice, rows: Rows) -> Refinem
     chain = geometry.chain
     if not isinstance(chain, ArcChain) or not chain.has_one_arc_per_segment:
         return UNREFINED
-    candidates = [Candidate(geometry, Structure())]
+    candidates = [RefinedGeometry(geometry, Structure())]
     for usual in geometry.usual[-1:]:
         if usual.name != geometry.name:
-            candidates.append(Candidate(usual, Structure(usual.name)))
-    candidates.append(Candidate(geometry, UNREFINED))
+            candidates.append(RefinedGeometry(usual, Structure(usual.name)))
+    candidates.append(RefinedGeometry(geometry, UNREFINED))
     rows = rows.thinned(_MOST)
     groups = rows.groups
     if groups is not None and len(np.unique(groups)) < 2:
@@ -85,15 +85,20 @@ def best_refinement(spec: Spec, geometry: GeometryChoice, rows: Rows) -> Refinem
         part = replace(rows.take(train), groups=None)
         held_out = rows.take(test)
         for k, candidate in enumerate(candidates):
-            fitted = replace(spec, mechanical=candidate.geometry.chain)
-            fitted = replace(fitted, geometry=candidate.geometry)
-            fitted = replace(fitted, refinement=candidate.refinement)
-            model = fitted.recalibrated(part).mechanical
+            of_candidate = replace(
+                spec,
+                mechanical=candidate.geometry.chain,
+                geometry=candidate.geometry,
+                refinement=candidate.refinement,
+            )
+            model = of_candidate.recalibrated(part).mechanical
             assert model is not None
             with torch.no_grad():
                 predicted = model(held_out.q).numpy()
             totals[k] += held_out.counts @ distance(predicted, held_out.tips)
     totals[-1] *= _CLEARLY
+    if not np.isfinite(totals).any():
+        return UNREFINED
     return candidates[int(np.nanargmin(totals))].refinement
 
 
@@ -122,22 +127,15 @@ class StructuralModel(ErrorModel):
                 "error_model='quadratic'."
             )
         factors = self.factors if len(rows) >= _FEW else self.factors[:1]
-        compared = len(factors) > 1
-        fits = []
-        try:
-            for factor in factors:
-                left_out = spec.held_out or compared
-                fits.append(fit_structure(chain, rows, factor, left_out))
-        except torch.linalg.LinAlgError as error:  # pyright: ignore
-            raise too_far() from error
+        left_out = spec.held_out or len(factors) > 1
+        fits = [fit_structure(chain, rows, factor, left_out) for factor in factors]
         best = fits[0]
         for fit in fits[1:]:
             if fit.rmse < _BETTER * best.rmse:
                 best = fit
-        n_tips = rows.tips.shape[1] // 3
         return FittedError(
             best,
-            n_tips * [[]],
+            [[] for _ in chain.markers],
             StructuralModel(best.factor),
             best.rmse / 3**0.5,
             held_out=True,

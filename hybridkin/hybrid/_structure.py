@@ -17,6 +17,7 @@ from hybridkin.calibration.measured import points
 from hybridkin.calibration.natural_scales import STRUCTURE
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.structural import Loads, StructuralChain, Weights, change_of
+from hybridkin.hybrid._drift import too_far
 from hybridkin.hybrid._linearised import members_of
 from hybridkin.hybrid._readout_fit import tips_of
 from hybridkin.hybrid._rows import Rows
@@ -322,8 +323,11 @@ def fit_structure(
     """
     with torch.no_grad():
         design = StructureDesign(chain, rows.q, factor, scales)
-        problem = _Problem(design, rows)
-        theta, rest, A = problem.minimum()
+        try:
+            problem = _Problem(design, rows)
+            theta, rest, A = problem.minimum()
+        except torch.linalg.LinAlgError as error:  # pyright: ignore
+            raise too_far() from error
         flat = A.flatten(0, 1)
         system = flat.mT @ flat + identity(len(theta), A)
         covariance = torch.cholesky_inverse(torch.linalg.cholesky(system))

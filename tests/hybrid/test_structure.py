@@ -172,6 +172,12 @@ def test_inputs_are_not_changed():
     np.testing.assert_array_equal(rows.y, y)
 
 
+def test_numbers_too_large_are_named():
+    q = 1e29 * motions(TRUNK, 20)
+    with pytest.raises(ValueError, match="too large"):
+        fit_structure(TRUNK, Rows(q.numpy(), np.ones((20, 3))))
+
+
 def test_structural_hybrid_of_the_shipped_trunk():
     data = datasets.load_trunk()
     rows = np.random.default_rng(0).permutation(len(data.q))
