@@ -84,6 +84,18 @@ IK_LEAST_PULL = (
 )
 IK_PULL_RATIO = 0.125  # ratio of one share to the one before
 
+# Rest at the point nearest to a target out of reach, eq. (21).
+IK_NO_FALL = 1e-12  # of a squared error: smaller falls are rounding
+IK_NO_WAY = 1e-8  # of the ranges: what shorter steps show is rounding
+IK_CURVED = 1e-6  # of |J|^2: least lambda^2, and least curvature along a step that counts
+IK_MOST_CURVED = 1e4  # of |J|^2: largest lambda^2
+IK_EASED = 0.7  # factor on the curvature after a step that kept its promise
+IK_EASED_WAY = 1e-4  # of the ranges: shorter steps do not ease it
+IK_JUMP = 0.5  # of an error: a step says nothing about a target that moved more since then
+# What is remembered of the last step: the curvature, the squared length of the step, its largest
+# share of a range; then the motion of the tip that J promised, and the error that it was made for.
+IK_BENT, IK_WAY_SQ, IK_SHARE, IK_PROMISED = 0, 1, 2, 3
+
 # The state of a robot that follows targets: one array.
 IK_MODE = 0  # sum of the bits below
 IK_PERIOD = 1  # [s]
@@ -94,7 +106,8 @@ IK_DAMPING = 5
 IK_DISTANCE = 6  # length of the error
 IK_STOPPED = 7  # whether half-spaces changed the motion of the tip
 # Then target, motion of the target in this period, measured tip, last measured tip minus model, x
-# and error; q, step, q before, whether it was held (n each); and J. Points of a task of m rows have
+# and error; q, step, q before, whether it was held (n each); what is remembered of the last step (2 m
+# + IK_PROMISED); and J. Points of a task of m rows have
 # m numbers, poses 16; motions and errors m. With hysteresis q is the command and q before what the
 # actuators did; then follow its state, and one to try.
 IK_TARGET = 8

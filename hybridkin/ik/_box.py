@@ -49,6 +49,17 @@ class BoxProblem(NamedTuple):
         return self.z + apply_columns(self.J, mu)
 
 
+def calmed(z: Tensor, task: Tensor, calm: Tensor | float) -> Tensor:
+    """Return steps z (N, n), where `calm` (N,) is positive at most half as long as those of a task.
+
+    Else the way to a posture would go on shaking a robot that rests where its target is out of
+    reach.
+    """
+    share = task.norm(dim=-1) / (2.0 * z.norm(dim=-1))
+    share = torch.where(torch.as_tensor(calm) > 0.0, share.clamp_max(1.0), 1.0)
+    return share.nan_to_num(1.0)[..., None] * z
+
+
 def box_limited_step(
     problem: BoxProblem, mu: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
@@ -135,7 +146,7 @@ def box_limited_step(
     return problem.clip(problem.unlimited(best)), best
 
 
-def strict_box_step(problem: BoxProblem) -> Tensor:
+def strict_box_step(problem: BoxProblem, calm: Tensor) -> Tensor:
     """Return the box-limited step whose task part does not depend on the preferred step z.
 
     Without damping, z only chooses among the steps that reach v, or come nearest to it. Damping
@@ -147,6 +158,8 @@ def strict_box_step(problem: BoxProblem) -> Tensor:
     problem : BoxProblem
         With lambda^2 >= 0. Below 1e-6 of sigma_max^2 (float64) the box-limited step is solved with
         this minimum, and proximal rounds on the multipliers remove its task error.
+    calm : Tensor of shape (N,)
+        Where it is positive, z is at most half as long as the step of the task.
 
     Returns
     -------
@@ -167,8 +180,9 @@ def strict_box_step(problem: BoxProblem) -> Tensor:
         damped = damped._replace(z=torch.zeros_like(damped.z))
         dq, mu = _proximal_box_step(damped, floor[rows], centre[rows])
         v = problem.v.index_put((rows,), apply_rows(damped.J, dq))
+        z = problem.z.index_put((rows,), calmed(problem.z[rows], dq, calm[rows]))
         undamped = problem.damping_sq.index_fill(0, rows, 0.0)
-        problem = problem._replace(v=v, damping_sq=undamped)
+        problem = problem._replace(v=v, z=z, damping_sq=undamped)
         # Start from these multipliers: they keep the active limits, also if v is out of reach.
         centre[rows] = mu
     return _proximal_box_step(problem, floor, centre)[0]

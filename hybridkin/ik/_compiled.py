@@ -32,6 +32,7 @@ from hybridkin._core.kernel_numbers import (
     IK_MODE,
     IK_MUST_SEE,
     IK_PERIOD,
+    IK_PROMISED,
     IK_REACHED,
     IK_SIGMA_MIN,
     IK_STATE_ROWS,
@@ -346,7 +347,7 @@ class Follower:
     def start(self, q: Tensor, dq: Tensor, hysteresis: Any) -> None:
         """Set the initial command (1, n), the step to it, and the state of hysteresis before it."""
         parts = self._parts
-        for name in ("target", "feed", "tip", "offset", "held", "J"):
+        for name in ("target", "feed", "tip", "offset", "held", "rest", "J"):
             parts[name][:] = 0.0
         parts["error"][:] = math.nan
         self.state[[IK_SIGMA_MIN, IK_DISTANCE]] = math.nan
@@ -405,6 +406,7 @@ class Follower:
             state[:, IK_SIGMA_MIN],
             state[:, IK_DAMPING],
             parts["held"] > 0.0,
+            parts["rest"][:, IK_PROMISED : IK_PROMISED + self.core.m],
             state[:, IK_STOPPED] > 0.0,
         )
         x = parts["x"].unflatten(1, self.task.shape)
@@ -474,6 +476,7 @@ def places_of(n: int, m: int, width: int, n_rows: int) -> dict[str, slice]:
         "dq": n,
         "before": n,
         "held": n,
+        "rest": IK_PROMISED + 2 * m,
         "J": m * n,
         "lead": n_rows * n,
         "tried": n_rows * n,

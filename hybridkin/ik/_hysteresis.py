@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from hybridkin._core.kernel_numbers import IK_AT_REST_SHARE
+from hybridkin.ik._gram import apply_rows
 from hybridkin.ik._settings import Bounds, StepSettings, stopping
 from hybridkin.ik._step import StepRows
 from hybridkin.native.hysteresis import Hysteresis
@@ -47,6 +48,7 @@ class Lead:
     def step(
         self,
         control: Callable[[Bounds], StepRows],
+        J: Tensor,
         seconds: float,
         last: Tensor,
     ) -> StepRows:
@@ -60,6 +62,8 @@ class Lead:
         ----------
         control : callable
             Returns the step of the actuators within bounds.
+        J : Tensor of shape (1, m, n)
+            The Jacobian of the task.
         seconds : float
             Time until the next command [s].
         last : Tensor of shape (1, n)
@@ -84,9 +88,12 @@ class Lead:
             goal = torch.where(down | up, wanted, goal)
         known = torch.isfinite(step.sigma_min)[:, None]
         goal = tick.clip(torch.where(known, goal, command))
+        wished = self.effective + step.dq
         self.command = goal
         self.effective, self.state = self._operator.apply(goal, self.state, seconds)
-        return step._replace(dq=goal - command, saturated=tick.held(goal))
+        promised = step.promised + apply_rows(J, self.effective - wished)
+        held = tick.held(goal)
+        return step._replace(dq=goal - command, saturated=held, promised=promised)
 
     def _slowed(self, tick: Bounds, way: Tensor, dq: Tensor, seconds: float) -> Bounds:
         """Return bounds of commands that can arrive after a way at the speed of steps dq."""

@@ -21,7 +21,7 @@ from hybridkin._core.kernel_numbers import (
     IK_SLACK,
     IK_SLIP,
 )
-from hybridkin.ik._box import BoxProblem, strict_box_step
+from hybridkin.ik._box import BoxProblem, calmed, strict_box_step
 from hybridkin.ik._gram import (
     adaptive_damping,
     apply_columns,
@@ -42,7 +42,21 @@ class StepRows(NamedTuple):
     sigma_min: Tensor
     damping: Tensor
     saturated: Tensor
+    promised: Tensor  # motion of the tip to first order
     stopped: Tensor | bool = False  # by a tip limit
+
+
+class Law(NamedTuple):
+    """The settings of steps, and the least lambda^2 (N,) of this period, zero for none."""
+
+    settings: StepSettings
+    least: Tensor
+
+    def step(
+        self, J: Tensor, v: Tensor, posture: Tensor | None, bounds: Bounds
+    ) -> StepRows:
+        """Return the step for the task v and the posture step, within the bounds."""
+        return limited_step(self.settings, J, v, posture, bounds, least=self.least)
 
 
 def control_step(
@@ -55,6 +69,7 @@ def control_step(
     last: Tensor | None = None,
     tip: Tensor | None = None,
     bounds: Bounds | None = None,
+    least: Tensor | None = None,
 ) -> StepRows:
     """Return the step of eq. (1) for one period, with v = dx dt + gain dt e.
 
@@ -81,6 +96,8 @@ def control_step(
         Position of the tip, for tip limits.
     bounds : Bounds, optional
         Bounds of the step. Default: the limits.
+    least : Tensor of shape (N,), optional
+        Least lambda^2, in the unit in which weights are 1. Default: none.
 
     Returns
     -------
@@ -92,6 +109,9 @@ def control_step(
         feed_forward = torch.zeros_like(e)
     if last is None:
         last = torch.zeros_like(q)
+    if least is None:
+        least = torch.zeros_like(q[:, 0])
+    law = Law(settings, least)
 
     # Rows that are not finite, or overflow, get zeros, and no step at the end.
     error_size = e.norm(dim=-1, keepdim=True)
@@ -112,7 +132,7 @@ def control_step(
         posture = torch.where(fine, posture, 0.0)
     change = settings.change(q, seconds)
     if settings.accelerates:
-        brake = _braking(settings, J, e, change)
+        brake = _braking(law, J, e, change)
         fastest_gain = stopping(torch.ones_like(brake), brake)
         gain = fastest_gain.clamp_max(gain)[:, None]
         if posture is not None:
@@ -125,18 +145,19 @@ def control_step(
         bounds = settings.step_bounds(q, seconds, last)
     spaces = settings.tip_limits
     if spaces is None or tip is None:
-        step = limited_step(settings, J, v, posture, bounds)
+        step = law.step(J, v, posture, bounds)
     else:
         margin = spaces.margin(torch.where(fine, tip, 0.0))
         if settings.accelerates:
             normals = spaces.normals.to(J)[:, None].expand(-1, len(J), -1)
-            brakes = [_braking(settings, J, normal, change) for normal in normals]
+            brakes = [_braking(law, J, normal, change) for normal in normals]
             margin = stopping(margin, torch.stack(brakes, dim=-1))
-        confined = _Confined(settings, spaces, margin, J, posture, bounds)
+        confined = _Confined(law, spaces, margin, J, posture, bounds)
         step = confined.step(v)
         v = confined.allowed(v)
+    step = step._replace(promised=apply_rows(J, step.dq))
     if settings.pulls.any():
-        step = _arriving(settings, at, J, v, step, bounds)
+        step = _arriving(law, at, J, v, step, bounds)
 
     # The other rows stay, or brake; outside the limits their finite actuators return.
     fine = fine & _finite(step.dq)
@@ -157,11 +178,13 @@ def limited_step(
     posture: Tensor | None,
     bounds: Bounds,
     damping_sq: Tensor | None = None,
+    least: Tensor | float = 0.0,
 ) -> StepRows:
     """Return the step for the task v and the posture step, within the bounds.
 
     Weights are a change of unit: in u = W^(1/2) q all weights are 1. With `damping_sq`, lambda^2 in
-    this unit, singular values are not computed, and sigma_min is NaN.
+    this unit, singular values are not computed, and sigma_min is NaN. Else lambda^2 is at `least`
+    a number; where this is positive, the posture step is at most half as long as that of the task.
     """
     unit = settings.unit(v)
     J = J * unit
@@ -181,10 +204,13 @@ def limited_step(
             damping_sq = adaptive_damping(gram)
         else:
             damping_sq = (settings.damping * gram.sigma_max).square()
+        damping_sq = damping_sq.clamp_min(least)
         mu = damped_solve(gram, v, damping_sq)
         if posture is not None:
             z = null_projection(J, gram, posture)
-    dq = apply_columns(J, mu) + z
+    dq = apply_columns(J, mu)
+    z = calmed(z, dq, least)
+    dq = dq + z
 
     # Rows within all limits keep this step; eq. (19) is solved for the others. Weights turn J out
     # of the plane.
@@ -197,11 +223,12 @@ def limited_step(
             lower = box.lower.expand_as(dq)
             upper = box.upper.expand_as(dq)
             problem = BoxProblem(rows, motion, z, damping_sq, lower, upper)
-            clipped[over] = strict_box_step(problem.take(over))
+            calm = least + torch.zeros_like(damping_sq)
+            clipped[over] = strict_box_step(problem.take(over), calm[over])
         dq = clipped
     held = box.held(dq)
     dq = bounds.clip(dq * unit)
-    return StepRows(dq, sigma_min, damping_sq.sqrt(), held)
+    return StepRows(dq, sigma_min, damping_sq.sqrt(), held, v)
 
 
 def null_step(settings: StepSettings, J: Tensor, step: Tensor) -> Tensor:
@@ -241,10 +268,10 @@ def _norm(rows: Tensor) -> Tensor:
     return rows.norm(dim=-1, keepdim=True)
 
 
-def _braking(settings: StepSettings, J: Tensor, way: Tensor, change: Tensor) -> Tensor:
+def _braking(law: Law, J: Tensor, way: Tensor, change: Tensor) -> Tensor:
     """Return the largest change of the tip's motion per period, in multiples of `way` (N,)."""
     free = torch.full_like(J[:, 0], math.inf)
-    step = limited_step(settings, J, way, None, Bounds(-free, free))
+    step = law.step(J, way, None, Bounds(-free, free))
     return (change / step.dq.abs()).amin(-1)
 
 
@@ -254,7 +281,7 @@ def _braking(settings: StepSettings, J: Tensor, way: Tensor, change: Tensor) -> 
 class _Confined(NamedTuple):
     """Steps that must keep the tip in half-spaces, with margins (N, k) to their planes."""
 
-    settings: StepSettings
+    law: Law
     spaces: HalfSpaces
     margin: Tensor
     J: Tensor
@@ -283,7 +310,7 @@ class _Confined(NamedTuple):
         violation is removed by taking a fraction of the way from the safe step to this one.
         """
         wanted = self.allowed(v)
-        step = limited_step(self.settings, self.J, wanted, self.posture, self.bounds)
+        step = self.law.step(self.J, wanted, self.posture, self.bounds)
         out = (self.along(step.dq) - self.margin > self.close).any(-1, keepdim=True)
         if out.any():
             safe = self._safe()
@@ -330,9 +357,7 @@ class _Confined(NamedTuple):
             # A bit farther in, because a step in a box is right to rounding only.
             way = self.spaces.way_in(-over - 8.0 * self.close)
             wanted = torch.where(out, motion + IK_EXCESS * way, wanted)
-            step = limited_step(
-                self.settings, self.J, wanted, self.posture, self.bounds
-            )
+            step = self.law.step(self.J, wanted, self.posture, self.bounds)
             dq = torch.where(out, step.dq, dq)
         return dq, wanted
 
@@ -379,16 +404,17 @@ class _End(NamedTuple):
 class _Arrival(NamedTuple):
     """Configurations q (N, n) with tips x, and the bounds of their steps."""
 
-    settings: StepSettings
+    law: Law
     q: Tensor
     x: Tensor
     bounds: Bounds
 
     def end(self, dq: Tensor, motion: Tensor) -> _End:
         """Return the end of steps dq, whose tips are to make a motion (N, m)."""
-        tip, J = self.settings.evaluate(self.q + dq)
-        moved = self.settings.task.difference(self.x, tip)
-        return _End(dq, _only_taut(self.settings, J), motion - moved)
+        settings = self.law.settings
+        tip, J = settings.evaluate(self.q + dq)
+        moved = settings.task.difference(self.x, tip)
+        return _End(dq, _only_taut(settings, J), motion - moved)
 
     def approach(self, dq: Tensor, motion: Tensor, close: Tensor) -> _End:
         """Return the best end of Newton's method from steps dq, within the bounds."""
@@ -399,7 +425,7 @@ class _Arrival(NamedTuple):
             if not going.any():
                 break
             left = Bounds(lower - end.dq, upper - end.dq)
-            step = limited_step(self.settings, end.J, end.missing, None, left)
+            step = self.law.step(end.J, end.missing, None, left)
             dq = self.bounds.clip(end.dq + step.dq)
             dq = torch.where(step.dq >= left.upper, upper, dq)
             dq = torch.where(step.dq <= left.lower, lower, dq)
@@ -410,7 +436,7 @@ class _Arrival(NamedTuple):
 
 
 def _arriving(
-    settings: StepSettings,
+    law: Law,
     q: Tensor,
     J: Tensor,
     v: Tensor,
@@ -423,12 +449,13 @@ def _arriving(
     Newton's method corrects it within the bounds. Where the result is less than half of the motion
     v, slack tendons are pulled in, as far as the tip gets nearer to v or not away.
     """
+    settings = law.settings
     x, _ = settings.evaluate(q)
-    arrival = _Arrival(settings, q, x, bounds)
+    arrival = _Arrival(law, q, x, bounds)
     eps = torch.finfo(q.dtype).eps
     smallest_step = IK_SLIP * _norm(step.dq) + 32.0 * eps * _norm(q)
     slip = _norm(J.flatten(1)) * smallest_step
-    promised = apply_rows(J, step.dq)
+    promised = step.promised
     close = torch.maximum(0.5 * _norm(promised), slip)
     end = arrival.approach(step.dq, promised, close)
     end = end._replace(missing=v - promised + end.missing)

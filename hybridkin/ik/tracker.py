@@ -19,6 +19,7 @@ from hybridkin._core.model import Portable
 from hybridkin.ik._compiled import Follower, Tick, core_of, why_torch
 from hybridkin.ik._gram import row_gram
 from hybridkin.ik._hysteresis import Lead
+from hybridkin.ik._rest import Rest
 from hybridkin.ik._settings import Array, StepSettings, require
 from hybridkin.ik._step import StepRows, control_step
 from hybridkin.ik.results import IKStatus
@@ -393,7 +394,8 @@ class _InTorch:
         unknown = torch.full_like(self._offset, math.nan)
         undamped = torch.zeros_like(q[:, 0])
         free = torch.zeros_like(q, dtype=torch.bool)
-        step = StepRows(dq, unknown[:, 0], undamped, free)
+        step = StepRows(dq, unknown[:, 0], undamped, free, unknown)
+        self._rest = Rest.at(self._offset)
         self._period = self._settings.dt  # of the last step
         self._last = Tick(q, x, J, unknown, step)
 
@@ -418,8 +420,10 @@ class _InTorch:
         x, J = settings.evaluate(self._q)
         error = torch.full_like(self._offset, math.nan)
         used = torch.zeros_like(self._offset)
+        before = used
         if target is not None:
             error = used = task.difference(x, target)
+            before = task.difference(self._last.x, target) - used
             if tip is not None:
                 # Without a measurement, use the model's error corrected by the remembered offset;
                 # without memory, use no error.
@@ -434,12 +438,22 @@ class _InTorch:
         at = None
         if settings.tip_limits is not None:
             at = x + self._offset
+        rest = self._rest.seen(settings, before + used, used, J)
         control = partial(
-            control_step, settings, self._q, J, used, feed_forward, seconds, last, at
+            control_step,
+            settings,
+            self._q,
+            J,
+            used,
+            feed_forward,
+            seconds,
+            last,
+            at,
+            least=rest.least(used),
         )
         effective = self._q
         if self._lead is not None:
-            step = self._lead.step(control, seconds, last)
+            step = self._lead.step(control, J, seconds, last)
             self._command = self._lead.command
             self._q = self._lead.effective
         else:
@@ -447,6 +461,8 @@ class _InTorch:
             self._command = self._q = effective + step.dq
         if self._memory is not None:
             self._offset = math.exp(-seconds / self._memory) * self._offset
+        moved = self._q - effective
+        self._rest = rest.after(settings, moved, step.promised, used)
         self._last = Tick(effective, x, J, error, step)
         self._period = seconds
         return self._last

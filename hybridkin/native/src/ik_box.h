@@ -340,27 +340,36 @@ static void ik_proximal_box(int m, int n, const real *J, const real *v, const re
     }
 }
 
+/* Shorten a step z to at most half of that of a task: else the way to a posture would go on shaking
+   a robot that rests where its target is out of reach. */
+static inline void ik_calm(int n, const real *task, real *z) {
+    const real share = ik_norm(n, task) / (R(2.0) * ik_norm(n, z));
+    for (int j = 0; j < n && share < R(1.0); j++) z[j] *= share;
+}
+
 /* The step in the box whose task part does not depend on the preferred step z: near a singularity
    the damped task is solved for z = 0 first, then z chooses among the steps that move the tip so.
  */
 static void ik_strict_box(int m, int n, const real *J, const real *g, const real *v, const real *z,
-                          const real *lower, const real *upper, real damping_sq, real *dq) {
+                          const real *lower, const real *upper, real damping_sq, int calm,
+                          real *dq) {
     real sum = R(0.0);
     for (int k = 0, at = 0; k < m; k++)
         for (int i = k; i < m; i++, at++) sum += (i == k ? g[at] : R(2.0) * g[at]) * g[at];
     const real size_sq = HK_MATH(sqrt)(sum);
     const real rounding = HK_MATH(sqrt)(HK_EPS), relative = rounding > R(1e-6) ? rounding : R(1e-6);
     const real least = size_sq > R(0.0) ? relative * size_sq : R(1.0);
-    real mu[IK_MOST_ROWS] = {R(0.0)}, moved[IK_MOST_ROWS], none[HK_MAX_N];
+    real mu[IK_MOST_ROWS] = {R(0.0)}, moved[IK_MOST_ROWS], none[HK_MAX_N], slower[HK_MAX_N];
     int preferred = 0;
     for (int j = 0; j < n; j++) {
-        none[j] = R(0.0);
+        none[j] = R(0.0), slower[j] = z[j];
         preferred |= z[j] != R(0.0);
     }
     if (damping_sq > R(0.0) && preferred) {
         ik_proximal_box(m, n, J, v, none, lower, upper, damping_sq, least, mu, dq);
         ik_rows_of(m, n, J, dq, moved);
-        v = moved, damping_sq = R(0.0);
+        if (calm) ik_calm(n, dq, slower);
+        v = moved, z = slower, damping_sq = R(0.0);
     }
     ik_proximal_box(m, n, J, v, z, lower, upper, damping_sq, least, mu, dq);
 }

@@ -19,6 +19,7 @@ typedef struct {
     const real *spaces, *offsets;  /* normals (m, n_spaces), and how far along them */
     hk_hysteresis hysteresis;
     real gain, beta, dt, damping;  /* gain < 0: 1 / dt; damping < 0: adaptive */
+    real least;                    /* lambda^2 at least, in the unit where nothing has a weight */
 } ik_settings;
 
 /* What the matrices are for; of the ends of a step there are three. */
@@ -39,7 +40,7 @@ enum { IK_WIDTH = HK_POSES && HK_MAX_R < 16 ? 16 : HK_MAX_R }; /* of a target at
 /* A step: its bounds and the posture step, which go in, and what comes out. */
 typedef struct {
     real lower[HK_MAX_N], upper[HK_MAX_N], posture[HK_MAX_N];
-    real dq[HK_MAX_N], sigma_min, damping;
+    real dq[HK_MAX_N], promised[IK_ROWS], sigma_min, damping; /* promised: to first order */
     unsigned char held[HK_MAX_N];
     int stopped; /* by half-spaces of the tip */
 } ik_step_t;
@@ -172,7 +173,8 @@ static HK_NOINLINE void ik_limited_in_plane(const ik_settings *ik, const real *J
         }
     }
     ik_products(m + ik->n_normals, n, rows, NULL, g);
-    ik_strict_box(m + ik->n_normals, n, rows, g, motion, z, lower, upper, damping_sq, dq);
+    ik_strict_box(m + ik->n_normals, n, rows, g, motion, z, lower, upper, damping_sq,
+                  ik->least > R(0.0), dq);
 }
 
 /* Fill in a step for the task v within its bounds; `slides`: with its posture step. `trust` is
@@ -199,7 +201,7 @@ HK_INLINE void ik_limited_step_of(int m, int n, const ik_settings *ik, const rea
         ik_eigen e;
         ik_eigen_of(m, g, &e);
         ik_eigen_ends(m, &e, &low, &high);
-        damping_sq = ik_damping_sq(ik, low, high);
+        damping_sq = hk_larger(ik_damping_sq(ik, low, high), ik->least);
         ik_eigen_solve(m, &e, v, damping_sq, mu);
         if (slides) ik_eigen_projection(m, n, J, &e, z);
     } else {
@@ -210,12 +212,17 @@ HK_INLINE void ik_limited_step_of(int m, int n, const ik_settings *ik, const rea
                 ik_singular_values(g, &low, &high);
             else
                 ik_pivots(m, g, &low, &high);
-            damping_sq = ik_damping_sq(ik, low, high);
+            damping_sq = hk_larger(ik_damping_sq(ik, low, high), ik->least);
         }
         ik_factors f;
         ik_factor(m, g, damping_sq, &f);
         ik_solve(m, &f, v, mu);
         if (slides) ik_null_projection(m, n, J, g, z);
+    }
+    if (ik->least > R(0.0)) {
+        real none[HK_MAX_N] = {R(0.0)};
+        ik_columns_of(m, n, J, mu, none, dq);
+        ik_calm(n, dq, z);
     }
     ik_columns_of(m, n, J, mu, z, dq);
     if (ik->flags & IK_LIMITED) {
@@ -226,7 +233,7 @@ HK_INLINE void ik_limited_step_of(int m, int n, const ik_settings *ik, const rea
             ik_limited_in_plane(ik, J, v, z, slides ? s->posture : NULL, lower, upper, damping_sq,
                                 dq);
         else if (over)
-            ik_strict_box(m, n, J, g, v, z, lower, upper, damping_sq, dq);
+            ik_strict_box(m, n, J, g, v, z, lower, upper, damping_sq, ik->least > R(0.0), dq);
     }
     for (int j = 0; j < n; j++) {
         s->held[j] = (unsigned char)((dq[j] <= lower[j]) | (dq[j] >= upper[j]));
@@ -557,9 +564,9 @@ static void ik_arrive(const ik_settings *ik, const real *q, const real *x, const
     const int n = ik->n, m = ik->m;
     const real slip =
         ik_norm(m * n, J) * (IK_SLIP * ik_norm(n, s->dq) + R(32.0) * HK_EPS * ik_norm(n, q));
-    real promised[IK_ROWS] = {R(0.0)}, left[IK_ROWS];
+    const real *promised = s->promised;
+    real left[IK_ROWS];
     ik_end end = {.J = ik_slot(ik, IK_END)}, pulled = {.J = ik_slot(ik, IK_END + 1)};
-    IK_OF(m, ik_rows_of, n, J, s->dq, promised);
     for (int j = 0; j < n; j++) end.dq[j] = s->dq[j];
     ik_approach(ik, q, x, promised, hk_larger(R(0.5) * ik_norm(m, promised), slip), s, &end);
     for (int i = 0; i < m; i++) left[i] = v[i] - promised[i] + end.missing[i];
@@ -627,6 +634,7 @@ static HK_NOINLINE void ik_control(const ik_settings *ik, const real *q, const r
             ik_bound(ik, q, seconds, last, ends, s);
             ik_limited_step(ik, J, v, slides, NULL, s);
         }
+        IK_OF(m, ik_rows_of, n, J, s->dq, s->promised);
         if (ik->flags & IK_PULLS && ik_finite(n, s->dq)) ik_arrive(ik, q, x, J, v, s);
         if (ik_finite(n, s->dq)) return; /* else v is too large to compute with */
     }
@@ -635,16 +643,19 @@ static HK_NOINLINE void ik_control(const ik_settings *ik, const real *q, const r
         s->dq[j] = ik_finite(1, q + j) ? ik_clip(R(0.0), s->lower[j], s->upper[j]) : R(0.0);
         s->held[j] = (unsigned char)((s->dq[j] <= s->lower[j]) | (s->dq[j] >= s->upper[j]));
     }
+    for (int i = 0; i < m; i++) s->promised[i] = R(0.0);
     s->sigma_min = R(NAN), s->damping = R(0.0);
 }
 
 /* The parts of the state of a robot that follows targets. */
 typedef struct {
-    real *target, *feed, *tip, *offset, *x, *error, *q, *dq, *before, *held, *J;
+    real *target, *feed, *tip, *offset, *x, *error, *q, *dq, *before, *held, *rest, *J;
     real *lead, *tried; /* with hysteresis: its state, and one to try */
 } ik_state;
 
-#define IK_STATE_SIZE(n, m, width) (IK_TARGET + 3 * (width) + 3 * (m) + 4 * (n) + (m) * (n))
+#define IK_REST_SIZE(m) (IK_PROMISED + 2 * (m))
+#define IK_STATE_SIZE(n, m, width)                                                                 \
+    (IK_TARGET + 3 * (width) + 3 * (m) + 4 * (n) + IK_REST_SIZE(m) + (m) * (n))
 
 static inline ik_state ik_state_of(const ik_settings *ik, real *state) {
     ik_state parts;
@@ -658,7 +669,8 @@ static inline ik_state ik_state_of(const ik_settings *ik, real *state) {
     parts.dq = parts.q + ik->n;
     parts.before = parts.dq + ik->n;
     parts.held = parts.before + ik->n;
-    parts.J = parts.held + ik->n;
+    parts.rest = parts.held + ik->n;
+    parts.J = parts.rest + IK_REST_SIZE(ik->m);
     parts.lead = parts.J + ik->m * ik->n;
     parts.tried = HK_HYSTERESIS ? parts.lead + ik->hysteresis.code[HK_STATE_ROWS] * ik->n : NULL;
     return parts;
@@ -730,6 +742,7 @@ static HK_NOINLINE void ik_lead(const ik_settings *ik, const ik_state *now, cons
     const int n = ik->n;
     const real *y = now->lead + (ik->hysteresis.code[HK_STATE_ROWS] - 1) * n;
     real low[HK_MAX_N], high[HK_MAX_N], kept[HK_MAX_N], wanted[HK_MAX_N], goal[HK_MAX_N];
+    real missed[HK_MAX_N], moved[IK_ROWS];
     ik_step_t limits;
     ik_ends ends;
     int beyond = 0;
@@ -768,10 +781,70 @@ static HK_NOINLINE void ik_lead(const ik_settings *ik, const ik_state *now, cons
     for (int j = 0; j < n; j++) {
         if (s->sigma_min != s->sigma_min) goal[j] = now->q[j]; /* hold still, not known */
         now->lead[j] = ik_clip(goal[j], low[j], high[j]);
+        missed[j] = y[j] + s->dq[j];
         s->dq[j] = now->lead[j] - now->q[j];
         s->held[j] = (unsigned char)((now->lead[j] <= low[j]) | (now->lead[j] >= high[j]));
     }
     hk_hysteresis_apply(&ik->hysteresis, seconds, now->lead);
+    for (int j = 0; j < n; j++) missed[j] = y[j] - missed[j];
+    IK_OF(ik->m, ik_rows_of, n, now->J, missed, moved);
+    for (int i = 0; i < ik->m; i++) s->promised[i] += moved[i];
+}
+
+/* Read the curvature of the model from the errors before and after the last step, eq. (21), and
+   return the least lambda^2 of this one. It grows where more than half of the promised change of the
+   squared error did not come true: to what is missing per squared step. It eases where less than a
+   quarter is missing, after steps that are longer than rounding. */
+static inline real ik_rest(const ik_settings *ik, const real *J, const real *before, const real *e,
+                           real *rest) {
+    real start = R(0.0), end = R(0.0), left = R(0.0), motion = R(0.0), jump = R(0.0);
+    real largest = R(0.0), bent = rest[IK_BENT];
+    for (int i = 0; i < ik->m; i++) {
+        const real move = rest[IK_PROMISED + i], rest_of = before[i] - move;
+        const real apart = before[i] - rest[IK_PROMISED + ik->m + i];
+        start += before[i] * before[i], end += e[i] * e[i];
+        motion += move * move, left += rest_of * rest_of, jump += apart * apart;
+    }
+    const real fall = start - end, promised = start - left, missing = promised - fall;
+    const int tells = rest[IK_SHARE] > IK_NO_WAY && jump <= IK_JUMP * IK_JUMP * start &&
+                      hk_larger(ik_abs(promised), ik_abs(fall)) > IK_NO_FALL * start;
+    const int weak = tells && missing > R(0.5) * ik_abs(promised);
+    if (!(weak || bent > R(0.0)) || !(end > R(0.0))) return R(0.0);
+    for (int i = 0; i < ik->m; i++)
+        for (int j = 0; j < ik->n; j++) {
+            const real own = J[i * ik->n + j] * ik->unit[j];
+            largest += own * own;
+        }
+    const real size = HK_MATH(sqrt)(end), bend = (end - left) / rest[IK_WAY_SQ];
+    const real here = bend / size, eased = IK_EASED * bent;
+    if (weak && bend > IK_CURVED * largest)
+        bent = hk_larger(here, bent);
+    else if (tells && missing < R(0.25) * ik_abs(promised) && rest[IK_SHARE] > IK_EASED_WAY)
+        /* Where it exceeds J^T J along the step, a longer one would not have kept its promise. */
+        bent = missing > R(0.5) * motion ? ik_clip(here, eased, bent) : eased;
+    if (bent * size > IK_MOST_CURVED * largest) bent = IK_MOST_CURVED * largest / size;
+    if (bent * size < IK_CURVED * largest) bent = R(0.0);
+    if (ik_finite(1, &bent)) rest[IK_BENT] = bent;
+    bent = rest[IK_BENT] * size;
+    return ik_finite(1, &bent) ? bent : R(0.0);
+}
+
+/* Remember a step of where the model is, the motion of the tip that it promised, and the error that
+   it was made for. */
+static inline void ik_remember(const ik_settings *ik, const real *from, const real *to,
+                               const real *promised, const real *e, real *rest) {
+    rest[IK_WAY_SQ] = rest[IK_SHARE] = R(0.0);
+    for (int j = 0; j < ik->n; j++) {
+        const real way = to[j] - from[j], own = way / ik->unit[j];
+        const real range = ik->high[j] - ik->low[j] < ik->period[j] ? ik->high[j] - ik->low[j] : ik->period[j];
+        rest[IK_WAY_SQ] += own * own;
+        rest[IK_SHARE] = hk_larger(ik_abs(way) / (range < R(INFINITY) ? range : R(1.0)),
+                                   rest[IK_SHARE]);
+    }
+    for (int i = 0; i < ik->m; i++) {
+        rest[IK_PROMISED + i] = promised[i];
+        rest[IK_PROMISED + ik->m + i] = e[i];
+    }
 }
 
 /* One period of a robot that follows targets. Returns 0, and does nothing, if a pose in the state
@@ -782,17 +855,21 @@ static inline int ik_tick(const ik_settings *ik, real *state) {
     const real period = state[IK_PERIOD], memory = state[IK_MEMORY];
     const int leads = HK_HYSTERESIS && mode & IK_LEADS;
     real *at = leads ? now.tried - n : now.q; /* where the model is */
-    real used[IK_ROWS], seen_at[IK_ROWS], *last = NULL, moved[HK_MAX_N];
+    real used[IK_ROWS], seen_at[IK_ROWS], *last = NULL, moved[HK_MAX_N], x_before[IK_WIDTH];
+    real before[IK_ROWS];
+    ik_settings damped;
     int seen = 0;
     ik_step_t step;
     if (IK_IS_POSE(ik) && ((mode & IK_HAS_TARGET && !ik_is_rotation(now.target)) ||
                            (mode & IK_HAS_TIP && !ik_is_rotation(now.tip))))
         return 0;
+    for (int i = 0; i < ik->width; i++) x_before[i] = now.x[i];
     ik_look(ik, at, now.x, now.J);
-    for (int i = 0; i < m; i++) used[i] = R(0.0), now.error[i] = R(NAN);
+    for (int i = 0; i < m; i++) used[i] = before[i] = R(0.0), now.error[i] = R(NAN);
     if (mode & IK_HAS_TARGET) {
         ik_difference(ik, now.x, now.target, used);
-        for (int i = 0; i < m; i++) now.error[i] = used[i];
+        ik_difference(ik, x_before, now.target, before);
+        for (int i = 0; i < m; i++) now.error[i] = used[i], before[i] -= used[i];
     }
     if (mode & IK_HAS_TARGET && mode & IK_HAS_TIP) {
         /* Without a measurement, use the model's error corrected by the remembered offset;
@@ -815,6 +892,9 @@ static inline int ik_tick(const ik_settings *ik, real *state) {
         for (int j = 0; j < n; j++) last[j] = ratio * now.dq[j];
     }
     const real *feed = mode & IK_HAS_FEED ? now.feed : NULL;
+    for (int i = 0; i < m; i++) before[i] += used[i];
+    const real least = mode & IK_MUST_SEE ? R(0.0) : ik_rest(ik, now.J, before, used, now.rest);
+    if (least > R(0.0)) damped = *ik, damped.least = least, ik = &damped;
     for (int j = 0; j < n; j++) now.before[j] = at[j];
     if (leads)
         ik_lead(ik, &now, used, feed, period, last, seen_at, &step);
@@ -832,5 +912,6 @@ static inline int ik_tick(const ik_settings *ik, real *state) {
         now.held[j] = step.held[j];
         now.q[j] = leads ? now.lead[j] : now.q[j] + step.dq[j];
     }
+    ik_remember(ik, now.before, at, step.promised, used, now.rest);
     return 1;
 }

@@ -47,6 +47,8 @@ static void step_within(const ik_settings *ik, @NAME@_state *state, const @REAL@
         now.feed[i] = dx ? ik->dt * dx[i] : (real)0;
         now.offset[i] = state->offset[i];
     }
+    for (int i = 0; i < IK_REST_SIZE(@TASK@); i++) now.rest[i] = state->rest[i];
+    for (int i = 0; i < @WIDTH@; i++) now.x[i] = state->x[i];
     for (int j = 0; j < @N@; j++) {
         now.q[j] = state->q[j];
         now.dq[j] = state->dq[j];
@@ -66,6 +68,7 @@ static void step_within(const ik_settings *ik, @NAME@_state *state, const @REAL@
     for (int i = 0; i < LEAD; i++) state->hysteresis[i] = now.lead[i];
 #endif
     for (int i = 0; i < @TASK@; i++) state->offset[i] = now.offset[i];
+    for (int i = 0; i < IK_REST_SIZE(@TASK@); i++) state->rest[i] = now.rest[i];
     for (int i = 0; i < @WIDTH@; i++) state->x[i] = now.x[i];
     state->error = all[IK_DISTANCE];
     state->sigma_min = all[IK_SIGMA_MIN];

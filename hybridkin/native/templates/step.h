@@ -12,6 +12,7 @@ typedef struct {
     unsigned char held[@N@]; /* actuators that the step held at a limit of motion */
     unsigned char stopped;   /* whether limits of the tip changed its motion */
     @REAL@ offset[@TASK@]; /* measured minus predicted at the last measurement [m] */
+    @REAL@ rest[3 + 2 * @TASK@]; /* what the last steps showed of the model, to rest out of reach */
     @REAL@ memory;  /* time constant [s] of the offset while measurements are NaN; 0: not used */
 @LEAD_FIELD@} @NAME@_state;
 
