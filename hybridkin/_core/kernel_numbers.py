@@ -86,11 +86,12 @@ IK_PULL_RATIO = 0.125  # ratio of one share to the one before
 
 # Rest at the point nearest to a target out of reach, eq. (21).
 IK_NO_FALL = 1e-12  # of a squared error: smaller falls are rounding
-IK_NO_WAY = 1e-8  # of the ranges: what shorter steps show is rounding
+IK_NO_WAY = 1e-7  # of the ranges: what shorter steps show is rounding
 IK_CURVED = 1e-6  # of |J|^2: least lambda^2, and least curvature along a step that counts
 IK_MOST_CURVED = 1e4  # of |J|^2: largest lambda^2
 IK_EASED = 0.7  # factor on the curvature after a step that kept its promise
-IK_EASED_WAY = 1e-4  # of the ranges: shorter steps do not ease it
+IK_EASED_WAY = 1e-4  # of the ranges: shorter steps ease it only
+IK_STRAIGHT = 0.1  # where they show less than this share of it
 IK_JUMP = 0.5  # of an error: a step says nothing about a target that moved more since then
 # What is remembered of the last step: the curvature, the squared length of the step, its largest
 # share of a range; then the motion of the tip that J promised, and the error that it was made for.

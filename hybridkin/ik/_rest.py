@@ -21,6 +21,7 @@ from hybridkin._core.kernel_numbers import (
     IK_MOST_CURVED,
     IK_NO_FALL,
     IK_NO_WAY,
+    IK_STRAIGHT,
 )
 from hybridkin.ik._settings import StepSettings
 
@@ -59,7 +60,7 @@ class Rest(NamedTuple):
 
         It grows where more than half of the promised change of the squared error did not come true:
         to what is missing per squared step. It eases where less than a quarter is missing, after
-        steps that are longer than rounding.
+        steps that are longer than rounding or show far less of it.
 
         Parameters
         ----------
@@ -81,9 +82,11 @@ class Rest(NamedTuple):
         tells &= self.share > IK_NO_WAY
         tells &= _squared(before - self.error) <= IK_JUMP**2 * start
         weak = tells & (missing > 0.5 * promised.abs()) & (bend > IK_CURVED * largest)
-        kept = tells & (missing < 0.25 * promised.abs()) & (self.share > IK_EASED_WAY)
-
         here = bend / size
+        straight = here < IK_STRAIGHT * self.curvature
+        long = (self.share > IK_EASED_WAY) | straight
+        kept = tells & (missing < 0.25 * promised.abs()) & long
+
         grown = torch.maximum(self.curvature, here)
         # Where it exceeds J^T J along the step, a longer one would not have kept its promise.
         lost = missing > 0.5 * _squared(self.promised)

@@ -794,7 +794,7 @@ static HK_NOINLINE void ik_lead(const ik_settings *ik, const ik_state *now, cons
 /* Read the curvature of the model from the errors before and after the last step, eq. (21), and
    return the least lambda^2 of this one. It grows where more than half of the promised change of the
    squared error did not come true: to what is missing per squared step. It eases where less than a
-   quarter is missing, after steps that are longer than rounding. */
+   quarter is missing, after steps that are longer than rounding or show far less of it. */
 static inline real ik_rest(const ik_settings *ik, const real *J, const real *before, const real *e,
                            real *rest) {
     real start = R(0.0), end = R(0.0), left = R(0.0), motion = R(0.0), jump = R(0.0);
@@ -819,7 +819,8 @@ static inline real ik_rest(const ik_settings *ik, const real *J, const real *bef
     const real here = bend / size, eased = IK_EASED * bent;
     if (weak && bend > IK_CURVED * largest)
         bent = hk_larger(here, bent);
-    else if (tells && missing < R(0.25) * ik_abs(promised) && rest[IK_SHARE] > IK_EASED_WAY)
+    else if (tells && missing < R(0.25) * ik_abs(promised) &&
+             (rest[IK_SHARE] > IK_EASED_WAY || here < IK_STRAIGHT * bent))
         /* Where it exceeds J^T J along the step, a longer one would not have kept its promise. */
         bent = missing > R(0.5) * motion ? ik_clip(here, eased, bent) : eased;
     if (bent * size > IK_MOST_CURVED * largest) bent = IK_MOST_CURVED * largest / size;
