@@ -460,18 +460,22 @@ def _arriving(
     end = arrival.approach(step.dq, promised, close)
     end = end._replace(missing=v - promised + end.missing)
 
-    # Pull in the slack tendons of weak steps: the whole way to their bound, then less.
+    # Pull in the slack tendons of weak steps: the whole way to their bound, then less. None of them
+    # is let out: else they could be let out where they began.
     pulls = settings.pulls.to(q)
-    slack = (end.J == 0.0).all(-2) & (pulls != 0.0)
     to = torch.where(pulls < 0.0, *bounds)
-    to = torch.where(slack & torch.isfinite(to), to, end.dq)
+    slack = (end.J == 0.0).all(-2) & (pulls != 0.0) & torch.isfinite(to)
+    to = torch.where(slack, to, end.dq)
     way = to - end.dq
+    lower = torch.where(slack & (pulls > 0.0), end.dq, bounds.lower)
+    upper = torch.where(slack & (pulls < 0.0), end.dq, bounds.upper)
+    inwards = arrival._replace(bounds=Bounds(lower, upper))
     weak = end.distance > torch.maximum(0.5 * _norm(v), slip)
     weak &= (way != 0.0).any(-1, keepdim=True)
     fraction = 1.0
     while fraction > IK_LEAST_PULL and weak.any():
         dq = bounds.clip(to - (1.0 - fraction) * way)
-        pulled = arrival.approach(dq, v, slip)
+        pulled = inwards.approach(dq, v, slip)
         # A slack tendon moves the tip by rounding alone.
         allowed = (1.0 + eps**0.5) * end.distance
         better = weak & (pulled.distance <= allowed)

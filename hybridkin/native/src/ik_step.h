@@ -544,13 +544,16 @@ static void ik_approach(const ik_settings *ik, const real *q, const real *x, con
     }
 }
 
-/* Pull in slack tendons by a share of the way to the bounds; return whether any moved. */
-static int ik_pull_in(const ik_settings *ik, const ik_step_t *s, real share, ik_end *end) {
+/* Pull in slack tendons by a share of the way to the bounds, and let none of them out: else they
+   could be let out where they began. Return whether any moved. */
+static int ik_pull_in(const ik_settings *ik, real share, ik_step_t *s, ik_end *end) {
     int moved = 0;
     for (int j = 0; j < ik->n; j++) {
-        const real to = ik->pulls[j] < R(0.0) ? s->lower[j] : s->upper[j], way = to - end->dq[j];
+        const int down = ik->pulls[j] < R(0.0);
+        const real to = down ? s->lower[j] : s->upper[j], way = to - end->dq[j];
         const int slack = ik->pulls[j] != R(0.0) && !(ik_column(ik, end->J, j) > R(0.0));
         if (!slack || !ik_finite(1, &way)) continue;
+        *(down ? s->upper + j : s->lower + j) = end->dq[j];
         end->dq[j] = ik_clip(to - (R(1.0) - share) * way, s->lower[j], s->upper[j]);
         moved |= way != R(0.0);
     }
@@ -572,10 +575,11 @@ static void ik_arrive(const ik_settings *ik, const real *q, const real *x, const
     for (int i = 0; i < m; i++) left[i] = v[i] - promised[i] + end.missing[i];
     const real rounding = R(1.0) + HK_MATH(sqrt)(HK_EPS); /* a slack tendon does not move the tip */
     const real most = ik_norm(m, left), close = hk_larger(R(0.5) * ik_norm(m, v), slip);
+    ik_step_t inwards = *s;
     for (real share = R(1.0); most > close && share > IK_LEAST_PULL; share *= IK_PULL_RATIO) {
         ik_copy_end(ik, &end, &pulled);
-        if (!ik_pull_in(ik, s, share, &pulled)) break;
-        ik_approach(ik, q, x, v, slip, s, &pulled);
+        if (!ik_pull_in(ik, share, &inwards, &pulled)) break;
+        ik_approach(ik, q, x, v, slip, &inwards, &pulled);
         if (pulled.distance > rounding * most) continue;
         ik_copy_end(ik, &pulled, &end);
         break;
