@@ -87,15 +87,27 @@ IK_PULL_RATIO = 0.125  # ratio of one share to the one before
 # Rest at the point nearest to a target out of reach, eq. (21).
 IK_NO_FALL = 1e-12  # of a squared error: smaller falls are rounding
 IK_NO_WAY = 1e-7  # of the ranges: what shorter steps show is rounding
-IK_CURVED = 1e-6  # of |J|^2: least lambda^2, and least curvature along a step that counts
+IK_CURVED = (
+    1e-6  # of |J|^2: least lambda^2, and least curvature along a step that counts
+)
 IK_MOST_CURVED = 1e4  # of |J|^2: largest lambda^2
 IK_EASED = 0.7  # factor on the curvature after a step that kept its promise
 IK_EASED_WAY = 1e-4  # of the ranges: shorter steps ease it only
 IK_STRAIGHT = 0.1  # where they show less than this share of it
-IK_JUMP = 0.5  # of an error: a step says nothing about a target that moved more since then
+IK_JUMP = (
+    0.5  # of an error: a step says nothing about a target that moved more since then
+)
 # What is remembered of the last step: the curvature, the squared length of the step, its largest
 # share of a range; then the motion of the tip that J promised, and the error that it was made for.
 IK_BENT, IK_WAY_SQ, IK_SHARE, IK_PROMISED = 0, 1, 2, 3
+
+# The way out of a singular configuration, eq. (22).
+IK_STUCK = 0.01  # of a motion: a step that promises less does not get there
+IK_PROBE = 1e-4  # of the ranges: to see how J changes
+IK_BENDS = 1e-5  # of |J|^2: least negative curvature that leads out
+IK_BENDS_MOST = 0.02  # of all curvature that was seen: less is the error of the probe
+IK_TURNS = 40  # of the power method for its direction
+IK_WAY_OUT = 0.05  # of the ranges: the longest first step
 
 # The state of a robot that follows targets: one array.
 IK_MODE = 0  # sum of the bits below
@@ -107,10 +119,10 @@ IK_DAMPING = 5
 IK_DISTANCE = 6  # length of the error
 IK_STOPPED = 7  # whether half-spaces changed the motion of the tip
 # Then target, motion of the target in this period, measured tip, last measured tip minus model, x
-# and error; q, step, q before, whether it was held (n each); what is remembered of the last step (2 m
-# + IK_PROMISED); and J. Points of a task of m rows have
-# m numbers, poses 16; motions and errors m. With hysteresis q is the command and q before what the
-# actuators did; then follow its state, and one to try.
+# and error; q, step, q before, whether it was held (n each); what is remembered of the last step (IK_PROMISED
+# + 2 m); and J. Points of a task of m rows have m numbers, poses 16; motions and errors m.
+# With hysteresis q is the command and q before what the actuators did; then follow its state, and
+# one to try.
 IK_TARGET = 8
 IK_POSE_NUMBERS = 16
 IK_HAS_TARGET = 1

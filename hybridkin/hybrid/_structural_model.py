@@ -30,8 +30,8 @@ ENOUGH = 5000
 """Rows that determine the few errors below other corrections."""
 _MOST = 400  # rows by which the refinement is chosen
 _FOLDS = 3
-# Of the held-out error of the chain alone. On real robots smaller gains, from slack and friction that
-# look like a twist, were lost again below corrections; a twist under load gains twice as much.
+# Of the held-out error of the chain alone. On real robots smaller gains, from slack and friction
+# that look like a twist, were lost again below corrections; a twist under load gains twice as much.
 _CLEARLY = 0.75
 
 

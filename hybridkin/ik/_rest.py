@@ -55,7 +55,9 @@ class Rest(NamedTuple):
         none = torch.zeros_like(e[:, 0])
         return cls(none, none, none, torch.zeros_like(e), torch.zeros_like(e))
 
-    def seen(self, settings: StepSettings, before: Tensor, e: Tensor, J: Tensor) -> Self:
+    def seen(
+        self, settings: StepSettings, before: Tensor, e: Tensor, J: Tensor
+    ) -> Self:
         """Return this with the curvature that the last step has shown.
 
         It grows where more than half of the promised change of the squared error did not come true:

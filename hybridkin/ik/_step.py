@@ -20,8 +20,10 @@ from hybridkin._core.kernel_numbers import (
     IK_PULL_RATIO,
     IK_SLACK,
     IK_SLIP,
+    IK_STUCK,
 )
 from hybridkin.ik._box import BoxProblem, calmed, strict_box_step
+from hybridkin.ik._escape import way_out
 from hybridkin.ik._gram import (
     adaptive_damping,
     apply_columns,
@@ -146,6 +148,8 @@ def control_step(
     spaces = settings.tip_limits
     if spaces is None or tip is None:
         step = law.step(J, v, posture, bounds)
+        if not settings.pulls.any():
+            step = _escaping(settings, at, J, v, e, step, bounds)
     else:
         margin = spaces.margin(torch.where(fine, tip, 0.0))
         if settings.accelerates:
@@ -273,6 +277,31 @@ def _braking(law: Law, J: Tensor, way: Tensor, change: Tensor) -> Tensor:
     free = torch.full_like(J[:, 0], math.inf)
     step = law.step(J, way, None, Bounds(-free, free))
     return (change / step.dq.abs()).amin(-1)
+
+
+def _escaping(
+    settings: StepSettings,
+    q: Tensor,
+    J: Tensor,
+    v: Tensor,
+    e: Tensor,
+    step: StepRows,
+    bounds: Bounds,
+) -> StepRows:
+    """Return steps that leave singular configurations in which they promise almost nothing of v."""
+    promised = apply_rows(J, step.dq).norm(dim=-1)
+    singular = (step.damping > 0.0) | ~(step.sigma_min > 0.0)
+    stuck = singular & (promised <= IK_STUCK * v.norm(dim=-1)) & (_norm(e)[:, 0] > 0.0)
+    rows = stuck.nonzero()[:, 0]
+    if rows.numel() == 0:
+        return step
+    lower, upper = (end.expand_as(q) for end in bounds)
+    of_rows = Bounds(lower[rows], upper[rows])
+    way = way_out(settings, q[rows], J[rows], e[rows], step.dq[rows], of_rows)
+    dq = step.dq.index_put((rows,), of_rows.clip(step.dq[rows] + way))
+    left = torch.zeros_like(stuck).index_put((rows,), (way != 0.0).any(-1))
+    held = torch.where(left[:, None], bounds.held(dq), step.saturated)
+    return step._replace(dq=dq, saturated=held)
 
 
 # Limits of the tip.

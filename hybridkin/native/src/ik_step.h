@@ -590,6 +590,87 @@ static void ik_arrive(const ik_settings *ik, const real *q, const real *x, const
     }
 }
 
+/* Take out of a direction u (n) what moves the tip, where it can move well, and what the plane and
+   the bounds of a step forbid; make it a unit vector. */
+static inline void ik_allow(const ik_settings *ik, const real *J, const ik_factors *f,
+                            const ik_step_t *s, real *u) {
+    const int n = ik->n, m = ik->m;
+    real moved[IK_ROWS] = {R(0.0)}, mu[IK_ROWS];
+    IK_OF(m, ik_rows_of, n, J, u, moved);
+    ik_solve(m, f, moved, mu);
+    for (int i = 0; i < m; i++) mu[i] = -mu[i];
+    IK_OF(m, ik_columns_of, n, J, mu, u, u);
+    ik_in_plane(ik, 1, u);
+    for (int j = 0; j < n; j++)
+        if (u[j] > R(0.0) ? !(s->upper[j] > R(0.0)) : !(s->lower[j] < R(0.0))) u[j] = R(0.0);
+    const real size = ik_norm(n, u);
+    for (int j = 0; j < n && size > R(0.0); j++) u[j] /= size;
+}
+
+/* Leave a configuration in which the error e is lost, eq. (22): if the second derivative of the model
+   moves the tip towards the target along a direction, go there. Where the target is out of reach
+   there is none. */
+static HK_NOINLINE void ik_escape(const ik_settings *ik, const real *q, const real *J,
+                                  const real *e, ik_step_t *s) {
+    const int n = ik->n, m = ik->m;
+    real *there = ik_slot(ik, IK_END), bent[HK_MAX_N * HK_MAX_N], g[IK_PAIRS], at[HK_MAX_N];
+    real x[IK_WIDTH], u[HK_MAX_N], next[HK_MAX_N], spans[HK_MAX_N], moved[IK_ROWS] = {R(0.0)};
+    ik_factors f;
+    ik_products(m, n, J, NULL, g);
+    const real largest = ik_trace(m, g);
+    ik_factor(m, g, IK_HEALTHY * IK_HEALTHY * largest, &f);
+    for (int j = 0; j < n; j++) {
+        const real range = ik->high[j] - ik->low[j];
+        const real span = range < ik->period[j] ? range : ik->period[j];
+        spans[j] = span < R(INFINITY) ? span : R(1.0);
+        at[j] = q[j];
+        /* A start with a part of each direction. */
+        u[j] = (j % 2 ? -R(1.0) : R(1.0)) / (R(1.0) + (real)j);
+        if (!(s->upper[j] > R(0.0) && s->lower[j] < R(0.0)))
+            u[j] = s->upper[j] > R(0.0) ? ik_abs(u[j]) : -ik_abs(u[j]);
+    }
+    /* The second derivative of x along e, by differences inwards. */
+    for (int j = 0; j < n; j++) {
+        const real probe = (s->upper[j] > R(0.0) ? IK_PROBE : -IK_PROBE) * spans[j];
+        at[j] = q[j] + probe;
+        ik_look(ik, at, x, there);
+        at[j] = q[j];
+        for (int l = 0; l < n; l++) {
+            bent[n * j + l] = R(0.0);
+            for (int i = 0; i < m; i++)
+                bent[n * j + l] += e[i] * (there[n * i + l] - J[n * i + l]) / probe;
+        }
+    }
+    const real seen = ik_norm(n * n, bent);
+    ik_allow(ik, J, &f, s, u);
+    for (int turn = 0; turn < IK_TURNS; turn++) {
+        for (int j = 0; j < n; j++) {
+            next[j] = seen * u[j];
+            for (int l = 0; l < n; l++) next[j] += R(0.5) * (bent[n * j + l] + bent[n * l + j]) * u[l];
+        }
+        for (int j = 0; j < n; j++) u[j] = next[j];
+        ik_allow(ik, J, &f, s, u);
+    }
+    real curved = R(0.0), length = R(INFINITY);
+    IK_OF(m, ik_rows_of, n, J, u, moved);
+    for (int i = 0; i < m; i++) curved -= moved[i] * moved[i];
+    for (int j = 0; j < n; j++)
+        for (int l = 0; l < n; l++) curved += u[j] * bent[n * j + l] * u[l];
+    if (!(curved > IK_BENDS * largest && curved > IK_BENDS_MOST * seen)) return;
+    /* As far as this curvature takes back the error, within limits. */
+    for (int j = 0; j < n; j++) {
+        const real room = u[j] > R(0.0) ? s->upper[j] - s->dq[j] : s->dq[j] - s->lower[j];
+        const real way = IK_WAY_OUT * spans[j], most = (room < way ? room : way) / ik_abs(u[j]);
+        length = most < length ? most : length;
+    }
+    const real whole = ik_norm(m, e) * HK_MATH(sqrt)(R(2.0) / curved);
+    length = whole < length ? whole : length;
+    for (int j = 0; j < n; j++) {
+        s->dq[j] = ik_clip(s->dq[j] + length * u[j], s->lower[j], s->upper[j]);
+        s->held[j] = (unsigned char)((s->dq[j] <= s->lower[j]) | (s->dq[j] >= s->upper[j]));
+    }
+}
+
 /* Eq. (1) for one period from q: the error e and the motion `feed` of the target (may be NULL) are
    taken back. `tip` (m) is where half-spaces see it. What is not finite, or overflows, holds still,
    with a limit of acceleration after it has braked; from outside the limits the actuators that are
@@ -637,6 +718,11 @@ static HK_NOINLINE void ik_control(const ik_settings *ik, const real *q, const r
         } else {
             ik_bound(ik, q, seconds, last, ends, s);
             ik_limited_step(ik, J, v, slides, NULL, s);
+            IK_OF(m, ik_rows_of, n, J, s->dq, s->promised);
+            const int lost = !(s->sigma_min > R(0.0)) || s->damping > R(0.0);
+            if (lost && !(ik->flags & IK_PULLS) && sizes[0] > R(0.0) &&
+                ik_norm(m, s->promised) <= IK_STUCK * ik_norm(m, v))
+                ik_escape(ik, q, J, e, s);
         }
         IK_OF(m, ik_rows_of, n, J, s->dq, s->promised);
         if (ik->flags & IK_PULLS && ik_finite(n, s->dq)) ik_arrive(ik, q, x, J, v, s);
