@@ -19,7 +19,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridkin import ConstantCurvatureChain, InverseKinematics, native, robots, trajectories
+from hybridkin import (
+    ConstantCurvatureChain,
+    InverseKinematics,
+    native,
+    robots,
+    trajectories,
+)
 
 DT = 0.01
 DELAYS = (0.0, 1.0, 2.0, 3.5, 5.0, 10.0)  # periods

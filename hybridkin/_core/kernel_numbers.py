@@ -107,7 +107,9 @@ IK_FROM_REST = 16
 IK_LEADS = 32  # commands lead what the actuators do, by their hysteresis
 
 # Readings of the tip, and their state: one array.
-IK_FRACTION = 0.2  # of an innovation that the offset takes; stable up to seven periods late, as
+IK_FRACTION = (
+    0.2  # of an innovation that the offset takes; stable up to seven periods late, as
+)
 # the bound is 2 sin(pi / (4 d + 2)) for d periods that nobody knows of; .35 for four
 IK_RING = 64  # tips of the model that are remembered
 IK_RECENT = 8  # periods that a reading may be late without anybody knowing

@@ -592,7 +592,10 @@ class InverseKinematics:
             feedback != "measured" or plant is not None,
             '`feedback="measured"` needs `plant`, a callable q -> measured tip.',
         )
-        for name, value, unused in (("memory", memory, math.inf), ("delay", delay, 0.0)):
+        for name, value, unused in (
+            ("memory", memory, math.inf),
+            ("delay", delay, 0.0),
+        ):
             require(
                 value == unused or feedback == "measured",
                 f'`{name}` requires feedback="measured"; set it, or remove `{name}`.',

@@ -316,7 +316,9 @@ class Tracker(Portable):
         """Return the age of a reading [s]."""
         at = number(at, "at")
         oldest = self._time - MOST_PERIODS * self._settings.dt
-        oldest = oldest if oldest > 0.0 else -math.inf  # before the start it stood still
+        oldest = (
+            oldest if oldest > 0.0 else -math.inf
+        )  # before the start it stood still
         close = IK_ON_TIME * self._settings.dt
         require(
             oldest - close <= at <= self._time + close,

@@ -38,7 +38,7 @@ def late(tips, periods):
     return tips[before] + (place - before) * (tips[after] - tips[before])
 
 
-def missed(periods, given, gain=None, size=(0.4, 0.2)):
+def missed(periods, given, gain=None, size=(0.3, 0.15)):
     """Return the distances of a robot from a figure eight, with a camera that is late."""
     path = trajectories.figure_eight((0.0, 0.0, 0.70), size, dt=DT, duration=8.0)
     ik = InverseKinematics(CHAIN, **LIMITS, gain=gain)
@@ -151,7 +151,7 @@ def test_torch_the_core_and_exported_code_use_readings_alike(gain, tmp_path):
             np.testing.assert_allclose(np.asarray(loop.q), loops[0].q, rtol=0, atol=close)
             assert loop.rejected == loops[0].rejected
         rejected += loops[0].rejected
-    assert 10 < rejected < 40
+    assert 5 < rejected < 40
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -246,24 +246,24 @@ def test_the_error_of_a_task_goes_where_the_readings_say(case, kind):
             U, _, V = np.linalg.svd(reading[:3, :3])
             reading[:3, :3] = U @ V
         tracker.step(convert(goal), x_measured=convert(reading))
-    assert float(np.linalg.norm(task.difference(*map(torch.tensor, (tips[-1:], goal[None]))))) < 1e-4
+    assert (
+        float(np.linalg.norm(task.difference(*map(torch.from_numpy, (tips[-1][None], goal[None])))))
+        < 1e-4
+    )
     assert tracker.error < 1e-4
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_row_that_is_not_known_leaves_its_offset(kind):
     convert = KINDS[kind]
-    tracker = InverseKinematics(CHAIN, q_min=0.1, q_max=0.4, gain=1.0 / DT, dt=DT).tracker(
-        convert(HOME)
-    )
+    ik = InverseKinematics(CHAIN, q_min=0.1, q_max=0.4, gain=1.0 / DT, beta=0.0, dt=DT)
+    tracker = ik.tracker(convert(HOME))
     off = np.array([0.004, -0.003, 0.006])
-    for known in ([True, True, True], [True, False, True], [False, False, False]):
-        reading = tip_of(tracker.q, CHAIN) + off
-        if not all(known):
-            reading = reading + np.where(known, 0.001, np.nan)
-        for _ in range(5):
+    nothing = np.full(3, np.nan)
+    for more in (np.zeros(3), np.array([0.001, np.nan, 0.001]), nothing):
+        for _ in range(10):
+            reading = tip_of(tracker.q, CHAIN) + off + more
             tracker.step(convert(TARGET), x_measured=convert(reading))
-            reading = tip_of(tracker.q, CHAIN) + off + np.where(known, 0.001 * (not all(known)), np.nan)
     moved = tip_of(tracker.q, CHAIN) - TARGET
     np.testing.assert_allclose(moved, -off - [0.001, 0.0, 0.001], rtol=0, atol=1e-8)
 
@@ -280,10 +280,11 @@ def test_the_time_of_a_reading_counts(kind):
         assert tracker.time == pytest.approx(i * DT)
         age = 3.5 * (1.0 + math.sin(i))
         target = TARGET + [0.05 * math.sin(0.1 * i), 0.0, 0.0]
+        speed = convert([0.5 * math.cos(0.1 * i + 0.05), 0.0, 0.0])
         at = tracker.time - age * DT
-        tracker.step(convert(target), x_measured=convert(late(tips, age)), at=at)
+        tracker.step(convert(target), speed, x_measured=convert(late(tips, age)), at=at)
+    np.testing.assert_allclose(tips[-1], target, atol=2e-3)
     assert tracker.error < 2e-3
-    np.testing.assert_allclose(tips[-1], target, atol=8e-3)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -298,7 +299,7 @@ def test_times_of_readings_that_are_not_kept_are_refused(kind):
     tracker.step(convert(TARGET), x_measured=tip, at=-7.0)  # it stood still there
     for _ in range(70):
         tracker.step(convert(TARGET))
-    before = np.array(tracker.q)
+    before = np.array(np.asarray(tracker.q))
     for at in (0.05, tracker.time + 0.01, math.nan, -math.inf):
         with pytest.raises(ValueError, match=r"`at` must be a time \[s\] from 0.08 to 0.71"):
             tracker.step(convert(TARGET), x_measured=tip, at=at)
@@ -320,7 +321,7 @@ def test_a_tracker_goes_on_from_its_pickle_and_forgets_at_a_reset(kind):
             tips.append(tip_of(tracker.q))
             reading = readings_of(5, i, tips)
             tracker.step(convert(TARGET), x_measured=convert(reading))
-        return np.array(tracker.q)
+        return np.array(np.asarray(tracker.q))
 
     first = run(tracker, 0, 12)
     again = pickle.loads(pickle.dumps(tracker))
@@ -375,9 +376,7 @@ def test_a_track_counts_rejected_readings_and_knows_the_delay(kind):
     assert_close(np.asarray(track.error)[15:][known[15:]], errors[15:][known[15:]], atol=1e-3)
     assert ik.track(convert(path), q0=convert(HOME)).rejected is None
     with pytest.raises(ValueError, match="`delay` must be a time from 0 to 0.63 s"):
-        ik.track(
-            convert(np.tile(TARGET, (70, 1))), plant=plant, feedback="measured", delay=0.7
-        )
+        ik.track(convert(np.tile(TARGET, (70, 1))), plant=plant, feedback="measured", delay=0.7)
 
 
 def test_a_model_without_a_size_has_that_of_its_tips():
