@@ -4,9 +4,9 @@ The table of the docs page "Pitfalls" and ``docs/data/late_cameras.csv``::
 
     python examples/studies/late_cameras.py --csv docs/data/late_cameras.csv
 
-Twenty seconds. The robot has radii 5 % larger than the model, and its tip follows one figure eight of 10 s,
-in periods of 10 ms. Errors are those of the true tip after the first second. Seeds 0 to 2 where
-something is drawn at random.
+Twenty seconds. The robot has radii 5 % larger than the model. Its tip follows one figure eight of
+10 s in periods of 10 ms. Errors are those of the true tip after the first second. Seeds 0 to 2
+where something is drawn at random.
 """
 
 from __future__ import annotations

@@ -444,8 +444,8 @@ def _verify(command: argparse.ArgumentParser) -> None:
       hybridkin verify model track measured.csv --time stamp --out verification
 
     MEASURED has the columns of the log of the model, one row for each row of the track. With other
-    rows, --time names the column of the time: its first row is the first row of the track. Where the
-    tips agree clearly better with earlier commands, the report says by how much the camera is late.
+    rows, --time names the column of the time: its first row is the first row of the track. Where
+    the tips agree clearly better with earlier commands, the report says how late the camera is.
     """
     add = command.add_argument
     _add_model(command)

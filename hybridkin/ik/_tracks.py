@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -34,7 +34,7 @@ class Loop:
 
     plant: Plant | None = None
     feedback: str | None = "model"
-    readings: Feedback = Feedback()
+    readings: Feedback = field(default_factory=Feedback)
     progress: Callable[[int, int], None] | None = None
 
 

@@ -72,8 +72,8 @@ def estimated_delay(t: ArrayLike, x: ArrayLike, x_measured: ArrayLike) -> Delay:
     good = tips.shape == readings.shape == (n, 3) and n > 3
     if not (good and np.isfinite(times).all() and (np.diff(times) > 0.0).all()):
         raise ValueError(
-            "`t` must be at least 4 increasing times [s], `x` and `x_measured` tips (N, 3) at these "
-            f"times, got the shapes {times.shape}, {tips.shape} and {readings.shape}."
+            "`t` must be at least 4 increasing times [s], `x` and `x_measured` tips (N, 3) then, "
+            f"got the shapes {times.shape}, {tips.shape} and {readings.shape}."
         )
     known = np.isfinite(readings).all(axis=1) & np.isfinite(tips).all(axis=1)
     if known.sum() < 4:

@@ -21,7 +21,7 @@ ROBOT = CHAIN.with_geometry(radii=1.05 * CHAIN.radii)
 REACH = float(CHAIN.reach)
 LIMITS = {"q_min": 0.1, "q_max": 0.4, "dq_max": 0.5, "dt": DT}
 HOME = np.full(9, 0.25) + 0.01 * np.cos(np.arange(9))
-TARGET = CHAIN(torch.from_numpy(HOME)).numpy() + [0.02, -0.01, 0.005]
+TARGET = CHAIN(torch.from_numpy(HOME)).numpy() + np.array([0.02, -0.01, 0.005])
 KINDS = {"core": np.asarray, "torch": lambda a: torch.from_numpy(np.asarray(a, dtype=float))}
 pytestmark = pytest.mark.filterwarnings("ignore:`x_measured` spans")
 
@@ -139,7 +139,7 @@ def test_torch_the_core_and_exported_code_use_readings_alike(gain, tmp_path):
     assert loops[0].backend == "compiled"
     tips, commands, rejected = [], [HOME], 0
     for i in range(200):
-        tips.append(tip_of(loops[0].q) + [0.0, 0.06 * (i > 120), 0.0])
+        tips.append(tip_of(loops[0].q) + np.array([0.0, 0.06 * (i > 120), 0.0]))
         target = TARGET + 0.1 * np.array([np.sin(0.05 * i), np.cos(0.05 * i) - 1.0, 0.0])
         reading = readings_of(3, i, tips)
         loops[0].step(target, x_measured=reading)
@@ -279,7 +279,7 @@ def test_the_time_of_a_reading_counts(kind):
         tips.append(tip_of(tracker.q))
         assert tracker.time == pytest.approx(i * DT)
         age = 3.5 * (1.0 + math.sin(i))
-        target = TARGET + [0.05 * math.sin(0.1 * i), 0.0, 0.0]
+        target = TARGET + np.array([0.05 * math.sin(0.1 * i), 0.0, 0.0])
         speed = convert([0.5 * math.cos(0.1 * i + 0.05), 0.0, 0.0])
         at = tracker.time - age * DT
         tracker.step(convert(target), speed, x_measured=convert(late(tips, age)), at=at)
@@ -292,7 +292,7 @@ def test_times_of_readings_that_are_not_kept_are_refused(kind):
     convert = KINDS[kind]
     ik = InverseKinematics(CHAIN, q_min=0.1, q_max=0.4, dt=DT)
     for delay in (0.6301, -0.1, math.nan, math.inf):
-        with pytest.raises(ValueError, match="`delay` must be a time from 0 to 0.63 s"):
+        with pytest.raises(ValueError, match=r"`delay` must be a time from 0 to 0\.63 s"):
             ik.tracker(HOME, delay=delay)
     tracker = ik.tracker(convert(HOME), delay=0.63)
     tip = convert(tip_of(HOME))
@@ -362,7 +362,7 @@ def test_a_track_counts_rejected_readings_and_knows_the_delay(kind):
 
     def plant(q):
         tips.append(tip_of(q))
-        return late(tips, 3.0) + [0.0, 0.3 * (len(tips) == 31), 0.0]
+        return late(tips, 3.0) + np.array([0.0, 0.3 * (len(tips) == 31), 0.0])
 
     track = ik.track(
         convert(path), q0=convert(HOME), plant=plant, feedback="measured", delay=3.0 * DT, tol=2e-3
@@ -375,7 +375,7 @@ def test_a_track_counts_rejected_readings_and_knows_the_delay(kind):
     assert_close = np.testing.assert_allclose
     assert_close(np.asarray(track.error)[15:][known[15:]], errors[15:][known[15:]], atol=1e-3)
     assert ik.track(convert(path), q0=convert(HOME)).rejected is None
-    with pytest.raises(ValueError, match="`delay` must be a time from 0 to 0.63 s"):
+    with pytest.raises(ValueError, match=r"`delay` must be a time from 0 to 0\.63 s"):
         ik.track(convert(np.tile(TARGET, (70, 1))), plant=plant, feedback="measured", delay=0.7)
 
 

@@ -62,7 +62,7 @@ def late(q, delay):
 @pytest.mark.parametrize("gaps", [False, True])
 def test_the_delay_is_that_of_the_camera(delay, gaps):
     q = loops(SIZE)
-    x = late(q, delay) + [0.01, 0.0, 0.0]  # a constant offset does not count
+    x = late(q, delay) + np.array([0.01, 0.0, 0.0])  # a constant offset does not count
     if gaps:
         x[::7] = np.nan
         x[100:110, 1] = np.inf
@@ -82,7 +82,7 @@ def test_what_holds_no_motion_is_refused():
     q = loops(SIZE)
     x = truth(q)
     for t, readings in ((T[::-1], x), (T[:3], x[:3]), (T, x[:5]), (T, np.nan * x)):
-        with pytest.raises(ValueError, match="must (be|hold) at least 4"):
+        with pytest.raises(ValueError, match=r"must (be|hold) at least 4"):
             workflow.estimated_delay(t, x[: len(t)], readings)
 
 
