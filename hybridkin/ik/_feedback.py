@@ -92,8 +92,10 @@ def expected_innovation(settings: StepSettings) -> tuple[Tensor, float]:
     if task.has_rotation:
         expected[-1] = _TURN * task.units[-1]
         most += math.pi / _TURN
-    parts = torch.tensor(task.parts)
-    return torch.tensor(expected, dtype=torch.float64).repeat_interleave(parts), most
+    rows: list[float] = []
+    for size, count in zip(expected, task.parts, strict=True):
+        rows += [size] * count
+    return torch.tensor(rows, dtype=torch.float64, device="cpu"), most
 
 
 def _reach(settings: StepSettings) -> float:

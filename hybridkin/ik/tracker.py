@@ -44,7 +44,8 @@ class Tracker(Portable):
     `delay`, or the time of each reading (`at`), if they are late. Readings that cannot be are not
     used (`rejected`): those farther off than 3 % of the reach (or two error radii of a model with
     `coverage`), 0.2 rad, and the motion of the last eight periods. Five in a row that agree are
-    believed, unless they are more than twice the reach away.
+    believed, unless they are more than twice the reach away. (Without a chain the tips within the
+    limits of q give the reach; where q has none either, all readings are used.)
 
     With the hysteresis of a `HybridForwardModel` (`play_`) commands lead what the actuators do. All
     limits are those of commands. After a reversal the command crosses the width of the hysteresis,
