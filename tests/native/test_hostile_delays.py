@@ -1,4 +1,4 @@
-"""Late, missing and impossible readings in a functional mock-up unit and in Octave, as in Python."""
+"""Late, missing and impossible readings in a functional mock-up unit and Octave, as in Python."""
 
 import shutil
 import subprocess
@@ -26,7 +26,7 @@ def run(tracker, count=60):
         tips.append(tracker.x + 0.01 * np.array([1.0, -0.5, 0.2]))
         reading = tips[max(k - 2, 0)] + 1e-3 * draw.standard_normal(3)
         if k % 9 == 5:
-            reading = reading + [0.0, 0.3, 0.0]
+            reading = reading + np.array([0.0, 0.3, 0.0])
         if k % 4 == 3:
             reading = NOTHING
         readings.append(reading)
@@ -79,7 +79,8 @@ def test_octave_uses_readings_as_python(tmp_path):
         readings = load('readings.txt');
         state = robot('reset', repmat(0.22, 9, 1));
         for k = 1:rows(readings)
-          [q, state, ~, ~, bad] = robot('step', state, {TARGET.tolist()}, [], readings(k, :), {1.7 * DT});
+          tip = readings(k, :);
+          [q, state, ~, ~, bad] = robot('step', state, {TARGET.tolist()}, [], tip, {1.7 * DT});
           found(k, :) = [q', bad];
         end
         save('-ascii', '-double', 'found.txt', 'found');
