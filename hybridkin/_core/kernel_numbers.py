@@ -112,15 +112,16 @@ IK_WAY_OUT = 0.05  # of the ranges: the longest first step
 # The state of a robot that follows targets: one array.
 IK_MODE = 0  # sum of the bits below
 IK_PERIOD = 1  # [s]
-IK_MEMORY = 2  # [s], 0 for none
+IK_MEMORY = 2  # [s] of the offset without readings; infinite: it stays
 IK_LAST = 3  # period of the step before [s], 0 for none
 IK_SIGMA_MIN = 4
 IK_DAMPING = 5
 IK_DISTANCE = 6  # length of the error
 IK_STOPPED = 7  # whether half-spaces changed the motion of the tip
 # Then target, motion of the target in this period, measured tip, last measured tip minus model, x
-# and error; q, step, q before, whether it was held (n each); what is remembered of the last step (IK_PROMISED
-# + 2 m); and J. Points of a task of m rows have m numbers, poses 16; motions and errors m.
+# and error; q, step, q before, whether it was held (n each); what is remembered of the last step
+# (IK_PROMISED + 2 m); and J. Points of a task of m rows have m numbers, poses 16; motions and
+# errors m.
 # With hysteresis q is the command and q before what the actuators did; then follow its state, and
 # one to try.
 IK_TARGET = 8
@@ -131,6 +132,26 @@ IK_HAS_TIP = 4
 IK_MUST_SEE = 8
 IK_FROM_REST = 16
 IK_LEADS = 32  # commands lead what the actuators do, by their hysteresis
+
+# Readings of the tip, and their state: one array.
+IK_FRACTION = (
+    0.2  # of an innovation that the offset takes; stable up to seven periods late, as
+)
+# the bound is 2 sin(pi / (4 d + 2)) for d periods that nobody knows of; .35 for four
+IK_RING = 64  # tips of the model that are remembered
+IK_RECENT = 8  # periods that a reading may be late without anybody knowing
+IK_AGREEING = 5  # consecutive rejected readings that are believed if they agree
+IK_ON_TIME = 1e-6  # of a period that makes no difference
+IK_AGE = 0  # of a reading when it comes [s]
+IK_SINCE = 1  # time since the last tip of the model [s], infinite: at rest until now
+IK_NEWEST = 2  # its row in the ring
+IK_FILLED = 3  # rows of the ring
+IK_WEIGHT = 4  # of the readings in the offset, in readings
+IK_DOUBTED = 5  # readings rejected in a row
+IK_REJECTED = 6  # whether the last reading was not used
+# Then offsets shown by the doubted readings (m each), and rows of the ring: the time since the tip
+# before, and the tip.
+IK_DOUBTS = 7
 
 # Hysteresis of the actuators.
 HK_MAX_CREEPS = 16  # time constants of an operator

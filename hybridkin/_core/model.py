@@ -233,6 +233,11 @@ class ForwardModel(PortableModule):
         return []
 
     @property
+    def size(self) -> float:
+        """Size of the robot [m]; infinite: unknown."""
+        return math.inf
+
+    @property
     def farthest(self) -> float:
         """Distance from a tip beyond which a target is in another unit [m]; infinite: unknown."""
         return math.inf

@@ -250,9 +250,14 @@ class Chain(PoseModel):
         """Raise if finite rows (N, n) cannot be a log of this robot."""
 
     @property
+    def size(self) -> float:
+        """Size of the robot [m], its reach."""
+        return float(self.reach.detach())
+
+    @property
     def farthest(self) -> float:
         """Distance from a tip beyond which a target is in another unit [m]."""
-        return _FAR * float(self.reach.detach())
+        return _FAR * self.size
 
     @property
     def longest_usual(self) -> float:
@@ -265,8 +270,7 @@ class Chain(PoseModel):
         origin = self.base[:3, 3].detach().to(x)
         points = torch.cat([origin[None], x.reshape(-1, 3)])
         finite = points[countable(points).all(-1)]
-        reach = float(self.reach.detach())
-        message = span_message(name, finite, reach, _FAR)
+        message = span_message(name, finite, self.size, _FAR)
         return [] if message is None else [message]
 
     def misses(self, x: Tensor, largest: Tensor) -> Tensor:

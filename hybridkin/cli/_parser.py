@@ -22,6 +22,7 @@ from hybridkin.cli._values import (
     between,
     count,
     names,
+    not_negative,
     numbers,
     play,
     positive,
@@ -335,6 +336,15 @@ def _view(command: argparse.ArgumentParser) -> None:
     _add_log(command)
 
 
+def _add_delay(command: argparse.ArgumentParser, use: str) -> None:
+    command.add_argument(
+        "--delay",
+        type=not_negative,
+        metavar="SECONDS",
+        help=f"how much later than its command a tip is read [s]; {use}",
+    )
+
+
 def _track(command: argparse.ArgumentParser) -> None:
     """Compute the commands that lead the tip along a path.
 
@@ -414,6 +424,7 @@ def _track(command: argparse.ArgumentParser) -> None:
         metavar="MM",
         help="accepted error [mm] (0.1)",
     )
+    _add_delay(command, "kept for `verify`; the commands do not depend on it (0)")
     where = "where the robot stands before the path (rest)"
     stand: Any = {"default": "rest", "dest": "start", "metavar": "rest|path|A,B,..."}
     add("--from", type=start, help=where, **stand)
@@ -433,12 +444,16 @@ def _verify(command: argparse.ArgumentParser) -> None:
       hybridkin verify model track measured.csv --time stamp --out verification
 
     MEASURED has the columns of the log of the model, one row for each row of the track. With other
-    rows, --time names the column of the time: its first row is the first row of the track.
+    rows, --time names the column of the time: its first row is the first row of the track. Where
+    the tips agree clearly better with earlier commands, the report says how late the camera is.
     """
     add = command.add_argument
     _add_model(command)
     add("track", type=Path, metavar="TRACK", help="track.csv or its folder")
     add("log", type=Path, metavar="MEASURED", help="commands and measured tips")
+    _add_delay(
+        command, "each is compared with the command of its time (that of the track)"
+    )
     _add_out(command, "folder for the report (none)")
     _add_log(command)
 

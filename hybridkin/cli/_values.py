@@ -28,6 +28,14 @@ def start(text: str) -> Sequence[float] | str:
     return text if text in ("rest", "path") else numbers(text)
 
 
+def not_negative(text: str) -> float:
+    """Return a finite number that is zero or more."""
+    value = float(text)
+    if not 0.0 <= value < float("inf"):
+        raise argparse.ArgumentTypeError(f"must be zero or more, got {text}")
+    return value
+
+
 def names(text: str) -> Sequence[str]:
     """Return names separated by commas."""
     return tuple(part.strip() for part in text.split(","))

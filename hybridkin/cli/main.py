@@ -255,6 +255,7 @@ def _track(arguments: argparse.Namespace, stages: Stages) -> _Result:
         limits=limits,
         start=start if isinstance(start, str) else log_format.from_log(start),
         tol=1e-3 * arguments.tol,
+        delay=arguments.delay or 0.0,
         force=arguments.force,
         progress=stages,
     )
@@ -269,7 +270,12 @@ def _verify(arguments: argparse.Namespace, stages: Stages) -> _Result:
     log_format = _log_format(arguments, loaded.log_format(), arguments.model)
     log = _read(arguments, replace(log_format, groups=None), stages)
     report = hybridkin.workflow.verify_track(
-        loaded, arguments.track, log, arguments.out, force=arguments.force
+        loaded,
+        arguments.track,
+        log,
+        arguments.out,
+        delay=arguments.delay,
+        force=arguments.force,
     )
     return report, int(report.record.kept is False)
 

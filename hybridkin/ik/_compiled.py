@@ -17,9 +17,12 @@ from torch import Tensor
 
 from hybridkin._core.arrays import as_array
 from hybridkin._core.kernel_numbers import (
+    IK_AGE,
+    IK_AGREEING,
     IK_AT_REST,
     IK_DAMPING,
     IK_DISTANCE,
+    IK_DOUBTS,
     IK_FROM_REST,
     IK_HAS_FEED,
     IK_HAS_TARGET,
@@ -34,7 +37,10 @@ from hybridkin._core.kernel_numbers import (
     IK_PERIOD,
     IK_PROMISED,
     IK_REACHED,
+    IK_REJECTED,
+    IK_RING,
     IK_SIGMA_MIN,
+    IK_SINCE,
     IK_STATE_ROWS,
     IK_STOPPED,
     IK_TARGET,
@@ -42,6 +48,7 @@ from hybridkin._core.kernel_numbers import (
     IK_TO_POSTURE,
 )
 from hybridkin._core.plan import NoKernel, Plan
+from hybridkin.ik._feedback import Feedback
 from hybridkin.ik._search import Found, Point, Search
 from hybridkin.ik._settings import StepSettings
 from hybridkin.ik._step import StepRows
@@ -71,6 +78,7 @@ class Tick(NamedTuple):
     J: Tensor
     e: Tensor
     step: StepRows
+    rejected: bool = False  # the reading
 
 
 def core_of(settings: StepSettings) -> Core | None:
@@ -166,10 +174,10 @@ class Core:
         try:
             follower = self._idle.pop()
         except IndexError:  # other threads use them
-            follower = Follower(self, None, IK_MUST_SEE + IK_FROM_REST)
+            follower = Follower(self, Feedback(), IK_MUST_SEE + IK_FROM_REST)
         follower.q[...] = q
         result = None
-        if follower.tick(target, dx, tip):
+        if follower.tick(target, dx, tip, 0.0):
             result = (follower.state.copy(), self._fields)
         self._idle.append(follower)
         return result
@@ -281,8 +289,8 @@ class Follower:
     ----------
     core : Core
         The core that computes.
-    memory : float, optional
-        Time constant of the measured offset [s].
+    feedback : Feedback
+        How readings are used.
     mode : int, default=0
         Bits of the mode of `ik_tick` that are always set.
     state : ndarray, optional
@@ -299,22 +307,24 @@ class Follower:
     def __init__(
         self,
         core: Core,
-        memory: float | None,
+        feedback: Feedback,
         mode: int = 0,
         state: NDArray | None = None,
     ) -> None:
         self.core = core
-        self._memory = memory
+        self._feedback = feedback
         self._least = mode
         places = core.places
         if state is None:
-            state = np.zeros(int(places["tried"].stop))
+            last = "tried" if mode & IK_MUST_SEE else "seen"
+            state = np.zeros(int(places[last].stop))
         self.state = state
         self.task = core.settings.task
         self._dt = state[IK_PERIOD] = core.settings.dt
-        state[IK_MEMORY] = memory or 0.0
+        state[IK_MEMORY] = feedback.memory
         self._parts = {name: state[place] for name, place in places.items()}
         self.q = self._parts["q"]
+        self._seen = self._parts["seen"]
         self.command = self.effective = self.q.copy
         self._lead = self._parts["lead"].reshape(-1, core.n)
         if len(self._lead) and not mode & IK_MUST_SEE:
@@ -335,7 +345,7 @@ class Follower:
         self._mode = -1
 
     def __reduce__(self) -> tuple[type[Follower], tuple]:
-        return Follower, (self.core, self._memory, self._least, self.state.copy())
+        return Follower, (self.core, self._feedback, self._least, self.state.copy())
 
     @property
     def hysteresis(self) -> Any:
@@ -344,15 +354,22 @@ class Follower:
             return None
         return self._lead.copy()
 
-    def start(self, q: Tensor, dq: Tensor, hysteresis: Any) -> None:
-        """Set the initial command (1, n), the step to it, and the state of hysteresis before it."""
+    def start(self, q: Tensor, dq: Tensor | None, hysteresis: Any) -> None:
+        """Set the initial command (1, n), the step to it, and the state of hysteresis before it.
+
+        Without a step the robot is at rest.
+        """
         parts = self._parts
-        for name in ("target", "feed", "tip", "offset", "held", "rest", "J"):
+        cleared = ("target", "feed", "tip", "offset", "dq", "held", "rest", "J", "seen")
+        for name in cleared:
             parts[name][:] = 0.0
         parts["error"][:] = math.nan
         self.state[[IK_SIGMA_MIN, IK_DISTANCE]] = math.nan
         self.state[[IK_DAMPING, IK_STOPPED]] = 0.0
-        parts["dq"][:] = as_array(dq[0])
+        self._seen[IK_SINCE] = math.inf
+        if dq is not None:
+            parts["dq"][:] = as_array(dq[0])
+            self._seen[IK_SINCE] = 0.0
         parts["q"][:] = as_array(q[0])
         if self.task.hysteresis is not None:
             q, end = self.task.hysteresis.apply(q, hysteresis, 0.0)
@@ -362,8 +379,8 @@ class Follower:
         self.state[IK_LAST] = self._dt
         parts["before"][:] = as_array(q[0])
 
-    def tick(self, target: object, dx: object, tip: object) -> bool:
-        """Do a tick with plain arrays: the target, its velocity, the measured tip.
+    def tick(self, target: object, dx: object, tip: object, age: float) -> bool:
+        """Do a tick with plain arrays: the target, its velocity, the measured tip and its age.
 
         Returns False, and does nothing, if one of them needs full checks.
         """
@@ -379,13 +396,24 @@ class Follower:
             if not self._put_tip(tip):
                 return False
             mode |= IK_HAS_TIP
+            if not mode & IK_MUST_SEE:
+                self._seen[IK_AGE] = age
         if mode != self._mode:
             self._mode = mode
             self.state[IK_MODE] = mode
         return self._follow(self._place) > 0
 
-    def advance(self, period: float | None, *inputs: Tensor | None) -> Tick:
+    def advance(
+        self,
+        period: float | None,
+        target: Tensor | None,
+        feed: Tensor | None,
+        tip: Tensor | None,
+        age: float,
+    ) -> Tick:
         """Do a tick with checked rows: the target, its motion in the period, the measured tip."""
+        inputs = target, feed, tip
+        self._seen[IK_AGE] = age
         for place, rows in zip(self._inputs, inputs, strict=True):
             if rows is not None:
                 place.numbers[...] = rows[0].numpy()
@@ -411,7 +439,8 @@ class Follower:
         )
         x = parts["x"].unflatten(1, self.task.shape)
         J = parts["J"].unflatten(1, (self.core.m, self.core.n))
-        return Tick(parts["before"], x, J, parts["error"], step)
+        rejected = bool(self._seen[IK_REJECTED])
+        return Tick(parts["before"], x, J, parts["error"], step, rejected)
 
 
 class _Input:
@@ -480,6 +509,7 @@ def places_of(n: int, m: int, width: int, n_rows: int) -> dict[str, slice]:
         "J": m * n,
         "lead": n_rows * n,
         "tried": n_rows * n,
+        "seen": IK_DOUBTS + IK_AGREEING * m + IK_RING * (1 + width),
     }
     places = {}
     start = IK_TARGET

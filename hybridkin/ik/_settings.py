@@ -23,6 +23,7 @@ from hybridkin._core.arrays import (
 )
 from hybridkin._core.kernel_numbers import (
     IK_ACCELERATES,
+    IK_FRACTION,
     IK_LIMITED,
     IK_NORMALS,
     IK_POSE,
@@ -33,6 +34,7 @@ from hybridkin._core.kernel_numbers import (
 from hybridkin._core.model import Portable
 from hybridkin._core.named_rows import without_warnings
 from hybridkin._core.plan import NoKernel, Plan
+from hybridkin.ik._feedback import expected_innovation
 from hybridkin.ik._half_spaces import HalfSpaces
 from hybridkin.ik.tasks import PointsTask, PoseTask, PositionTask, Task, Tolerance
 from hybridkin.native.hysteresis import stage_numbers
@@ -334,6 +336,8 @@ class StepSettings(Portable):
         vectors = [self.q_min, self.q_max, self.dq_max, self.ddq_max, posture]
         numbers = [np.broadcast_to(as_array(vector), n) for vector in vectors]
         numbers += [weights**-0.5, self.kernel_rates(), scale]
+        expected, most = expected_innovation(self)
+        numbers += [as_array(expected), [most]]
         for vector in (self.periods, self.pulls):
             numbers.append(np.broadcast_to(as_array(vector), n))
 
@@ -373,6 +377,11 @@ class StepSettings(Portable):
         beta = 1.0 if self.beta is None else self.beta
         damping = -1.0 if isinstance(self.damping, str) else self.damping
         return [gain, beta, self.dt, damping]
+
+    @property
+    def fraction(self) -> float:
+        """Fraction of an innovation that a reading adds to the offset; all of it for a `gain`."""
+        return IK_FRACTION if self.gain is None else 1.0
 
     # The plane of q to keep to, where the log lies in one.
 

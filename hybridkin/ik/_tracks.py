@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from hybridkin._core.arrays import as_array, give_back
+from hybridkin.ik._feedback import Feedback
 from hybridkin.ik._settings import StepSettings
 from hybridkin.ik.results import IKStatus, Track, statuses
 from hybridkin.ik.tasks import Tolerance
@@ -33,7 +34,7 @@ class Loop:
 
     plant: Plant | None = None
     feedback: str | None = "model"
-    memory: float | None = None
+    readings: Feedback = field(default_factory=Feedback)
     progress: Callable[[int, int], None] | None = None
 
 
@@ -45,22 +46,25 @@ def followed(
     start = settings.configurations(q0, "q0", path.points)
     target = path.points.to(start.dtype)
     command = as_array(start) if path.as_numpy else start
-    tracker = Tracker(settings, command, path.tol, loop.memory, state)
-    q, effective, x, measured, sigma_min, held, damped = tracker.follow(
+    tracker = Tracker(settings, command, path.tol, loop.readings, state)
+    columns = tracker.follow(
         target, path.periods, loop.plant, loop.feedback, loop.progress
     )
-    e = task.difference(measured, target)
-    error = e.norm(dim=-1)
+    q, effective, x, measured, e, rejected, sigma_min, held, damped = columns
     judged = e
     if loop.feedback != "measured":
+        e = task.difference(measured, target)
         judged = task.difference(x, target)
+    error = e.norm(dim=-1)
     reached = task.reached(judged, path.tol)
     status = statuses(task, effective, judged.norm(dim=-1), reached, held, damped)
-    status[~torch.isfinite(error)] = IKStatus.INVALID_INPUT
+    status[~torch.isfinite(error) | rejected] = IKStatus.INVALID_INPUT
     margin = settings.margin(q)
     rows = (path.t, q, effective, x, measured, target, error, status, sigma_min, margin)
-    results = give_back(rows, (len(target),), path.as_numpy)
+    results = give_back((*rows, rejected), (len(target),), path.as_numpy)
     track = Track(*results)
+    if loop.feedback != "measured":
+        track = replace(track, rejected=None)
     if loop.plant is None:
         track = replace(track, x_measured=None)
     return track

@@ -44,7 +44,8 @@ class IKStatus(IntEnum):
     OUT_OF_DOMAIN = 5
     """Converged, but outside the domain of the model (its `in_domain` is False)."""
     INVALID_INPUT = 6
-    """The target, the start, the model's output or the measured tip is not finite."""
+    """The target, the start, the model's output or the measured tip is not finite, or the measured
+    tip was rejected."""
     NO_FURTHER = 7
     """No further one of the requested configurations (`n_solutions`) was found."""
 
@@ -190,17 +191,22 @@ class Track(Generic[ArrayT]):
     x : array of shape (T, 3)
         Tips of the model at `effective` [m].
     x_measured : array of shape (T, 3) or None
-        Tips measured on the plant [m], NaN if it failed; None without a plant.
+        Tips measured on the plant, as read at the points [m], NaN if it failed; None without a
+        plant.
     target : array of shape (T, 3)
         The path [m].
     error : array of shape (T,)
-        Distance from the target to the measured tip, or to the model's without a plant [m].
+        Distance from the target to the measured tip, or to the model's without a plant [m]. The
+        measured tip is moved by what the model moved since then, if readings are late (`delay`).
     status : int array of shape (T,)
         `IKStatus` of every point of the path.
     sigma_min : array of shape (T,)
         Smallest singular value of the Jacobian.
     limit_margin : array of shape (T,)
         Smallest distance of an actuator to its limits, in the unit of q; inf without limits.
+    rejected : bool array of shape (T,) or None
+        Readings that were not used because they cannot be, see `Tracker.rejected`; None without
+        feedback="measured".
     """
 
     t: ArrayT
@@ -213,6 +219,7 @@ class Track(Generic[ArrayT]):
     status: ArrayT
     sigma_min: ArrayT
     limit_margin: ArrayT
+    rejected: ArrayT | None = None
 
     @property
     def largest_step(self) -> float:
@@ -240,6 +247,8 @@ class Track(Generic[ArrayT]):
             "smallest singular value": f"{as_array(self.sigma_min).min(initial=np.inf):.3g}",
             "commands": {"": ("least", "largest"), **commands},
         }
+        if self.rejected is not None:
+            rows["rejected readings"] = f"{int(as_array(self.rejected).sum())}"
         return html_table("Track", rows)
 
 

@@ -24,6 +24,7 @@ from hybridkin._core.arrays import (
 )
 from hybridkin._core.html import html_table
 from hybridkin.ik._compiled import Core, core_of
+from hybridkin.ik._feedback import MOST_PERIODS, Feedback
 from hybridkin.ik._gram import row_gram
 from hybridkin.ik._half_spaces import half_spaces
 from hybridkin.ik._implicit import differentiable as with_derivatives
@@ -533,7 +534,8 @@ class InverseKinematics:
         q0: Array | None = None,
         plant: Plant | None = None,
         feedback: str | None = "model",
-        memory: float | None = None,
+        delay: float = 0.0,
+        memory: float = math.inf,
         tol: float | None = None,
         progress: Callable[[int, int], None] | None = None,
         state: Any = None,
@@ -560,14 +562,18 @@ class InverseKinematics:
         feedback : {"model", "measured"} or None, default="model"
             Source of the error: the model's tip (with a plant: the paper's feed-forward control),
             the measured tip, or none.
-        memory : float, optional
-            Time constant [s] with which the last measured offset between tip and model decays while
-            measurements are NaN; make it several times longer than the gaps. Default: feed-forward
-            only while there is no measurement, which can be better than a short memory.
+        delay : float, default=0.0
+            Age [s] of a measured tip when the plant returns it, fractions of a period too; at most
+            63 periods. It is compared with the model's tip of that time. Without a `gain` a delay
+            of up to four periods may stay unknown.
+        memory : float, default=inf
+            Time constant [s] with which the offset between measured tip and model decays while
+            measurements are NaN or rejected; make it several times longer than the gaps. Default:
+            the offset stays.
         tol : float, optional
             Largest error of a CONVERGED point [m], with feedback="measured" of its measured error.
             Default: 1e-4, with feedback="measured" 1e-3, because a step removes neither the noise
-            of its measurement nor the change of the model's error during the step.
+            of its measurement nor the change of the model's error since the measurements before.
         progress : callable, optional
             Called as ``progress(i, T)`` before point i.
         state : array of shape (R, n), optional
@@ -578,7 +584,7 @@ class InverseKinematics:
         -------
         Track
             If the plant raises, the point is NaN in `x_measured` with status INVALID_INPUT, a
-            warning is given, and the motion continues with feed-forward only.
+            warning is given, and the motion continues without a reading.
         """
         settings = self.settings
         one_of(feedback or "model", "feedback", ("model", "measured"), " or None")
@@ -586,10 +592,14 @@ class InverseKinematics:
             feedback != "measured" or plant is not None,
             '`feedback="measured"` needs `plant`, a callable q -> measured tip.',
         )
-        require(
-            memory is None or feedback == "measured",
-            '`memory` requires feedback="measured"; set it, or remove `memory`.',
-        )
+        for name, value, unused in (
+            ("memory", memory, math.inf),
+            ("delay", delay, 0.0),
+        ):
+            require(
+                value == unused or feedback == "measured",
+                f'`{name}` requires feedback="measured"; set it, or remove `{name}`.',
+            )
         if tol is None:
             tol = _MEASURED if feedback == "measured" else _TOL
         if isinstance(path, Trajectory):
@@ -612,7 +622,11 @@ class InverseKinematics:
         times, periods = settings.times(t, target)
         tolerance = settings.tolerance(tol)
         timed = Path(target, times, periods, tolerance, is_numpy(points))
-        loop = Loop(plant, feedback, memory, progress)
+        kept = math.inf  # of shorter paths everything, as it stood still before
+        if len(times) > MOST_PERIODS:
+            kept = float((times[MOST_PERIODS:] - times[:-MOST_PERIODS]).min())
+        readings = Feedback.checked(delay, memory, kept)
+        loop = Loop(plant, feedback, readings, progress)
         for message in messages:
             warnings.warn(message, stacklevel=3)
         if starts is not None and starts.ndim == 1:
@@ -660,7 +674,8 @@ class InverseKinematics:
         q0: Array,
         *,
         tol: float | Sequence[float] = 1e-4,
-        memory: float | None = None,
+        delay: float = 0.0,
+        memory: float = math.inf,
     ) -> Tracker:
         """Return a tracker that follows targets step by step, for one robot at its control rate.
 
@@ -670,7 +685,9 @@ class InverseKinematics:
             Present actuator vector, in the unit of q. Commands are NumPy or torch, like this.
         tol : float or sequence of floats, default=1e-4
             Largest error of a reached target [m], or one for every part of the task, for `status`.
-        memory : float, optional
+        delay : float, default=0.0
+            Age of a measured tip when `step` gets it, as for `track` [s].
+        memory : float, default=inf
             As for `track` [s].
 
         Returns
@@ -679,7 +696,8 @@ class InverseKinematics:
             Its `step` takes a target, and optionally the measured tip, and returns the command.
         """
         settings = self.settings
-        tracker = Tracker(settings, q0, settings.tolerance(tol), memory)
+        readings = Feedback.checked(delay, memory, MOST_PERIODS * settings.dt)
+        tracker = Tracker(settings, q0, settings.tolerance(tol), readings)
         start = as_tensor(q0, "q0")
         for message in settings.posture_messages(start, "q0"):
             warnings.warn(message, stacklevel=2)

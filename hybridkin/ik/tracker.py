@@ -15,8 +15,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hybridkin._core.arrays import as_array, as_tensor, is_numpy, number
+from hybridkin._core.kernel_numbers import IK_ON_TIME
 from hybridkin._core.model import Portable
 from hybridkin.ik._compiled import Follower, Tick, core_of, why_torch
+from hybridkin.ik._feedback import MOST_PERIODS, Feedback, Readings
 from hybridkin.ik._gram import row_gram
 from hybridkin.ik._hysteresis import Lead
 from hybridkin.ik._rest import Rest
@@ -34,7 +36,17 @@ class Tracker(Portable):
     The law is that of `InverseKinematics.step`, for one configuration and any task. Trackers are
     made by `InverseKinematics.tracker`; arrays are NumPy or torch, like its `q0`. It keeps a copy
     of the model from `reset`, but a refit of an estimator reaches it at the next `step`: `q` and
-    its speed stay, a remembered offset is forgotten. Threads that share it wait for each other.
+    its speed stay, the offset is forgotten. Threads that share it wait for each other.
+
+    A measured tip (`x_measured`) is compared with the model's tip of its own time, and the model's
+    present tip moved by the resulting offset is what goes to the target. With the default gain the
+    offset takes a fifth of what each reading shows beyond it, which is stable for readings up to
+    four periods late that nobody knows of, and averages noise. With a `gain` it takes all: give
+    `delay`, or the time of each reading (`at`), if they are late. Readings that cannot be are not
+    used (`rejected`): those farther off than 3 % of the reach (or two error radii of a model with
+    `coverage`), 0.2 rad, and the motion of the last eight periods. Five in a row that agree are
+    believed, unless they are more than twice the reach away. (Without a chain the tips within the
+    limits of q give the reach; where q has none either, all readings are used.)
 
     With the hysteresis of a `HybridForwardModel` (`play_`) commands lead what the actuators do. All
     limits are those of commands. After a reversal the command crosses the width of the hysteresis,
@@ -55,7 +67,11 @@ class Tracker(Portable):
         The model's tip at the start of the last step [m], in the shape of the task.
     error : float
         Distance from the tip, the measured one if it was given, to the target before the last step
-        [m]; NaN if unknown.
+        [m]; NaN if unknown. A late tip is moved by what the model moved since then.
+    time : float
+        Time of the present command since `reset` [s]: the clock of `at`.
+    rejected : bool
+        Whether the measured tip of the last step was not used, because it cannot be.
     saturated : bool array of shape (n,)
         Actuators that the last step held at a limit of position, speed or acceleration.
     sigma_min : float
@@ -82,16 +98,12 @@ class Tracker(Portable):
         settings: StepSettings,
         q0: Array,
         tol: Tolerance,
-        memory: float | None,
+        feedback: Feedback,
         state: Any = None,
     ) -> None:
-        if memory is not None:
-            memory = number(memory, "memory")
-        good = memory is None or 0.0 < memory < math.inf
-        require(good, f"`memory` must be a positive time [s], got {memory!r}.")
         self._settings = settings
         self._tol = tol
-        self._memory = memory
+        self._feedback = feedback
         self._as_numpy = is_numpy(q0)
         self._lock = Lock()  # of the state, for threads that share the tracker
         self._reset(q0, state)
@@ -144,6 +156,16 @@ class Tracker(Portable):
         return float(self._last().e.norm())
 
     @property
+    def time(self) -> float:
+        """Time of the present command since `reset` [s]."""
+        return self._time
+
+    @property
+    def rejected(self) -> bool:
+        """Whether the last step did not use its measured tip, because it cannot be."""
+        return self._last().rejected
+
+    @property
     def sigma_min(self) -> float:
         """Smallest singular value of the Jacobian before the last step."""
         return float(self._last().step.sigma_min)
@@ -164,12 +186,13 @@ class Tracker(Portable):
         CONVERGED if `error` is within the tolerance, or OUT_OF_DOMAIN if the configuration is
         outside the model's domain. Else AT_LIMITS if a limit restricted the step, SINGULAR if it
         was damped or no motion is possible, MAX_ITER otherwise. INVALID_INPUT before the first
-        step, and if the target, the measured tip or the model's output was not finite.
+        step, and if the target, the measured tip or the model's output was not finite, or the
+        measured tip was rejected.
         """
         last = self._last()
         task = self._robot.task
         step = last.step
-        if not torch.isfinite(last.e.norm() + step.sigma_min):
+        if last.rejected or not torch.isfinite(last.e.norm() + step.sigma_min):
             return IKStatus.INVALID_INPUT
         if task.reached(last.e, self._tol):
             with torch.no_grad():
@@ -207,26 +230,27 @@ class Tracker(Portable):
         with self._lock:
             self._like = start.clone()
             self._unseen = {"x_target", "x_measured"}
-            self._start(self._like, torch.zeros_like(start), state)
+            self._time = 0.0
+            self._start(self._like, None, state)
 
-    def _start(self, q: Tensor, dq: Tensor, hysteresis: Any) -> None:
-        """Read the model, and start at q (n,) after a step dq (n,)."""
+    def _start(self, q: Tensor, dq: Tensor | None, hysteresis: Any) -> None:
+        """Read the model, and start at q (n,), after a step dq (n,) or at rest."""
         self._settings = settings = self._settings.present()
         core = core_of(settings)
         task = settings.task
         if core is None:
             reason = why_torch(settings)
-            robot = _InTorch(settings, self._memory, self._as_numpy, reason)
+            robot = _InTorch(settings, self._feedback, self._as_numpy, reason)
         elif self._as_numpy and q.dtype == torch.float64:
-            robot = Follower(core, self._memory)
+            robot = Follower(core, self._feedback)
         else:
             reason = "`q0` is no float64 array of NumPy"
-            robot = _InTorch(settings, self._memory, self._as_numpy, reason)
+            robot = _InTorch(settings, self._feedback, self._as_numpy, reason)
         require(
             hysteresis is None or task.hysteresis is not None,
             "`state` is that of a hysteresis, but the model has none; leave it out.",
         )
-        robot.start(q[None], dq[None], hysteresis)
+        robot.start(q[None], None if dq is None else dq[None], hysteresis)
         self._estimator = task.estimator
         self._module = task.module
         self._robot = robot
@@ -237,6 +261,7 @@ class Tracker(Portable):
         dx: Array | None = None,
         *,
         x_measured: Array | None = None,
+        at: float | None = None,
     ) -> NDArray | Tensor:
         """Return the actuator vector to command next, one period ahead, eq. (1).
 
@@ -248,17 +273,28 @@ class Tracker(Portable):
             Velocity of the target [m/s], one for every row of the task; (next target - target) / dt
             for second order in dt. Default: at rest.
         x_measured : array-like of shape (3,), optional
-            Measured tip [m] for feedback. NaN means no measurement: the step is then feed-forward
-            only, or with `memory` uses the model's tip plus the last measured offset. Default: the
-            model's tip.
+            Measured tip [m] for feedback. Without one (default), or where it is NaN, the offset
+            between robot and model stays as it is, or decays with `memory`; before the first
+            reading it is zero.
+        at : float, optional
+            Time of the measured tip [s], on the clock of `time`: for a tip of a given age,
+            ``at=tracker.time - age``. Default: `delay` before `time`.
 
         Returns
         -------
         array of shape (n,)
             The command, exactly within the limits; a new array. If `x_target` or `dx` is not
             finite, the robot stops (with `ddq_max` it brakes first).
+
+        Raises
+        ------
+        ValueError
+            If `at` lies in the future, or more than 63 periods ago.
         """
         with self._lock:
+            age = self._feedback.delay
+            if at is not None:
+                age = self._age(at)
             estimator = self._estimator
             if estimator is not None and estimator.module_ is not self._module:
                 robot = self._robot
@@ -273,9 +309,25 @@ class Tracker(Portable):
             if x_measured is not None and self._unseen:
                 self._look("x_measured", x_measured)
             robot = self._robot
-            if not robot.tick(x_target, dx, x_measured):
-                self._step(x_target, dx, x_measured)
+            if not robot.tick(x_target, dx, x_measured, age):
+                self._step(x_target, dx, x_measured, age)
+            self._time += self._settings.dt
             return robot.command()
+
+    def _age(self, at: float) -> float:
+        """Return the age of a reading [s]."""
+        at = number(at, "at")
+        oldest = self._time - MOST_PERIODS * self._settings.dt
+        oldest = (
+            oldest if oldest > 0.0 else -math.inf
+        )  # before the start it stood still
+        close = IK_ON_TIME * self._settings.dt
+        require(
+            oldest - close <= at <= self._time + close,
+            f"`at` must be a time [s] from {max(oldest, 0.0):.6g} to {self._time:.6g}, which is "
+            f"`time` of the tracker, {MOST_PERIODS} periods later at most; got {at!r}.",
+        )
+        return max(self._time - at, 0.0)
 
     def _look(self, name: str, value: Array) -> None:
         """Warn if the first target or tip after `reset` has another unit than the robot."""
@@ -284,10 +336,16 @@ class Tracker(Portable):
             return
         self._unseen.discard(name)
         for message in self._settings.far_messages(points, name):
+            if name == "x_measured":
+                message += " Such readings are not used (`rejected`)."
             warnings.warn(message, stacklevel=3)
 
     def _step(
-        self, x_target: Array, dx: Array | None, x_measured: Array | None
+        self,
+        x_target: Array,
+        dx: Array | None,
+        x_measured: Array | None,
+        age: float,
     ) -> None:
         """Do a step with arguments that need full checks."""
         settings = self._settings
@@ -301,7 +359,7 @@ class Tracker(Portable):
         tip = None
         if x_measured is not None:
             tip = settings.points(x_measured, "x_measured", like, lead="")[None]
-        self._robot.advance(None, target[None], feed_forward, tip)
+        self._robot.advance(None, target[None], feed_forward, tip, age)
 
     def follow(
         self,
@@ -311,10 +369,11 @@ class Tracker(Portable):
         feedback: str | None,
         progress: Callable[[int, int], None] | None,
     ) -> list[Tensor]:
-        """Return commands, what the actuators do, x, the measured tip, sigma_min, held and damped.
+        """Return columns with a row for every point of the path (T, ...).
 
-        Rows are the points of the path (T, ...). The last two are whether the step to the point was
-        held or damped, all others refer to the state at the point.
+        They are the command, what the actuators do, x, the measured tip, the error of the loop,
+        whether the reading was rejected, sigma_min, and whether the step to the point was held or
+        damped; all others refer to the state at the point.
         """
         task = self._settings.task
         n = len(targets)
@@ -323,7 +382,6 @@ class Tracker(Portable):
         countable = torch.isfinite(ahead).all(-1, keepdim=True)
         ahead = torch.where(countable, ahead, 0.0)
         finite = torch.isfinite(targets.flatten(1)).all(-1).tolist()
-        unread = torch.full_like(targets[:1], math.nan)
         held = damped = torch.zeros(1, dtype=torch.bool, device=targets.device)
         rows = []
         for i, target in enumerate(targets.split(1)):
@@ -332,14 +390,19 @@ class Tracker(Portable):
             tip = None
             if plant is not None:
                 tip = self._measured(plant, i)
-            used = {"model": None, "measured": tip, None: unread}[feedback]
+            reading = tip if feedback == "measured" else None
             command = as_tensor(self._robot.command(), "q")[None]
-            if not finite[i]:
+            if not finite[i] or feedback is None:
                 target = None
-            tick = self._robot.advance(periods[i], target, ahead[i : i + 1], used)
+            tick = self._robot.advance(
+                periods[i], target, ahead[i : i + 1], reading, self._feedback.delay
+            )
+            self._time += periods[i]
             if tip is None:
                 tip = tick.x
-            rows.append((command, tick.q, tick.x, tip, tick.J, held, damped))
+            rejected = torch.full_like(held, tick.rejected)
+            state = command, tick.q, tick.x, tip, tick.e, rejected
+            rows.append((*state, tick.J, held, damped))
             held = tick.step.saturated.any(-1) | tick.step.stopped
             damped = tick.step.damping > 0.0
         *states, J, held, damped = map(torch.cat, zip(*rows, strict=True))
@@ -365,9 +428,9 @@ class _InTorch:
     """The torch counterpart of `Follower`, for any task."""
 
     def __init__(
-        self, settings: StepSettings, memory: float | None, as_numpy: bool, reason: str
+        self, settings: StepSettings, feedback: Feedback, as_numpy: bool, reason: str
     ) -> None:
-        self._memory = memory
+        self._memory = feedback.memory
         self._as_numpy = as_numpy
         self.backend = f"torch: {reason}"
         self.task = settings.task.frozen()
@@ -382,24 +445,31 @@ class _InTorch:
         return _given_back(self._lead.state[None], self._as_numpy)
 
     @torch.no_grad()
-    def start(self, q: Tensor, dq: Tensor, hysteresis: Any) -> None:
-        """Set the initial command (1, n), the step to it, and the state of hysteresis before it."""
+    def start(self, q: Tensor, dq: Tensor | None, hysteresis: Any) -> None:
+        """Set the initial command (1, n), the step to it, and the state of hysteresis before it.
+
+        Without a step the robot is at rest.
+        """
         self._command = q
         if self.task.hysteresis is not None:
             self._lead = Lead(self._settings, self.task.hysteresis, q, hysteresis)
             q = self._lead.effective
         self._q = q
         x, J = self._settings.evaluate(q)
-        self._offset = x.new_zeros(1, sum(self.task.parts))  # last measured minus model
-        unknown = torch.full_like(self._offset, math.nan)
+        self._readings = Readings(self._settings, x, at_rest=dq is None)
+        unknown = torch.full_like(self._readings.offset, math.nan)
         undamped = torch.zeros_like(q[:, 0])
         free = torch.zeros_like(q, dtype=torch.bool)
+        if dq is None:
+            dq = torch.zeros_like(q)
         step = StepRows(dq, unknown[:, 0], undamped, free, unknown)
-        self._rest = Rest.at(self._offset)
+        self._rest = Rest.at(unknown)
         self._period = self._settings.dt  # of the last step
         self._last = Tick(q, x, J, unknown, step)
 
-    def tick(self, target: Array, dx: Array | None, tip: Array | None) -> bool:
+    def tick(
+        self, target: Array, dx: Array | None, tip: Array | None, age: float
+    ) -> bool:
         """Return False: all arguments need full checks."""
         return False
 
@@ -410,35 +480,31 @@ class _InTorch:
         target: Tensor | None,
         feed_forward: Tensor | None,
         tip: Tensor | None,
+        age: float,
     ) -> Tick:
         """Take one step towards a target (1, ...), and return its results.
 
-        If `tip` is None the model's is used. Without a target the step is feed-forward only.
+        A measured `tip` is `age` seconds old. Without a target the step is feed-forward only.
         """
         settings = self._settings
         task = self.task
         x, J = settings.evaluate(self._q)
-        error = torch.full_like(self._offset, math.nan)
-        used = torch.zeros_like(self._offset)
-        before = used
+        readings = self._readings
+        readings.record(x)
+        shown = readings.take(tip, age, self._memory)
+        error = torch.full_like(shown, math.nan)
+        used = before = torch.zeros_like(shown)
         if target is not None:
-            error = used = task.difference(x, target)
-            before = task.difference(self._last.x, target) - used
-            if tip is not None:
-                # Without a measurement, use the model's error corrected by the remembered offset;
-                # without memory, use no error.
-                error = task.difference(tip, target)
-                offset = used - error
-                finite = torch.isfinite(offset).all(-1, keepdim=True)
-                remembered = used if self._memory is None else self._offset
-                used = torch.where(finite, error, used - remembered)
-                self._offset = torch.where(finite, offset, self._offset)
+            model_error = task.difference(x, target)
+            error = model_error - shown
+            used = model_error - readings.offset
+            before = used + task.difference(self._last.x, target) - model_error
         seconds = period or settings.dt
         last = self._last.step.dq * (seconds / self._period)
         at = None
         if settings.tip_limits is not None:
-            at = x + self._offset
-        rest = self._rest.seen(settings, before + used, used, J)
+            at = x + readings.offset
+        rest = self._rest.seen(settings, before, used, J)
         control = partial(
             control_step,
             settings,
@@ -459,11 +525,10 @@ class _InTorch:
         else:
             step = control()
             self._command = self._q = effective + step.dq
-        if self._memory is not None:
-            self._offset = math.exp(-seconds / self._memory) * self._offset
+        readings.passed(seconds)
         moved = self._q - effective
         self._rest = rest.after(settings, moved, step.promised, used)
-        self._last = Tick(effective, x, J, error, step)
+        self._last = Tick(effective, x, J, error, step, readings.rejected)
         self._period = seconds
         return self._last
 

@@ -21,7 +21,10 @@ from torch import Tensor
 
 from hybridkin._core.files import check_outputs, write_files
 from hybridkin._core.kernel_numbers import (
+    IK_AGREEING,
+    IK_DOUBTS,
     IK_LIMITED,
+    IK_RING,
     IK_STAGES,
     IK_STATE_ROWS,
     c_header,
@@ -51,9 +54,10 @@ _SIZES = dict(N="actuators", S="segments", M="outputs", F="features", P="powers"
 _SIZES["R"] = "rows of a task"
 _NO_LIMITS = np.array([[-math.inf], [math.inf], [math.inf], [math.inf]])
 _MOST_STACK = 56 * 1024  # bytes to compute in; small arrays come on top
-# steps per run of the test; memory in periods
+# steps per run of the test; memory and delay in periods
 _STEPS = 4
 _MEMORY = 5.0
+_DELAY = 1.5
 _STEP_PARTS = {
     "STEP_H": "step.h",
     "STEP_C": "step.c",
@@ -97,6 +101,8 @@ class _Task(Protocol):
 class _Settings(Protocol):
     @property
     def task(self) -> _Task: ...
+    @property
+    def fraction(self) -> float: ...
     def write_plan(self, plan: Plan) -> int: ...
     def kernel_rates(self) -> list[float]: ...
 
@@ -120,7 +126,7 @@ class _Controller(Protocol):
     @property
     def settings(self) -> _Settings: ...
     def tracker(
-        self, q0: NDArray | Tensor, *, memory: float | None = None
+        self, q0: NDArray | Tensor, *, delay: float = 0.0, memory: float = math.inf
     ) -> _Tracker: ...
 
 
@@ -360,6 +366,7 @@ def _step_code(plan: Plan, task: _Task, n_spaces: int) -> Entries:
         "ABOUT_TARGET": _ABOUT_POSES if task.has_rotation else "desired x now [m];",
         "SPACES": _ABOUT_SPACES if n_spaces else "",
         "LEAD": n * plan.entry(plan.root, IK_STATE_ROWS),
+        "SEEN": IK_DOUBTS + IK_AGREEING * m + IK_RING * (1 + math.prod(task.shape)),
     }
     entries |= {"LEADS": "", "LEAD_FIELD": "", "WITHOUT": ""}
     if leads(plan):
@@ -473,6 +480,7 @@ def _vectors(
         arrays |= runs
         entries["STEPS"] = _STEPS
         entries["MEMORY"] = _MEMORY * _limits(plan)[1]
+        entries["DELAY"] = _DELAY * _limits(plan)[1]
     for name, array in arrays.items():
         entries[name] = literals(array)
     return entries
@@ -523,7 +531,7 @@ def _runs(
     squares = []
     healthy = 8 if dtype == "float64" else 4  # runs whose steps are compared
     for k, start in enumerate(_doubles(starts)):
-        tracker = controller.tracker(start, memory=_MEMORY * dt)
+        tracker = controller.tracker(start, delay=_DELAY * dt, memory=_MEMORY * dt)
         tips = [
             *_doubles(measured[k, :-1]),
             None,

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridkin._core.files import check_outputs, write_file
+from hybridkin._core.kernel_numbers import IK_RING
 from hybridkin._core.texts import xml_text
 from hybridkin._core.version import __version__
 from hybridkin.native.export import (
@@ -58,6 +59,7 @@ _NEEDS = {
 }
 _START = Need("finite", -_MOST, _MOST)
 _MEMORY = Need("zero or a time in s", 0.0, _MOST)
+_FRACTION = Need("above zero and at most 1", _LEAST, 1.0)
 
 
 class Variable(NamedTuple):
@@ -108,10 +110,13 @@ def export_fmu(
     The unit is one of FMI 3.0 for co-simulation, with a library for this machine and its sources,
     from which others can be compiled. Of a model it has the input q and the outputs x, J and
     domain_distance. Of inverse kinematics it has the inputs target, velocity and measured (NaN:
-    no measurement), the outputs command, tip (that of the model), error and status (0 a step
-    without limits, 1 limits restricted it, 2 held, because an input is not finite), with hysteresis
-    effective (what the actuators do), and as parameters the start, the limits, gain, beta and
-    memory. A step of the simulation must be a multiple of its period.
+    no measurement), the outputs command, tip (that of the model), error, status (0 a step without
+    limits, 1 limits restricted it, 2 held, because an input is not finite) and rejected (1 if the
+    measurement was not used, as it cannot be), with hysteresis effective (what the actuators do),
+    and as parameters the start, the limits, gain, beta, fraction (of what a measurement shows
+    beyond the offset between robot and model, by default 0.2, and 1 with a `gain`), delay (age of
+    measurements) and memory (0: the offset stays). A step of the simulation must be a multiple of
+    its period; in several periods a measurement is that of the first.
 
     Parameters are checked as in Python. All but the start may change between steps. A call that is
     refused returns fmi3Error, logs the reason (category logStatusError), and changes nothing.
@@ -212,6 +217,9 @@ def _variables(project: CProject) -> list[Variable]:
     by_rate = f"up to {rate:.6g} 1/s, which is 1 / period"
     need_gain = Need(f"positive and {by_rate}", _LEAST, most)
     need_beta = Need(f"zero or {by_rate}", 0.0, most)
+    oldest = (IK_RING - 1) * dt
+    need_delay = Need(f"zero or up to {oldest:.6g} s", 0.0, oldest)
+    settings = project.controller.settings
     variables = [
         Variable(
             "target", "input", str(project.entries["ABOUT_TARGET"]), width, target
@@ -221,11 +229,14 @@ def _variables(project: CProject) -> list[Variable]:
         Variable("start", "parameter", "command at rest", (n,), home, _START, "fixed"),
         _tunable("gain", "of the error [1/s]", gain, need_gain),
         _tunable("beta", "of the posture [1/s]", beta, need_beta),
-        _tunable("memory", "of measurements [s]", 0.0, _MEMORY),
+        _tunable("fraction", "of an innovation", settings.fraction, _FRACTION),
+        _tunable("delay", "age of measurements [s]", 0.0, need_delay),
+        _tunable("memory", "of measurements [s]; 0: no end", 0.0, _MEMORY),
         Variable("command", "output", project.about_q, (n,)),
         Variable("tip", "output", "of the model at the command, as target", width),
         Variable("error", "output", "distance to the target [m]", ()),
         Variable("status", "output", "0 free, 1 at limits, 2 held", ()),
+        Variable("rejected", "output", "1: the measurement is not used", ()),
     ]
     if leads(plan):
         about = "what the actuators do, after hysteresis"

@@ -10,6 +10,7 @@ from hybridkin.workflow.report import Report
 
 if TYPE_CHECKING:
     from hybridkin.workflow.compare import FitSettings
+    from hybridkin.workflow.delay import Delay, estimated_delay
     from hybridkin.workflow.domain import PathLimits, path_limits
     from hybridkin.workflow.evaluate import Evaluation, evaluate_log
     from hybridkin.workflow.export import export_model
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "LOG_SUFFIXES",
+    "Delay",
     "Description",
     "Evaluation",
     "FitRecord",
@@ -36,6 +38,7 @@ __all__ = [
     "Verification",
     "animate_track",
     "describe",
+    "estimated_delay",
     "evaluate_log",
     "export_model",
     "fit_log",
@@ -52,6 +55,10 @@ __all__ = [
 # A description of a robot needs no fit and no inverse kinematics.
 _NAMES_OF = {
     "compare": ("FitSettings",),
+    "delay": (
+        "Delay",
+        "estimated_delay",
+    ),
     "domain": (
         "PathLimits",
         "path_limits",

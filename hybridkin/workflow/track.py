@@ -72,6 +72,8 @@ class TrackRecord:
         Number of rows that lead from the robot's configuration to the path.
     limits : PathLimits
         The limits that were kept.
+    delay : float
+        How much later than its command a tip will be read [s], for `verify_track`.
     """
 
     command: str = "track"
@@ -85,6 +87,7 @@ class TrackRecord:
     play: list[float] | None
     lead_in: int
     limits: PathLimits
+    delay: float = 0.0
 
 
 def _write(report: Report[TrackRecord], loaded: LoadedModel, better: str) -> None:
@@ -133,6 +136,7 @@ def track_path(
     limits: PathLimits | None = None,
     start: ArrayLike | str = "rest",
     tol: float = 1e-4,
+    delay: float = 0.0,
     force: bool = False,
     progress: Progress = quiet,
 ) -> Report[TrackRecord]:
@@ -162,6 +166,9 @@ def track_path(
         command of the path, without a lead-in.
     tol : float, default=1e-4
         As for `InverseKinematics.track` [m].
+    delay : float, default=0.0
+        How much later than its command a tip will be read [s]. It is noted for `verify_track`; the
+        commands do not depend on it.
     force : bool, default=False
         If points of the path are out of reach, track them as closely as possible; and replace files
         of `out` that `track` did not write.
@@ -204,6 +211,7 @@ def track_path(
         play=play_widths(loaded.hybrid),
         lead_in=n_lead,
         limits=domain.limits,
+        delay=delay,
     )
     report = Report(f"{loaded.name}: a path of {len(path)} points", record)
     _write(report, loaded, better)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,13 +12,14 @@ import torch
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from hybridkin._core.arrays import as_array
+from hybridkin._core.arrays import as_array, number
 from hybridkin._core.commands import Commands
 from hybridkin._core.rotations import rigid_motion
 from hybridkin.chains.play import PlayOperator
 from hybridkin.datasets import Log
 from hybridkin.hybrid.other_units import check_tips
 from hybridkin.native.library import evaluate
+from hybridkin.workflow.delay import Delay, at_times, estimated_delay
 from hybridkin.workflow.errors import Errors, ExpectedErrors
 from hybridkin.workflow.model import LoadedModel
 from hybridkin.workflow.report import Report, check_out, millimetres, percent
@@ -66,6 +68,10 @@ class Verification:
         The cause with the largest share above 0.5, if the promise is not kept.
     range : float or None
         Largest range of an actuator relative to the log; None without a log.
+    delay : float
+        How much later than its command each tip was read [s].
+    later : Delay or None
+        The further delay with which tips and model agree best; None without times.
     """
 
     command: str = "verify"
@@ -77,6 +83,8 @@ class Verification:
     causes: Mapping[str, float]
     cause: str | None
     range: float | None
+    delay: float
+    later: Delay | None
 
     def _write(self, report: Report) -> None:
         """Add the record to a report, in words."""
@@ -102,6 +110,15 @@ class Verification:
             )
         else:
             report.text(f"Likely cause: {self.cause}. To do: {_REMEDIES[self.cause]}.")
+        later = self.later
+        if later is not None and later.is_clear:
+            report.text(
+                f"The tips agree best with the commands {later.seconds:.3g} s before those that "
+                f"they were compared with: without a constant offset the error is then "
+                f"{millimetres(later.error)} in place of {millimetres(later.without)} (root mean "
+                f"square). If the camera is late, use --delay {self.delay + later.seconds:.3g}; "
+                "backlash looks alike."
+            )
         if self.cause == "moved base" and self.range and self.range < _SHORT:
             report.text(
                 f"The path covers {percent(self.range)} of the range of the log; on so short a "
@@ -116,6 +133,7 @@ def verify_track(
     log: Log,
     out: str | Path | None = None,
     *,
+    delay: float | None = None,
     force: bool = False,
 ) -> Report[Verification]:
     """Compare the error that a track promised with the error of the robot, and find the cause.
@@ -136,6 +154,8 @@ def verify_track(
         if there are as many; else by the time since the first row.
     out : str or Path, optional
         Folder to write into. Default: nothing is written.
+    delay : float, optional
+        How much later than its command each tip was read [s]. Default: that of the track.
     force : bool, default=False
         Replace files of `out` that `verify` did not write.
 
@@ -156,6 +176,10 @@ def verify_track(
     sent = read_track(track, loaded.log_format())
     motion = loaded.effective(Commands(sent.q, time=sent.time))
     rows = _rows_of(log, sent)
+    if delay is None:
+        delay = _delay_of(track)
+    if number(delay, "delay") != 0.0:
+        motion = _late(motion, sent, delay)
     x = log.x[:, -3:]
     used = np.isfinite(x).all(axis=1)
     if sent.groups is not None:
@@ -168,6 +192,9 @@ def verify_track(
         )
     q = motion[rows]
     predicted = loaded.tips(q)
+    later = None
+    if sent.time is not None and (np.diff(rows) > 0).all() and len(rows) > 3:
+        later = estimated_delay(sent.time[rows], predicted, x)
     check_tips(x, predicted, "x")
     errors = np.linalg.norm(x - predicted, axis=1)
     promised = loaded.promised_errors(q)
@@ -192,6 +219,8 @@ def verify_track(
         causes=causes,
         cause=cause,
         range=_share_of_range(loaded, q),
+        delay=delay,
+        later=later,
     )
     title = f"{loaded.name}: {Path(track).name} against {Path(log.source).name}"
     report = Report(title, record)
@@ -199,6 +228,29 @@ def verify_track(
     if out is not None:
         report.write(out)
     return report
+
+
+def _delay_of(track: str | Path) -> float:
+    """Return the delay that the report beside a track names, else 0."""
+    path = Path(track)
+    report = (path if path.is_dir() else path.parent) / "report.json"
+    if not report.is_file():
+        return 0.0
+    content = json.loads(report.read_text(encoding="utf-8"))
+    if content.get("command") != "track":
+        return 0.0
+    return float(content.get("delay", 0.0))
+
+
+def _late(motion: NDArray, sent: Log, delay: float) -> NDArray:
+    """Return what the actuators did `delay` seconds before each row of a track (N, n)."""
+    good = sent.time is not None and 0.0 <= delay <= sent.time[-1] - sent.time[0]
+    if sent.time is None or not good:
+        raise ValueError(
+            f"`delay` must be a time [s] from 0 to the duration of the track, which needs a column "
+            f"of times, got {delay!r}."
+        )
+    return at_times(sent.time - delay, sent.time, motion)
 
 
 def _rows_of(log: Log, sent: Log) -> NDArray:

@@ -190,7 +190,7 @@ def test_a_refit_makes_a_tracker_forget_the_offset(array):
     nowhere, target = uses.array(np.full(3, np.nan)), uses.array(TARGET)
     for refit in (lambda model: None, adapt):
         tracker = uses.ik.tracker(uses.array(NOW), memory=10.0)
-        tracker.step(target, x_measured=uses.array(X[7] + 0.004))
+        tracker.step(target, x_measured=uses.array(as_numpy(tracker.x) + 0.001))
         refit(uses.model)
         for _ in range(6):
             tracker.step(target, x_measured=nowhere)

@@ -346,7 +346,7 @@ def test_the_speed_grows_by_the_acceleration_times_each_period(operator, kind):
 def test_a_remembered_offset_decays_by_the_time_that_has_passed(kind):
     """Measured once, then never: the tip stays where the offset that is left says."""
     ik = InverseKinematics(sliding(np.eye(3)), beta=0.0, dt=0.02)
-    offset = np.array([0.02, -0.01, 0.03])
+    offset = np.array([0.01, -0.005, 0.015])  # as may be
     seen = []
 
     def plant(q):

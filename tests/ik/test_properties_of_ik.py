@@ -176,7 +176,7 @@ def test_a_step_is_finite_within_the_limits_and_its_own(case):
                         assert_allclose(part, parts[0], rtol=tol, atol=tol, err_msg=field)
 
 
-@given(motions(rows=5), st.sampled_from([None, 0.05]), st.booleans())
+@given(motions(rows=5), st.sampled_from([np.inf, 0.05]), st.booleans())
 def test_a_tracker_stays_within_the_limits_whatever_comes(case, memory, in_torch):
     _, ik, q, target, more = case
     settings, (low, high) = ik.settings, bounds(ik)

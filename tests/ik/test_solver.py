@@ -207,7 +207,7 @@ def test_feedback_on_the_plant_removes_what_the_model_does_not_know():
         assert q.shape == (9,)
         return CHAIN(torch.from_numpy(1.03 * q)).numpy() + 0.01
 
-    ik = bha(dt=0.02)
+    ik = bha(dt=0.02, gain=50.0)
     blind = ik.track(path, plant=plant)
     seeing = ik.track(path, plant=plant, feedback="measured")
     assert blind.error.min() > 5e-3

@@ -75,7 +75,7 @@ def test_steps_are_those_of_torch(name):
     assert held > 800
 
 
-@pytest.mark.parametrize("memory", [None, 0.05])
+@pytest.mark.parametrize("memory", [np.inf, 0.05])
 def test_a_stream_is_that_of_torch(memory):
     """With readings that come and go, and targets that are not known."""
     draw = np.random.default_rng(2)

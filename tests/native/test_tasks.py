@@ -151,7 +151,7 @@ def test_steps_are_those_of_torch(name, options):
     assert ((new >= low) & (new <= high)).all()
 
 
-@pytest.mark.parametrize("memory", [None, 0.05])
+@pytest.mark.parametrize("memory", [np.inf, 0.05])
 @pytest.mark.parametrize("name", NAMES)
 def test_a_stream_is_that_of_torch(name, memory):
     """With readings that come and go, and targets that are not known."""

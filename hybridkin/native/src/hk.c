@@ -174,7 +174,8 @@ static ik_settings ik_settings_in(const hk_call *call) {
 /* A period, see `ik_tick`. */
 HK_API int32_t hk_ik_tick(const ik_follower *f) {
     const ik_settings ik = ik_settings_in(&f->call);
-    return ik_tick(&ik, f->state);
+    const ik_state now = ik_state_of(&ik, f->state);
+    return ik_tick(&ik, f->state, now.seen);
 }
 
 static void ik_put(int64_t row, int width, const real *rows, real *to) {
@@ -201,7 +202,7 @@ HK_API void hk_ik_steps(const hk_call *call, int64_t rows, int32_t mode, const r
         ik_put(r, width, tip, now.tip);
         ik_put(r, n, q, now.q);
         for (int j = 0; j < n; j++) now.dq[j] = last ? last[n * r + j] : R(0.0);
-        ik_tick(&ik, state);
+        ik_tick(&ik, state, NULL);
         for (int j = 0; j < n; j++) {
             out[j] = now.dq[j];
             held[n * r + j] = now.held[j] > R(0.0);

@@ -16,6 +16,8 @@ typedef struct {
     int quick;                     /* estimates of singular values suffice */
     const real *low, *high, *speed, *accel, *posture, *unit, *period, *pulls, *normals;
     const real *scale;             /* of every row of the task [m per unit] */
+    const real *expected;          /* innovations of the rows; see feedback.h */
+    real most, fraction;           /* the largest possible size of one, and how much is taken */
     const real *spaces, *offsets;  /* normals (m, n_spaces), and how far along them */
     hk_hysteresis hysteresis;
     real gain, beta, dt, damping;  /* gain < 0: 1 / dt; damping < 0: adaptive */
@@ -49,7 +51,7 @@ static inline ik_settings ik_settings_of(const int32_t *code, const real *data, 
                                          real *work) {
     const int32_t *node = code + at, *more = node + HK_MORE;
     const int n = node[HK_N], m = node[HK_M], flags = more[1], n_normals = more[2];
-    const real *a = data + node[HK_DATA], *b = a + 6 * n, *c = b + 4 + m;
+    const real *a = data + node[HK_DATA], *b = a + 6 * n, *c = b + 5 + 2 * m;
     const ik_settings ik = {
         .plan = {code, data, R(0.0)},
         .work = work + IK_SLOTS_WORK(n, m, n_normals),
@@ -72,6 +74,9 @@ static inline ik_settings ik_settings_of(const int32_t *code, const real *data, 
         .dt = b[2],
         .damping = b[3],
         .scale = b + 4,
+        .expected = b + 4 + m,
+        .most = b[4 + 2 * m],
+        .fraction = b[0] < R(0.0) ? IK_FRACTION : R(1.0),
         .period = c,
         .pulls = c + n,
         .normals = c + 2 * n,
@@ -119,6 +124,8 @@ static inline void ik_difference(const ik_settings *ik, const real *x, const rea
     } else
         for (int i = 0; i < ik->m; i++) e[i] = ik->scale[i] * (target[i] - x[i]);
 }
+
+#include "feedback.h"
 
 /* x (16) of a pose, from the tip and its axes (3, 3). */
 static inline void ik_pose_of(const real *tip, const real *turn, real *x) {
@@ -590,6 +597,13 @@ static void ik_arrive(const ik_settings *ik, const real *q, const real *x, const
     }
 }
 
+/* The range of an actuator, at most its period; 1 if it has none. */
+static inline real ik_span(const ik_settings *ik, int j) {
+    const real range = ik->high[j] - ik->low[j];
+    const real span = range < ik->period[j] ? range : ik->period[j];
+    return span < R(INFINITY) ? span : R(1.0);
+}
+
 /* Take out of a direction u (n) what moves the tip, where it can move well, and what the plane and
    the bounds of a step forbid; make it a unit vector. */
 static inline void ik_allow(const ik_settings *ik, const real *J, const ik_factors *f,
@@ -620,9 +634,7 @@ static HK_NOINLINE void ik_escape(const ik_settings *ik, const real *q, const re
     const real largest = ik_trace(m, g);
     ik_factor(m, g, IK_HEALTHY * IK_HEALTHY * largest, &f);
     for (int j = 0; j < n; j++) {
-        const real range = ik->high[j] - ik->low[j];
-        const real span = range < ik->period[j] ? range : ik->period[j];
-        spans[j] = span < R(INFINITY) ? span : R(1.0);
+        spans[j] = ik_span(ik, j);
         at[j] = q[j];
         /* A start with a part of each direction. */
         u[j] = (j % 2 ? -R(1.0) : R(1.0)) / (R(1.0) + (real)j);
@@ -741,6 +753,7 @@ static HK_NOINLINE void ik_control(const ik_settings *ik, const real *q, const r
 typedef struct {
     real *target, *feed, *tip, *offset, *x, *error, *q, *dq, *before, *held, *rest, *J;
     real *lead, *tried; /* with hysteresis: its state, and one to try */
+    real *seen;         /* the state of readings; not of a step alone */
 } ik_state;
 
 #define IK_REST_SIZE(m) (IK_PROMISED + 2 * (m))
@@ -762,7 +775,11 @@ static inline ik_state ik_state_of(const ik_settings *ik, real *state) {
     parts.rest = parts.held + ik->n;
     parts.J = parts.rest + IK_REST_SIZE(ik->m);
     parts.lead = parts.J + ik->m * ik->n;
-    parts.tried = HK_HYSTERESIS ? parts.lead + ik->hysteresis.code[HK_STATE_ROWS] * ik->n : NULL;
+    parts.tried = parts.seen = parts.lead;
+    if (HK_HYSTERESIS && ik->hysteresis.code[0] > 0) {
+        parts.tried += ik->hysteresis.code[HK_STATE_ROWS] * ik->n;
+        parts.seen = parts.tried + ik->hysteresis.code[HK_STATE_ROWS] * ik->n;
+    }
     return parts;
 }
 
@@ -927,10 +944,8 @@ static inline void ik_remember(const ik_settings *ik, const real *from, const re
     rest[IK_WAY_SQ] = rest[IK_SHARE] = R(0.0);
     for (int j = 0; j < ik->n; j++) {
         const real way = to[j] - from[j], own = way / ik->unit[j];
-        const real range = ik->high[j] - ik->low[j] < ik->period[j] ? ik->high[j] - ik->low[j] : ik->period[j];
         rest[IK_WAY_SQ] += own * own;
-        rest[IK_SHARE] = hk_larger(ik_abs(way) / (range < R(INFINITY) ? range : R(1.0)),
-                                   rest[IK_SHARE]);
+        rest[IK_SHARE] = hk_larger(ik_abs(way) / ik_span(ik, j), rest[IK_SHARE]);
     }
     for (int i = 0; i < ik->m; i++) {
         rest[IK_PROMISED + i] = promised[i];
@@ -938,45 +953,41 @@ static inline void ik_remember(const ik_settings *ik, const real *from, const re
     }
 }
 
-/* One period of a robot that follows targets. Returns 0, and does nothing, if a pose in the state
-   holds no rotation. */
-static inline int ik_tick(const ik_settings *ik, real *state) {
+/* One period of a robot that follows targets, with what readings have `seen` (unused by a step alone,
+   which must see). Returns 0, and does nothing, if a pose in the state holds no rotation. */
+static inline int ik_tick(const ik_settings *ik, real *state, real *seen) {
     const int n = ik->n, m = ik->m, mode = (int)state[IK_MODE];
     const ik_state now = ik_state_of(ik, state);
-    const real period = state[IK_PERIOD], memory = state[IK_MEMORY];
+    const real period = state[IK_PERIOD], *tip = mode & IK_HAS_TIP ? now.tip : NULL;
+    const int alone = mode & IK_MUST_SEE;
     const int leads = HK_HYSTERESIS && mode & IK_LEADS;
     real *at = leads ? now.tried - n : now.q; /* where the model is */
-    real used[IK_ROWS], seen_at[IK_ROWS], *last = NULL, moved[HK_MAX_N], x_before[IK_WIDTH];
-    real before[IK_ROWS];
+    real used[IK_ROWS], shown[IK_ROWS], seen_at[IK_ROWS], *last = NULL, moved[HK_MAX_N];
+    real x_before[IK_WIDTH], before[IK_ROWS];
     ik_settings damped;
-    int seen = 0;
     ik_step_t step;
     if (IK_IS_POSE(ik) && ((mode & IK_HAS_TARGET && !ik_is_rotation(now.target)) ||
-                           (mode & IK_HAS_TIP && !ik_is_rotation(now.tip))))
+                           (tip && !ik_is_rotation(tip))))
         return 0;
     for (int i = 0; i < ik->width; i++) x_before[i] = now.x[i];
     ik_look(ik, at, now.x, now.J);
+    if (!alone) {
+        ik_record(ik, seen, now.x);
+        ik_hear(ik, seen, tip, state[IK_MEMORY], now.offset, shown);
+    }
     for (int i = 0; i < m; i++) used[i] = before[i] = R(0.0), now.error[i] = R(NAN);
     if (mode & IK_HAS_TARGET) {
         ik_difference(ik, now.x, now.target, used);
         ik_difference(ik, x_before, now.target, before);
-        for (int i = 0; i < m; i++) now.error[i] = used[i], before[i] -= used[i];
-    }
-    if (mode & IK_HAS_TARGET && mode & IK_HAS_TIP) {
-        /* Without a measurement, use the model's error corrected by the remembered offset;
-           without memory, use no error. */
-        real apart[IK_ROWS];
-        ik_difference(ik, now.tip, now.target, now.error);
-        for (int i = 0; i < m; i++) apart[i] = used[i] - now.error[i];
-        seen = mode & IK_MUST_SEE || ik_finite(m, apart);
+        for (int i = 0; i < m; i++) before[i] -= used[i];
+        if (alone) ik_difference(ik, tip ? tip : now.x, now.target, now.error);
         for (int i = 0; i < m; i++) {
-            const real remembered = memory > R(0.0) ? now.offset[i] : used[i];
-            used[i] = seen ? now.error[i] : used[i] - remembered;
-            now.offset[i] = seen ? apart[i] : now.offset[i];
+            if (alone) now.offset[i] = used[i] - now.error[i];
+            else now.error[i] = used[i] - shown[i];
+            used[i] = alone ? now.error[i] : used[i] - now.offset[i];
         }
     }
-    for (int i = 0; i < m; i++) /* a step alone knows of no earlier measurement */
-        seen_at[i] = now.x[i] + (seen || !(mode & IK_MUST_SEE) ? now.offset[i] : R(0.0));
+    for (int i = 0; i < m; i++) seen_at[i] = now.x[i] + now.offset[i];
     if (ik->flags & IK_ACCELERATES && !(mode & IK_FROM_REST)) {
         const real ratio = state[IK_LAST] > R(0.0) ? period / state[IK_LAST] : R(1.0);
         last = moved;
@@ -984,7 +995,7 @@ static inline int ik_tick(const ik_settings *ik, real *state) {
     }
     const real *feed = mode & IK_HAS_FEED ? now.feed : NULL;
     for (int i = 0; i < m; i++) before[i] += used[i];
-    const real least = mode & IK_MUST_SEE ? R(0.0) : ik_rest(ik, now.J, before, used, now.rest);
+    const real least = alone ? R(0.0) : ik_rest(ik, now.J, before, used, now.rest);
     if (least > R(0.0)) damped = *ik, damped.least = least, ik = &damped;
     for (int j = 0; j < n; j++) now.before[j] = at[j];
     if (leads)
@@ -992,8 +1003,7 @@ static inline int ik_tick(const ik_settings *ik, real *state) {
     else
         ik_control(ik, now.q, now.x, now.J, used, feed, period, last, seen_at, NULL, &step);
     state[IK_LAST] = period;
-    if (memory > R(0.0))
-        for (int i = 0; i < m; i++) now.offset[i] *= HK_MATH(exp)(-period / memory);
+    if (!alone) seen[IK_SINCE] = period;
     state[IK_SIGMA_MIN] = step.sigma_min;
     state[IK_DAMPING] = step.damping;
     state[IK_DISTANCE] = ik_norm(m, now.error);

@@ -13,6 +13,7 @@ static void write_outputs(instance_t *unit) {
     for (int j = 0; j < @N@; j++) values[V_EFFECTIVE + j] = EFFECTIVE(&unit->state)[j];
 #endif
     values[V_ERROR] = unit->state.error;
+    values[V_REJECTED] = unit->state.rejected;
 }
 
 /* At rest at the start command. */
@@ -29,6 +30,7 @@ static ik_settings settings_of(const instance_t *unit, real *work) {
 @PARAMETERS@
     ik.gain = values[V_GAIN];
     ik.beta = values[V_BETA];
+    ik.fraction = values[V_FRACTION];
     return ik;
 }
 
@@ -51,13 +53,14 @@ static int step_unit(instance_t *unit, double step) {
     const ik_settings ik = settings_of(unit, work);
     if (!(periods >= 1.0 && periods <= 1e9 && fabs(step - periods * @DT@) <= 1e-6 * step))
         return refused(unit, "a step must be a multiple of %g s, got %g s", @DT@, step);
-    unit->state.memory = values[V_MEMORY];
-    /* Without a measurement, and without a memory of the last one, the tip is that of the model. */
-    const double *measured = values + V_MEASURED;
-    for (int i = 0; i < @WIDTH@ && measured; i++)
-        if (isnan(values[V_MEASURED + i]) && !(values[V_MEMORY] > 0.0)) measured = NULL;
+    unit->state.memory = values[V_MEMORY] > 0.0 ? values[V_MEMORY] : INFINITY;
+    unit->state.delay = values[V_DELAY];
+    /* A measurement is that of one period; without any, the error is that of the model. */
+    int known = 0;
+    for (int i = 0; i < @WIDTH@; i++) known += !isnan(values[V_MEASURED + i]);
     for (int k = 0; k < (int)periods; k++)
-        step_within(&ik, &unit->state, values + V_TARGET, values + V_VELOCITY, measured);
+        step_within(&ik, &unit->state, values + V_TARGET, values + V_VELOCITY,
+                    k == 0 && known ? values + V_MEASURED : NULL);
     write_outputs(unit);
     return FMI_OK;
 }

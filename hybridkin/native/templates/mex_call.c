@@ -4,7 +4,7 @@
         reset(out, in[1]);
         return;
     }
-    if (!strcmp(command, "step") && n_in >= 3 && n_in <= 5) {
+    if (!strcmp(command, "step") && n_in >= 3 && n_in <= 6) {
         step(n_out, out, n_in, in);
         return;
     }

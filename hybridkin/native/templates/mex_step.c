@@ -19,7 +19,7 @@ static void reset(mxArray *out[], const mxArray *argument) {
     out[0] = packed(&state);
 }
 
-/* [q, state, error, held] = @NAME@('step', state, target, velocity, measured) */
+/* [q, state, error, held, rejected] = @NAME@('step', state, target, velocity, measured, age) */
 static void step(int n_out, mxArray *out[], int n_in, const mxArray *in[]) {
     @NAME@_state state;
     @REAL@ target[@WIDTH@], velocity[@TASK@], measured[@WIDTH@], held[@N@];
@@ -37,10 +37,13 @@ static void step(int n_out, mxArray *out[], int n_in, const mxArray *in[]) {
         const double *tip = numbers(in[4], @WIDTH@, "measured must hold @WIDTH@ numbers, or be [].");
         for (int i = 0; i < @WIDTH@; i++) measured[i] = (@REAL@)tip[i];
     }
+    if (n_in > 5) state.delay = (@REAL@)*numbers(in[5], 1, "age must be a time [s].");
     @NAME@_step(&state, target, moves ? velocity : NULL, sees ? measured : NULL);
+    const @REAL@ rejected = (@REAL@)state.rejected;
     for (int j = 0; j < @N@; j++) held[j] = (@REAL@)state.held[j];
     give(n_out, out, 0, @N@, 1, state.q);
     if (n_out > 1) out[1] = packed(&state);
     give(n_out, out, 2, 1, 1, &state.error);
     give(n_out, out, 3, @N@, 1, held);
+    give(n_out, out, 4, 1, 1, &rejected);
 }

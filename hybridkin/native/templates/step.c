@@ -31,6 +31,7 @@ void @NAME@_reset(@NAME@_state *state, const @REAL@ *q) {
 #if HK_HYSTERESIS
     for (int i = 0; i < LEAD; i++) state->hysteresis[i] = q[i % @N@];
 #endif
+    state->memory = state->seen[IK_SINCE] = (real)INFINITY;
     ik_model(&ik, q, state->x, J);
     state->error = state->sigma_min = (real)NAN;
 }
@@ -60,10 +61,12 @@ static void step_within(const ik_settings *ik, @NAME@_state *state, const @REAL@
 #endif
     all[IK_PERIOD] = ik->dt;
     all[IK_MEMORY] = state->memory;
-    if (!ik_tick(ik, all)) { /* no rotation: not known */
-        now.target[0] = now.tip[0] = (real)NAN;
-        ik_tick(ik, all);
+    state->seen[IK_AGE] = state->delay;
+    if (!ik_tick(ik, all, state->seen)) { /* no rotation: not known */
+        for (int i = 0; i < @WIDTH@; i++) now.target[i] = now.tip[i] = (real)NAN;
+        ik_tick(ik, all, state->seen);
     }
+    state->rejected = state->seen[IK_REJECTED] > (real)0;
 #if HK_HYSTERESIS
     for (int i = 0; i < LEAD; i++) state->hysteresis[i] = now.lead[i];
 #endif

@@ -19,6 +19,7 @@ static void check_steps(double *worst) {
         @NAME@_state state;
         @NAME@_reset(&state, starts + N * run);
         state.memory = (@REAL@)@MEMORY@;
+        state.delay = (@REAL@)@DELAY@;
         for (int i = STEPS * run; i < STEPS * (run + 1); i++) {
             const int reads = i % STEPS < STEPS - 1; /* the last one without a measured tip */
             @NAME@_step(&state, target + TARGET * i, dx + TASK * i,
