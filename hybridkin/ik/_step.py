@@ -44,6 +44,16 @@ class StepRows(NamedTuple):
     saturated: Tensor
     stopped: Tensor | bool = False  # by a tip limit
 
+    @property
+    def held(self) -> Tensor:
+        """Whether a limit restricted the steps, bool (N,)."""
+        return self.saturated.any(-1) | self.stopped
+
+    @property
+    def damped(self) -> Tensor:
+        """Whether the steps were damped, or no motion is possible, bool (N,)."""
+        return (self.damping > 0.0) | (self.sigma_min == 0.0)
+
 
 def control_step(
     settings: StepSettings,

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from hybridkin._core.arrays import as_array, give_back
 from hybridkin.ik._settings import StepSettings
-from hybridkin.ik.results import IKStatus, Track, statuses
+from hybridkin.ik.results import Track, statuses
 from hybridkin.ik.tasks import Tolerance
 from hybridkin.ik.tracker import Plant, Tracker
 
@@ -54,9 +54,15 @@ def followed(
     judged = e
     if loop.feedback != "measured":
         judged = task.difference(x, target)
-    reached = task.reached(judged, path.tol)
-    status = statuses(task, effective, judged.norm(dim=-1), reached, held, damped)
-    status[~torch.isfinite(error)] = IKStatus.INVALID_INPUT
+    status = statuses(
+        task,
+        effective,
+        judged,
+        path.tol,
+        known=torch.isfinite(error),
+        held=held,
+        singular=damped,
+    )
     margin = settings.margin(q)
     rows = (path.t, q, effective, x, measured, target, error, status, sigma_min, margin)
     results = give_back(rows, (len(target),), path.as_numpy)

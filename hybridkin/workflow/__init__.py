@@ -10,6 +10,7 @@ from hybridkin.workflow.report import Report
 
 if TYPE_CHECKING:
     from hybridkin.workflow.compare import FitSettings
+    from hybridkin.workflow.counts import Counts
     from hybridkin.workflow.domain import PathLimits, path_limits
     from hybridkin.workflow.evaluate import Evaluation, evaluate_log
     from hybridkin.workflow.export import export_model
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "LOG_SUFFIXES",
+    "Counts",
     "Description",
     "Evaluation",
     "FitRecord",
@@ -52,6 +54,7 @@ __all__ = [
 # A description of a robot needs no fit and no inverse kinematics.
 _NAMES_OF = {
     "compare": ("FitSettings",),
+    "counts": ("Counts",),
     "domain": (
         "PathLimits",
         "path_limits",
