@@ -425,7 +425,7 @@ def _track(command: argparse.ArgumentParser) -> None:
         "--round",
         nargs="?",
         type=positive,
-        const="log",
+        const=True,
         metavar="STEP",
         help=whole,
     )

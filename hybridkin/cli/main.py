@@ -282,7 +282,7 @@ def _counts(arguments: argparse.Namespace, loaded: LoadedModel) -> Counts | None
     Counts = hybridkin.workflow.Counts
     if arguments.round is None:
         return None
-    if arguments.round != "log":
+    if arguments.round is not True:
         n = loaded.n_actuators
         return Counts([arguments.round] * n, [0.0] * n)
     counts = Counts.read(loaded.training)

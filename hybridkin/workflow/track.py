@@ -245,11 +245,15 @@ def track_path(
     stands = _start(domain, start)
     check_reach(domain, path, tol, out_of_reach, progress)
     attempts = Attempts(progress)
-    track = best_track(domain, path, tol, attempts)
-    lead_in = _lead_in(track, stands, domain)
-    n_lead = len(lead_in) - 1
-    if loaded.play is not None and n_lead > 0:
+    if loaded.play is None or stands is None:
+        track = best_track(domain, path, tol, attempts)
+        lead_in = _lead_in(track, stands, domain)
+    else:
+        # The state of the hysteresis after the lead-in decides the commands of the path.
+        first = best_track(domain, path, tol, attempts, finest=_FINER[0])
+        lead_in = _lead_in(first, stands, domain)
         track = best_track(domain, path, tol, attempts, lead_in)
+    n_lead = len(lead_in) - 1
     rounded = None
     if counts is not None:
         exact = track
@@ -422,10 +426,12 @@ def best_track(
     tol: float,
     attempts: Attempts,
     lead_in: NDArray | None = None,
+    finest: int = _FINER[-1],
 ) -> Track:
     """Return the track of several attempts that reaches most points in the domain.
 
-    After the commands `lead_in` (N + 1, n) it starts at the last of them, with its hysteresis.
+    Each attempt has smaller steps, up to `finest` times as many; it starts where the one before
+    did. After the commands `lead_in` (N + 1, n) it starts at the last of them, with its hysteresis.
     """
     commands, tips = domain.sample
     state = None
@@ -437,6 +443,8 @@ def best_track(
     least = max(1, math.ceil(way / (_STEP * extent)))
     tracks: list[Track] = []
     for finer in _FINER:
+        if finer > finest:
+            break
         every = finer * least
         fine = _in_steps(path, every)
         dt = float(np.diff(fine.t).max()) if len(fine) > 1 else 0.01
@@ -446,6 +454,7 @@ def best_track(
         tracks.append(_alone(_thinned(track, every), domain, tol, state))
         if score(tracks[-1]) == (len(path), len(path)):
             break
+        commands = track.q[0]
     return max(tracks, key=score)  # of equal tracks the first
 
 
