@@ -106,7 +106,9 @@ def test_a_promise_counts_the_points_that_are_missed(home, tmp_path, capsys):
     np.testing.assert_array_equal(missed, error > 1e-4)
     assert record["missed_by"] > 0.08
     assert record["expected"]["mean"] == pytest.approx(np.hypot(error, 1e-3).mean(), rel=1e-5)
-    assert record["expected"]["p95"] == pytest.approx(np.hypot(error, 2e-3).mean(), rel=1e-5)
+    largest = np.quantile(np.hypot(error, 1e-3), 0.95)
+    assert largest > np.hypot(error, 2e-3).mean()
+    assert record["expected"]["p95"] == pytest.approx(largest, rel=1e-5)
     assert record["expected_inside"]["mean"] == pytest.approx(1e-3, rel=1e-3)
     last = " ".join(printed.split("\n\n")[-2].split())
     assert last.startswith(f"Reached: {record['reached']} of 21 points; missed: {missed.sum()}, by")
