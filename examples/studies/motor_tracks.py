@@ -9,8 +9,9 @@ and the errors of its ruler, too. `hybridkin fit` and `hybridkin track` run with
 settings on a circle or a figure eight near measured tips; a path that is refused is made smaller
 as the message says. The commands are rounded to counts and sent
 open loop to the simulated robot, which stands where its log ended. Promised are the errors that
-`track` tells to expect inside the log; true is the distance of the robot's tip from the target, of
-all points or of those that are CONVERGED, and so inside the log.
+`track` tells to expect, over all points and at those that are CONVERGED, and so inside the log;
+true is the distance of the robot's tip from the target, of the same points. With --beyond the same
+paths are made larger, by this factor, and tracked with --out-of-reach: parts leave the reach.
 
 A *still* direction is one along which the commands of the log moved less than 2 % as far (rms) as
 along the direction with the largest motion: tendons in balance have one in each segment.
@@ -277,7 +278,7 @@ def _cpu() -> float:
     return sum(usage.ru_utime + usage.ru_stime for usage in usages)
 
 
-def track(setup: Setup, model: str, number: int) -> dict[str, Any]:
+def track(setup: Setup, model: str, number: int, larger: float = 1.0) -> dict[str, Any]:
     """Return what the commands of `hybridkin track` do on the robot.
 
     Parameters
@@ -288,6 +289,8 @@ def track(setup: Setup, model: str, number: int) -> dict[str, Any]:
         A model that `fit` has saved.
     number : int
         Of the path: even ones are circles, odd ones figures of eight.
+    larger : float, default=1.0
+        Factor of its size; with another one its points may be out of reach.
 
     Returns
     -------
@@ -297,13 +300,17 @@ def track(setup: Setup, model: str, number: int) -> dict[str, Any]:
     began = _cpu()
     shape = "eight" if number % 2 else "circle"
     points = path_near_tips(setup.log.tips, 1000 * setup.seed + number, shape)
-    entry: dict[str, Any] = {"path": f"{number} {shape}", "scale": 1.0}
+    entry: dict[str, Any] = {"path": f"{number} {shape}", "scale": larger}
     file = setup.folder / f"path_{number}.csv"
     table = np.column_stack([_DT * np.arange(len(points)), 1e3 * points])
     np.savetxt(file, table, "%.6f", ",", header="t,x,y,z", comments="")
     folder = _model_folder(setup, model)
     out = folder.with_name(f"{folder.name}_track_{number}")
     command = ["track", folder, file, "--unit", "mm", "--out", out]
+    if larger != 1.0:
+        command[-1] = out.with_name(f"{out.name}_{larger:g}")
+        out = command[-1]
+        command += ["--scale", larger, "--out-of-reach"]
     record, error = _run(command)
     advice = re.search(r"--scale (0\.\d+)", error)
     if advice is not None:
@@ -329,8 +336,12 @@ def track(setup: Setup, model: str, number: int) -> dict[str, Any]:
     noise = _NOISE * np.random.default_rng(number).standard_normal(tips.shape)
     measured = np.linalg.norm(tips + noise - target, axis=1)
     inside = sent["status"][on_path] == "CONVERGED"
-    expected = record.get("expected", {})
+    expected_inside = record["expected_inside"]
+    expected = record["expected"]
     entry |= {
+        "missed": record["missed"] / record["n"],
+        "missed_by": record["missed_by"],
+        "expected_inside": expected_inside.get("mean", math.nan),
         "expected_mean": expected.get("mean", math.nan),
         "expected_p95": expected.get("p95", math.nan),
         "true_inside": float(errors[inside].mean()) if inside.any() else math.nan,
@@ -421,6 +432,7 @@ def one_robot(
     out: Path,
     tendons: int = 3,
     commands: str = "rounded",
+    beyond: Sequence[float] = (),
 ) -> list[dict[str, Any]]:
     """Return the entries of all models and paths of a robot; a refusal is an entry, too."""
     torch.set_num_threads(1)
@@ -436,17 +448,22 @@ def one_robot(
             entries.append({**common, "path": "-", "error": str(error)})
             continue
         for number in range(n_paths):
-            try:
-                entries.append({**common, **track(setup, model, number)})
-            except ValueError as error:
-                entries.append({**common, "path": str(number), "error": str(error)})
+            for larger in (1.0, *beyond):
+                try:
+                    entry = track(setup, model, number, larger)
+                except ValueError as error:
+                    entry = {"path": str(number), "error": str(error)}
+                entries.append({**common, **entry})
     return entries
 
 
 COLUMNS = {  # heading: key, factor
     "held-out mean": ("held_out_mean", 1e3),
-    "promised mean, inside": ("expected_mean", 1e3),
-    "promised 95 %, inside": ("expected_p95", 1e3),
+    "missed [%]": ("missed", 100),
+    "missed by": ("missed_by", 1e3),
+    "promised mean, inside": ("expected_inside", 1e3),
+    "promised mean": ("expected_mean", 1e3),
+    "promised 95 %": ("expected_p95", 1e3),
     "true mean, inside": ("true_inside", 1e3),
     "measured mean, inside": ("measured_inside", 1e3),
     "true mean": ("true_mean", 1e3),
@@ -468,6 +485,12 @@ COLUMNS = {  # heading: key, factor
     "track CPU [s]": ("track_cpu_s", 1),
 }
 """Columns of the table; errors in mm."""
+_RATIOS = {
+    "true / promised mean inside": ("true_inside", "expected_inside"),
+    "measured / promised mean inside": ("measured_inside", "expected_inside"),
+    "true / promised mean of all points": ("true_mean", "expected_mean"),
+    "true / promised 95 % of all points": ("true_p95", "expected_p95"),
+}
 
 
 def tracks_report(entries: list[dict[str, Any]]) -> Report:
@@ -494,18 +517,22 @@ def tracks_report(entries: list[dict[str, Any]]) -> Report:
     report.table([*keys, *COLUMNS], cells)
     for model in dict.fromkeys(entry["model"] for entry in done):
         chosen = [entry for entry in done if entry["model"] == model]
-        n_robots = len({entry["robot"] for entry in chosen})
-        for what in ("true", "measured"):
-            ratios = np.array(
-                [e[f"{what}_inside"] / e["expected_mean"] for e in chosen]
-            )
-            ratios = ratios[np.isfinite(ratios)]  # no point of some paths is inside
-            low, median, high = np.quantile(ratios, [0.05, 0.5, 0.95])
-            report.text(
-                f"{model}: {what} mean / promised mean over {len(ratios)} paths of {n_robots} "
-                f"robots: median {median:.2f}, 5 % {low:.2f}, 95 % {high:.2f}, largest "
-                f"{ratios.max():.2f}."
-            )
+        kinds = {
+            "paths with all points reached": [e for e in chosen if e["missed"] == 0.0],
+            "paths with missed points": [e for e in chosen if e["missed"] > 0.0],
+        }
+        for kind, some in kinds.items():
+            for what, (true, promised) in _RATIOS.items():
+                ratios = np.array([e[true] / e[promised] for e in some])
+                ratios = ratios[np.isfinite(ratios)]  # no point of some paths is inside
+                if not len(ratios):
+                    continue
+                low, median, high = np.quantile(ratios, [0.05, 0.5, 0.95])
+                report.text(
+                    f"{model}, {kind}: {what} over {len(ratios)} paths of "
+                    f"{len({e['robot'] for e in some})} robots: median {median:.2f}, 5 % "
+                    f"{low:.2f}, 95 % {high:.2f}, largest {ratios.max():.2f}."
+                )
     for entry in entries:
         if "error" in entry:
             report.text(
@@ -569,10 +596,24 @@ def main(argv: Sequence[str] | None = None) -> None:
         "--tendons", type=int, default=3, help="in a segment; 4: two pairs"
     )
     parser.add_argument("--commands", default=COMMANDS[0], choices=COMMANDS)
+    parser.add_argument(
+        "--beyond",
+        nargs="*",
+        type=float,
+        default=[],
+        help="also the same paths, so many times as large, such as 2",
+    )
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     given = parser.parse_args(argv)
     seeds = range(given.first, given.first + given.robots)
-    rest = given.models, given.paths, given.out, given.tendons, given.commands
+    rest = (
+        given.models,
+        given.paths,
+        given.out,
+        given.tendons,
+        given.commands,
+        given.beyond,
+    )
     workers = Parallel(n_jobs=given.jobs, return_as="generator_unordered")
     entries = []
     began = time.monotonic()

@@ -31,9 +31,10 @@ from hybridkin.cli._values import (
 )
 
 EXIT_CODES = """\
-exit codes: 0 success; 1 the result is not as requested (points not reached, errors above
---fail-above or a promise, or `describe` and `init` found errors in a log); 2 invalid input, a log
-with errors before a fit, or a path out of reach; 130 interrupted; 143 terminated."""
+exit codes: 0 success; 1 the result is not as requested (a fifth of the points of a path not
+reached, errors above --fail-above or a promise, or `describe` and `init` found errors in a log);
+2 invalid input, a log with errors before a fit, or a path out of reach; 130 interrupted;
+143 terminated."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -361,9 +362,11 @@ def _track(command: argparse.ArgumentParser) -> None:
 
     The limits --q-min and --q-max are in the unit and sign of the robot's logs (m without a
     description), one number or one for each actuator. Default: the limits of the robot description
-    within the training range of the model. If the path leaves the reach of the robot, the command
-    ends with exit code 2 and names the largest scale that does not. With --force the tip goes as
-    near as it can.
+    within the training range of the model. If more than a tenth of the path leaves the reach of the
+    robot, the command ends with exit code 2 and names the largest scale that does not. With
+    --out-of-reach the tip goes as near as it can. The last line says how many points are reached
+    and missed, by how much, and the error to expect over all of them. The exit code is 1 if a fifth
+    of the points are missed or outside the log, with --fail-missed if one is missed.
 
     The first rows have the status LEAD_IN. They lead to the path from where the robot stands:
     --from rest (no tendon pulled), --from=A,B,... (a value of every actuator in the unit and sign
@@ -428,8 +431,19 @@ def _track(command: argparse.ArgumentParser) -> None:
     where = "where the robot stands before the path (rest)"
     stand: Any = {"default": "rest", "dest": "start", "metavar": "rest|path|A,B,..."}
     add("--from", type=start, help=where, **stand)
-    near = f"go as near as the tip can if out of reach; {_REPLACE_OTHERS}"
-    add("--force", action="store_true", help=near)
+    whole = "round commands to the whole numbers of the log, or to steps of STEP in its unit"
+    add(
+        "--round",
+        nargs="?",
+        type=positive,
+        const=True,
+        metavar="STEP",
+        help=whole,
+    )
+    near = "write commands although points are missed: the tip goes as near as it can"
+    add("--out-of-reach", action="store_true", help=near)
+    add("--fail-missed", action="store_true", help="exit code 1 if a point is missed")
+    add("--force", action="store_true", help=_REPLACE_OTHERS)
 
 
 def _verify(command: argparse.ArgumentParser) -> None:

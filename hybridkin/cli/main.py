@@ -36,11 +36,19 @@ if TYPE_CHECKING:
     from hybridkin.chains.robots import Limits, LogFormat
     from hybridkin.datasets import LogReport
     from hybridkin.ik.trajectories import Trajectory
-    from hybridkin.workflow import LoadedModel, MeasuredLog, PathLimits, Report
+    from hybridkin.workflow import (
+        Counts,
+        LoadedModel,
+        MeasuredLog,
+        PathLimits,
+        Report,
+    )
 
 _DT = 0.02
 _LIGHT = ("describe", "init")  # commands that compute little
-_INSIDE = 0.8  # least share of a path in the domain, else the exit code is 1
+_INSIDE = (
+    0.8  # least share of a path reached, and in the domain; else the exit code is 1
+)
 # What the user can correct is printed without a traceback.
 _OF_INPUT = (ValueError, TypeError, OSError, ImportError, MemoryError)
 
@@ -256,13 +264,35 @@ def _track(arguments: argparse.Namespace, stages: Stages) -> _Result:
         start=start if isinstance(start, str) else log_format.from_log(start),
         tol=1e-3 * arguments.tol,
         delay=arguments.delay or 0.0,
+        counts=_counts(arguments, loaded),
+        out_of_reach=arguments.out_of_reach,
         force=arguments.force,
         progress=stages,
     )
     track = report.record
     inside = track.in_domain is None or track.in_domain > _INSIDE
-    done = (arguments.force or inside) and track.reached == track.n
-    return report, int(not done)
+    enough = inside and track.reached > _INSIDE * track.n
+    good = enough or arguments.out_of_reach
+    if arguments.fail_missed:
+        good = good and track.missed == 0
+    return report, int(not good)
+
+
+def _counts(arguments: argparse.Namespace, loaded: LoadedModel) -> Counts | None:
+    """Return the numbers to which commands are rounded, None without `--round`."""
+    Counts = hybridkin.workflow.Counts
+    if arguments.round is None:
+        return None
+    if arguments.round is not True:
+        n = loaded.n_actuators
+        return Counts([arguments.round] * n, [0.0] * n)
+    counts = Counts.read(loaded.training)
+    if counts is None or not any(counts.steps):
+        raise ValueError(
+            "`--round` needs a model that was fitted by `hybridkin fit` to a log with whole "
+            "numbers; give the step of the actuators in the unit of the log: --round 1."
+        )
+    return counts
 
 
 def _verify(arguments: argparse.Namespace, stages: Stages) -> _Result:

@@ -136,6 +136,8 @@ class Core:
         Numbers of actuators, of rows of the task, and of numbers in a target.
     places : dict of str to slice
         Places of the parts of the state of a follower.
+    lengths : list of int
+        Their lengths.
     """
 
     def __init__(self, settings: StepSettings, models: list[Program]) -> None:
@@ -150,6 +152,7 @@ class Core:
         self._idle: list[Follower] = []  # one for every thread that has used `step`
         n_rows = self.plan.entry(self.plan.root, IK_STATE_ROWS)
         self.places = places = places_of(self.n, self.m, self.width, n_rows)
+        self.lengths = [place.stop - place.start for place in places.values()]
         x = places["x"]
         if len(settings.task.shape) > 1:
             x = np.arange(x.start, x.stop).reshape(settings.task.shape)
@@ -427,8 +430,8 @@ class Follower:
     def last(self) -> Tick:
         """Return the results of the last tick."""
         state = torch.from_numpy(self.state.copy())[None]
-        places = self.core.places
-        parts = {name: state[:, place] for name, place in places.items()}
+        columns = state[:, IK_TARGET:].split(self.core.lengths, dim=1)
+        parts = dict(zip(self.core.places, columns, strict=True))
         step = StepRows(
             parts["dq"],
             state[:, IK_SIGMA_MIN],

@@ -47,6 +47,16 @@ class StepRows(NamedTuple):
     promised: Tensor  # motion of the tip to first order
     stopped: Tensor | bool = False  # by a tip limit
 
+    @property
+    def held(self) -> Tensor:
+        """Whether a limit restricted the steps, bool (N,)."""
+        return self.saturated.any(-1) | self.stopped
+
+    @property
+    def damped(self) -> Tensor:
+        """Whether the steps were damped, or no motion is possible, bool (N,)."""
+        return (self.damping > 0.0) | (self.sigma_min == 0.0)
+
 
 class Law(NamedTuple):
     """The settings of steps, and the least lambda^2 (N,) of this period, zero for none."""

@@ -12,7 +12,7 @@ from torch import Tensor
 from hybridkin._core.arrays import as_array, give_back
 from hybridkin.ik._feedback import Feedback
 from hybridkin.ik._settings import StepSettings
-from hybridkin.ik.results import IKStatus, Track, statuses
+from hybridkin.ik.results import Track, statuses
 from hybridkin.ik.tasks import Tolerance
 from hybridkin.ik.tracker import Plant, Tracker
 
@@ -56,9 +56,15 @@ def followed(
         e = task.difference(measured, target)
         judged = task.difference(x, target)
     error = e.norm(dim=-1)
-    reached = task.reached(judged, path.tol)
-    status = statuses(task, effective, judged.norm(dim=-1), reached, held, damped)
-    status[~torch.isfinite(error) | rejected] = IKStatus.INVALID_INPUT
+    status = statuses(
+        task,
+        effective,
+        judged,
+        path.tol,
+        known=torch.isfinite(error) & ~rejected,
+        held=held,
+        singular=damped,
+    )
     margin = settings.margin(q)
     rows = (path.t, q, effective, x, measured, target, error, status, sigma_min, margin)
     results = give_back((*rows, rejected), (len(target),), path.as_numpy)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from hybridkin._core.arrays import as_array
 from hybridkin._core.html import html_table, numbers
-from hybridkin.ik.tasks import Task
+from hybridkin.ik.tasks import Task, Tolerance
 
 ArrayT = TypeVar("ArrayT", np.ndarray, Tensor)
 
@@ -53,30 +53,47 @@ class IKStatus(IntEnum):
 def statuses(
     task: Task,
     q: Tensor,
-    error: Tensor,
-    reached: Tensor,
+    e: Tensor,
+    tol: Tolerance,
+    *,
+    known: Tensor,
     held: Tensor,
     singular: Tensor,
+    resting: Tensor | None = None,
+    beyond: Tensor | None = None,
 ) -> Tensor:
     """Return the `IKStatus` of rows, int (N,); later conditions override earlier ones.
+
+    The one rule of `solve`, `track` and trackers.
 
     Parameters
     ----------
     task : Task
-        Task whose domain is checked.
+        Task whose errors and domain are judged.
     q : Tensor of shape (N, n)
         Configurations.
-    error : Tensor of shape (N,)
-        Errors [m], not finite if an input was not.
-    reached, held, singular : bool Tensor of shape (N,)
-        Whether the error is within the tolerance, limits restricted the motion, it was damped.
+    e : Tensor of shape (N, m)
+        Errors of the task there [m].
+    tol : float or tuple of floats
+        Largest error of a reached target.
+    known, held, singular : bool Tensor of shape (N,)
+        Whether all inputs are finite; limits restricted the motion; it was damped, or the Jacobian
+        has lost a direction.
+    resting, beyond : bool Tensor of shape (N,), optional
+        Whether no motion lowers the error; whether the target is out of reach for certain. Default:
+        nobody knows.
     """
-    status = torch.full(error.shape, IKStatus.MAX_ITER.value, device=error.device)
+    status = torch.full(known.shape, IKStatus.MAX_ITER.value, device=e.device)
     status[singular] = IKStatus.SINGULAR
     status[held] = IKStatus.AT_LIMITS
+    if resting is not None:
+        status[resting] = IKStatus.MAX_ITER
+    if beyond is not None:
+        status[beyond] = IKStatus.UNREACHABLE
+    reached = task.reached(e, tol)
     status[reached] = IKStatus.CONVERGED
     status[reached & ~task.in_domain(q)] = IKStatus.OUT_OF_DOMAIN
-    status[~torch.isfinite(error)] = IKStatus.INVALID_INPUT
+    status[~(known & torch.isfinite(e.norm(dim=-1)))] = IKStatus.INVALID_INPUT
     return status
 
 

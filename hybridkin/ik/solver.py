@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from hybridkin._core.arrays import (
+    as_array,
     as_tensor,
     give_back,
     is_numpy,
@@ -488,14 +489,17 @@ class InverseKinematics:
         e = task.difference(x, target)
         error = e.norm(dim=-1)
         singular = row_gram(J)
-        reached = task.reached(e, tolerance)
         status = statuses(
-            task, q_plain, error, reached, solution.held, singular.is_singular
+            task,
+            q_plain,
+            e,
+            tolerance,
+            known=torch.isfinite(error),
+            held=solution.held,
+            singular=singular.is_singular,
+            resting=solution.stationary,
+            beyond=moved | (settings.misses(target) > np.max(tolerance)),
         )
-        missed = ~reached & torch.isfinite(error)
-        status[missed & solution.stationary] = IKStatus.MAX_ITER
-        beyond = moved | (settings.misses(target) > np.max(tolerance))
-        status[missed & beyond] = IKStatus.UNREACHABLE
         place = torch.arange(len(q), device=q.device) % places
         status[(place > 0) & q.isnan().all(-1)] = IKStatus.NO_FURTHER
         results = (
@@ -636,7 +640,7 @@ class InverseKinematics:
         alone = plant is None and feedback == "model"
         on_model = Loop(progress=progress if alone else None)
         tracks: list[Track] = []
-        for start in self._starts(target[:1], starts):
+        for start in self._starts(target[:1], starts, timed.as_numpy):
             tracks.append(followed(settings, start, timed, on_model))
             if score(tracks[-1]) == (len(target), len(target)):
                 break
@@ -647,12 +651,16 @@ class InverseKinematics:
             settings, torch.as_tensor(best.q[0], device=target.device), timed, loop
         )
 
-    def _starts(self, target: Tensor, q0: Tensor | None) -> Iterator[Tensor]:
+    def _starts(
+        self, target: Tensor, q0: Tensor | None, as_numpy: bool
+    ) -> Iterator[Tensor]:
         """Yield two configurations (n,) at a target (1, ...): of the first start, a regular one."""
         settings = self.settings
+        # Arrays of NumPy are solved by the compiled core.
+        goal = as_array(target[0]) if as_numpy else target[0]
         guesses = q0
         if guesses is None:
-            yield self._solved(target[0]).q
+            yield as_tensor(self._solved(goal).q, "q")
             start = settings.start(target)[None]
             guesses = nearest_starts(settings, start, start[:, 0], target, _GUESSES)[0]
         # The nearest ones, and always the first.
@@ -660,13 +668,18 @@ class InverseKinematics:
         distances = settings.task.distances(x[None], target)[0]
         distances[0] = -1.0
         guesses = guesses[distances.argsort()[: _GUESSES + 1]]
-        solution = self._solved(target[0], guesses, max_iter=200)
+        solution = self._solved(
+            goal, as_array(guesses) if as_numpy else guesses, max_iter=200
+        )
+        q = as_tensor(solution.q, "q")
+        status = as_tensor(solution.status, "status")
+        sigma_min = as_tensor(solution.sigma_min, "sigma_min")
         if q0 is not None:
-            yield solution.q[0]
+            yield q[0]
         for wanted in (IKStatus.CONVERGED, IKStatus.OUT_OF_DOMAIN):
-            regular = torch.where(solution.status == wanted, solution.sigma_min, -1.0)
+            regular = torch.where(status == wanted, sigma_min, -1.0)
             if regular.max() >= 0.0:
-                yield solution.q[regular.argmax()]
+                yield q[regular.argmax()]
                 return
 
     def tracker(

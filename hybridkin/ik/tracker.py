@@ -24,7 +24,7 @@ from hybridkin.ik._hysteresis import Lead
 from hybridkin.ik._rest import Rest
 from hybridkin.ik._settings import Array, StepSettings, require
 from hybridkin.ik._step import StepRows, control_step
-from hybridkin.ik.results import IKStatus
+from hybridkin.ik.results import IKStatus, statuses
 from hybridkin.ik.tasks import Tolerance
 
 Plant = Callable[["NDArray | Tensor"], Array]
@@ -190,18 +190,19 @@ class Tracker(Portable):
         measured tip was rejected.
         """
         last = self._last()
-        task = self._robot.task
         step = last.step
-        if last.rejected or not torch.isfinite(last.e.norm() + step.sigma_min):
-            return IKStatus.INVALID_INPUT
-        if task.reached(last.e, self._tol):
-            with torch.no_grad():
-                inside = task.in_domain(last.q)
-            return IKStatus.CONVERGED if inside else IKStatus.OUT_OF_DOMAIN
-        if step.saturated.any() or step.stopped:
-            return IKStatus.AT_LIMITS
-        damped = step.damping > 0.0 or step.sigma_min == 0.0
-        return IKStatus.SINGULAR if damped else IKStatus.MAX_ITER
+        known = torch.isfinite(step.sigma_min) & (not last.rejected)
+        with torch.no_grad():
+            status = statuses(
+                self._robot.task,
+                last.q,
+                last.e,
+                self._tol,
+                known=known,
+                held=step.held,
+                singular=step.damped,
+            )
+        return IKStatus(int(status))
 
     def reset(self, q: Array, state: Any = None) -> None:
         """Restart at rest from an actuator vector, as read from the robot.
@@ -391,7 +392,7 @@ class Tracker(Portable):
             if plant is not None:
                 tip = self._measured(plant, i)
             reading = tip if feedback == "measured" else None
-            command = as_tensor(self._robot.command(), "q")[None]
+            command = torch.as_tensor(self._robot.command())[None]  # a copy
             if not finite[i] or feedback is None:
                 target = None
             tick = self._robot.advance(
@@ -403,8 +404,8 @@ class Tracker(Portable):
             rejected = torch.full_like(held, tick.rejected)
             state = command, tick.q, tick.x, tip, tick.e, rejected
             rows.append((*state, tick.J, held, damped))
-            held = tick.step.saturated.any(-1) | tick.step.stopped
-            damped = tick.step.damping > 0.0
+            held = tick.step.held
+            damped = tick.step.damped
         *states, J, held, damped = map(torch.cat, zip(*rows, strict=True))
         return [*states, row_gram(J).sigma_min, held, damped]
 

@@ -10,6 +10,7 @@ from hybridkin.workflow.report import Report
 
 if TYPE_CHECKING:
     from hybridkin.workflow.compare import FitSettings
+    from hybridkin.workflow.counts import Counts
     from hybridkin.workflow.delay import Delay, estimated_delay
     from hybridkin.workflow.domain import PathLimits, path_limits
     from hybridkin.workflow.evaluate import Evaluation, evaluate_log
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "LOG_SUFFIXES",
+    "Counts",
     "Delay",
     "Description",
     "Evaluation",
@@ -55,6 +57,7 @@ __all__ = [
 # A description of a robot needs no fit and no inverse kinematics.
 _NAMES_OF = {
     "compare": ("FitSettings",),
+    "counts": ("Counts",),
     "delay": (
         "Delay",
         "estimated_delay",

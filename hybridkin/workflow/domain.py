@@ -1,15 +1,13 @@
-"""Limits of a track, commands in the domain of a model, and a posture that stays in the domain."""
+"""Limits of a track, and commands in the domain of a model, one of which is its posture."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
-from torch import Tensor
 
 from hybridkin._core.arrays import as_array, real_array
 from hybridkin.chains import robots
@@ -23,12 +21,6 @@ _STEPS = 60
 _STEP = 0.12  # length of a step, as a share of the range
 _PLANAR = 1e-9  # relative cut-off of singular values, for tendons in one plane
 _NAMES = ("q_min", "q_max", "dq_max", "ddq_max")
-# Domain distance from which the posture returns; 1 is the edge of the domain.
-_EASE = 0.5
-
-
-Posture = Callable[[Tensor], Tensor] | NDArray
-"""A preferred configuration, or a function of q that returns one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,15 +150,16 @@ class Domain:
     def preferred(self) -> NDArray:
         """A configuration (n,) in the domain of the model, within the limits.
 
-        It is the first of these that lies in the domain: the middle of the training range, no
-        tendon pulled, the training row nearest to the middle. For a model without a fit it is no
-        tendon pulled, or for other robots the middle of the limits.
+        It is the first of these that lies in the domain: the median of the training rows, actuator
+        by actuator, the middle of the training range, no tendon pulled, the training row nearest to
+        the middle. For a model without a fit it is no tendon pulled, or for other robots the middle
+        of the limits.
         """
         trained = self.loaded.trained_range
         limits = self.limits
         spanned = trained or limits
         middle = 0.5 * (np.asarray(spanned.q_min) + np.asarray(spanned.q_max))
-        middle = self.rest + (middle - self.rest) @ self.bending
+        middle = self._bent(middle)
         candidates = [middle]
         if self.tendons is not None:
             candidates.append(self.rest)
@@ -176,11 +169,16 @@ class Domain:
         if hybrid is not None and hybrid.fitted_module_.tested is not None:
             tested = hybrid.fitted_module_.tested
             rows = as_array(tested.rows) - hybrid.change_.shift
-            far = np.linalg.norm(rows - candidates[0], axis=1)
-            candidates.append(rows[far.argmin()])
+            far = np.linalg.norm(rows - middle, axis=1)
+            median = self._bent(np.median(rows, axis=0))
+            candidates = [median, *candidates, rows[far.argmin()]]
         q = np.clip(candidates, limits.q_min, limits.q_max)
         distance = self.loaded.domain_distance(q)
         return q[np.maximum(distance, 1.0).argmin()]  # the first of those in the domain
+
+    def _bent(self, q: NDArray) -> NDArray:
+        """Return a configuration (n,) without a common pull of the tendons."""
+        return self.rest + (q - self.rest) @ self.bending
 
     @property
     def tendons(self) -> ArcChain | None:
@@ -234,16 +232,12 @@ class Domain:
         far = np.linalg.norm(tips - x[..., None, :], axis=-1)
         return commands[far.argmin(axis=-1)]
 
-    def solver(
-        self, q_pref: Posture | None = None, dt: float = 0.01
-    ) -> InverseKinematics:
-        """Return inverse kinematics within the limits; default of `q_pref`: `preferred`.
+    def solver(self, dt: float = 0.01) -> InverseKinematics:
+        """Return inverse kinematics within the limits, with `preferred` as its posture.
 
         With hysteresis the limits of q are those of the commands.
         """
         limits = self.limits
-        if q_pref is None:
-            q_pref = self.preferred
         q_min, q_max = self.of_commands
         return InverseKinematics(
             self.loaded.model,
@@ -251,7 +245,7 @@ class Domain:
             q_max=q_max,
             dq_max=limits.dq_max,
             ddq_max=limits.ddq_max,
-            q_pref=q_pref,
+            q_pref=self.preferred,
             dt=dt,
         )
 
@@ -305,34 +299,3 @@ class Domain:
         slopes = as_array(slopes) / gains
         of_metres = np.linalg.pinv(slopes, rcond=_PLANAR) @ slopes
         return gains[:, None] * of_metres / gains
-
-    def posture(self, pull: float) -> Posture:
-        """Return the posture for ``InverseKinematics(q_pref=...)`` that keeps q in the domain.
-
-        From half way to the edge of the domain it moves back, along the gradient of the domain
-        distance. In addition it moves by a share `pull` of the way to the `preferred`
-        configuration. Without a guard it is the `preferred` configuration.
-        """
-        hybrid = self.loaded.hybrid
-        if hybrid is None or hybrid.guard is None or hybrid._fitted.kind is None:
-            return self.preferred
-        module = self.loaded.module
-        home = torch.from_numpy(self.preferred)
-        bending = torch.from_numpy(self.bending)
-        squares = torch.from_numpy(self.limits.span**2)
-
-        def posture(q: Tensor) -> Tensor:
-            rows = q.detach().reshape(-1, q.shape[-1])
-            with torch.enable_grad():
-                leaf = rows.clone().requires_grad_()
-                value = module.domain_distance(leaf)
-                (slope,) = torch.autograd.grad(value.sum(), leaf)
-            # Newton's step to the distance _EASE, in units of the range of every actuator.
-            downhill = squares.to(slope) * slope
-            steepness = (slope * downhill).sum(-1, keepdim=True)
-            over = (value.detach() - _EASE).clamp(min=0.0)[:, None]
-            step = over * downhill / steepness.clamp(min=torch.finfo(q.dtype).tiny)
-            step = step @ bending.to(step)
-            return (rows - step + pull * (home.to(rows) - rows)).reshape(q.shape)
-
-        return posture

@@ -29,6 +29,7 @@ from hybridkin.workflow.compare import (
     fit_to_all,
     with_play_detected,
 )
+from hybridkin.workflow.counts import Counts
 from hybridkin.workflow.errors import HeldOutErrors, Promise
 from hybridkin.workflow.explained import explained_in_words
 from hybridkin.workflow.fit_record import (
@@ -132,6 +133,9 @@ def fit_log(
         chosen=choice_in_words(model),
         held_out=held_out,
         promise=Promise.of(compared.errors[saved], compared.distance),
+        counts=None
+        if robot.log is None
+        else Counts.of_log(robot.log.to_log(complete.q)),
         choices_by_fold=compared.choices,
         log_check=complete.report,
         worst=largest_errors(compared, rows.motions),

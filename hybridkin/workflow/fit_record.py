@@ -19,6 +19,7 @@ from hybridkin.workflow.compare import (
     HYBRID_ELM,
     Comparison,
 )
+from hybridkin.workflow.counts import Counts
 from hybridkin.workflow.errors import Errors, HeldOutErrors, Promise
 from hybridkin.workflow.log import write_check
 from hybridkin.workflow.report import Report
@@ -59,6 +60,8 @@ class Training:
         Errors of every model on held-out motions [m].
     promise : Promise
         Errors to expect of the saved model.
+    counts : Counts or None
+        Whole numbers that the columns of the log can hold; None without a format of the log.
     """
 
     log: str
@@ -73,6 +76,7 @@ class Training:
     chosen: str
     held_out: Mapping[str, HeldOutErrors]
     promise: Promise
+    counts: Counts | None = None
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from hybridkin.workflow.report import (
     millimetres,
     quiet,
 )
-from hybridkin.workflow.track import best_track
+from hybridkin.workflow.track import Attempts, best_track
 
 _POOL = 2000  # number of configurations to choose from
 _SHOWN = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)  # rows of the table
@@ -87,7 +87,7 @@ def next_rows(
     target = None
     where = "within the limits"
     if path is not None:
-        target = best_track(domain, path, _TOL, progress).effective
+        target = best_track(domain, path, _TOL, Attempts(progress)).effective
         candidates = np.concatenate([target, candidates])
         far = distance(loaded.tips(target), path.x).max()
         where = f"along the path, which the model reaches to within {millimetres(far)}"

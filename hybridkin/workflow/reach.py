@@ -20,6 +20,9 @@ _POINTS = 13  # of the path, evenly in time; its ends in each direction are adde
 _PLACES = 48  # places that are tried for a path
 _HALVINGS = 7
 _ITERATIONS = 100
+_MOST_MISSED = (
+    0.1  # share of the checked points of a path that does not leave the reach
+)
 _OTHER_UNIT = 20.0  # a path this many times larger than the workspace: another unit
 
 
@@ -64,9 +67,16 @@ def better_place(domain: Domain, path: Trajectory, tol: float) -> str:
 
 
 def check_reach(
-    domain: Domain, path: Trajectory, tol: float, force: bool, progress: Progress
+    domain: Domain,
+    path: Trajectory,
+    tol: float,
+    out_of_reach: bool,
+    progress: Progress,
 ) -> None:
-    """Raise if a path is in another unit or, unless `force` is set, leaves the robot's reach."""
+    """Raise if a path is in another unit or, unless `out_of_reach` is set, leaves the reach.
+
+    A path leaves the reach if more than a tenth of the checked points are missed.
+    """
     tips = domain.sample[1]
     far = np.linalg.norm(path.x, axis=1).max()
     reach = np.linalg.norm(tips, axis=1).max()
@@ -76,7 +86,7 @@ def check_reach(
             f"`path` goes {far:.4g} m from the origin, the tips of the robot {reach:.3g} m. This "
             f"looks like {unit.name} read as metres; give --unit {unit.symbol}."
         )
-    if force:
+    if out_of_reach:
         return
     center = center_of(path)
 
@@ -92,7 +102,7 @@ def check_reach(
     rows = _some_rows(path)
     missed = missed_by(1.0, rows)
     far_out = rows[missed > 0.0]
-    if len(far_out) == 0:
+    if len(far_out) <= _MOST_MISSED * len(rows):
         return
     if missed_by(0.0, far_out[:1]).any():
         low = point_in_millimetres(tips.min(axis=0))
@@ -110,7 +120,7 @@ def check_reach(
         "`path` leaves the reach of the robot within its limits "
         f"({domain.limits.source}): {len(far_out)} of {len(rows)} checked points are out of reach, "
         f"{worst} by {millimetres(missed.max())}; {way_out}. To track as closely as possible: "
-        "--force."
+        "--out-of-reach."
     )
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike, NDArray
 
 import hybridkin
@@ -19,8 +20,9 @@ from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.robots import LogFormat
 from hybridkin.datasets import Log, load_log
 from hybridkin.ik import trajectories
-from hybridkin.ik.results import IKStatus, Track, score
+from hybridkin.ik.results import IKStatus, Track, score, statuses
 from hybridkin.ik.trajectories import Trajectory
+from hybridkin.workflow.counts import Counts
 from hybridkin.workflow.domain import Domain, PathLimits, path_limits
 from hybridkin.workflow.errors import Errors
 from hybridkin.workflow.model import LoadedModel, hysteresis_in_words, play_widths
@@ -36,6 +38,7 @@ from hybridkin.workflow.report import (
 
 TARGET = ("target_x", "target_y", "target_z")
 TIME = "t"
+_REACHED = (IKStatus.CONVERGED, IKStatus.OUT_OF_DOMAIN)
 LEAD_IN = "LEAD_IN"  # status of the rows before the path
 _STEP = 0.002  # largest tip step between two solutions, relative to the extent of the workspace
 _PEAK = 1.875  # largest speed of `min_jerk`
@@ -43,7 +46,8 @@ _PUSH = 10.0 / math.sqrt(3.0)  # its largest acceleration
 _MOST_OUTSIDE = 0.05  # share of the points outside the domain that is not worth a word
 _SLOW = 0.1  # share of the range per second, without known limits
 _DT = 0.02  # period of a path of one point [s]
-_PULLS = (0.2, 0.0)  # pull to the preferred configuration, in each attempt
+_FINER = (1, 4)  # times as many steps, in each attempt
+_SHOWN = 100  # times that a track reports its progress
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -56,16 +60,25 @@ class TrackRecord:
         "track", and the file of the model.
     n : int
         Number of points of the path.
-    reached : int
-        Number of points that are reached within `tol`.
+    reached, missed : int
+        Number of points that are reached within `tol`, and of the others.
+    missed_by : float
+        Largest error of the solver at a missed point [m], 0 if none is missed.
     errors : Errors
-        Errors of the solver [m].
+        Errors of the solver at all points [m].
     statuses : dict of str to int
         How many points have each status.
     in_domain : float or None
         Share of the points in the domain of the model, None without a learned part.
     expected : dict of str to float
-        "mean" and "p95" of the errors to expect of the robot in the domain [m], if known.
+        "mean" and "p95" of the errors to expect of the robot at all points [m], also at those that
+        are missed or outside the domain; empty if not known.
+    expected_inside : dict of str to float
+        The same at the points that are reached in the domain.
+    rounded : dict of str to float or None
+        "before" and "after": mean error of the solver before and after commands were rounded [m].
+    backend : str
+        What computed the steps: "compiled", or "torch: " and the reason.
     play : list of float or None
         Width of the hysteresis of every actuator [m].
     lead_in : int
@@ -80,10 +93,15 @@ class TrackRecord:
     model: str
     n: int
     reached: int
+    missed: int
+    missed_by: float
     errors: Errors
     statuses: dict[str, int]
     in_domain: float | None
     expected: Mapping[str, float]
+    expected_inside: Mapping[str, float]
+    rounded: Mapping[str, float] | None
+    backend: str
     play: list[float] | None
     lead_in: int
     limits: PathLimits
@@ -97,7 +115,8 @@ def _write(report: Report[TrackRecord], loaded: LoadedModel, better: str) -> Non
     report.text(
         f"In the model, {record.reached} of {record.n} points are reached. Error of the solver: "
         f"mean {millimetres(errors.mean)}, 95 % quantile {millimetres(errors.p95)}, max "
-        f"{millimetres(errors.max)}. Limits: {record.limits.source}."
+        f"{millimetres(errors.max)}. Limits: {record.limits.source}. Backend: {{backend}}.",
+        backend=record.backend,
     )
     rows = [[status, str(count)] for status, count in record.statuses.items()]
     report.table(["status", "points"], rows)
@@ -117,15 +136,50 @@ def _write(report: Report[TrackRecord], loaded: LoadedModel, better: str) -> Non
         )
     if loaded.plane_in_words():
         report.text("{plane}", plane=loaded.plane_in_words())
-    words = "The error of the robot is not known: the model has no held-out errors"
-    if record.expected:
-        mean = millimetres(record.expected["mean"], ".2g")
-        p95 = millimetres(record.expected["p95"], ".2g")
-        words = f"Expect {mean} (95 % below {p95}) of the robot inside the log"
+    report.text(*_about_counts(record, Counts.read(loaded.training)))
+    report.text(_outcome(record, better))
+
+
+def _about_counts(record: TrackRecord, counts: Counts | None) -> list[str]:
+    """Return what rounding costs, or that it is possible."""
+    if record.rounded is not None:
+        before = millimetres(record.rounded["before"])
+        after = millimetres(record.rounded["after"])
+        return [
+            f"Commands are rounded to whole steps of the actuators. Mean error of the solver: "
+            f"{before} before, {after} after."
+        ]
+    if counts is not None and counts.whole.all():
+        return [
+            "The columns of the log hold whole numbers; these commands are not rounded: --round."
+        ]
+    return []
+
+
+def _outcome(record: TrackRecord, better: str) -> str:
+    """Return what is reached and missed, and the error to expect of the robot."""
+    words = f"Reached: {record.reached} of {record.n} points"
+    if record.missed:
+        by = millimetres(record.missed_by, ".2g")
+        words += f"; missed: {record.missed}, by up to {by}"
+    if not record.expected:
+        unknown = (
+            "The error of the robot is not known: the model has no held-out errors"
+        )
+        return f"{words}. {unknown}{better}."
+    mean = millimetres(record.expected["mean"], ".2g")
+    p95 = millimetres(record.expected["p95"], ".2g")
+    words += f". Expect {mean} (95 % below {p95}) of the robot"
+    if record.in_domain == 1.0 and not record.missed:
+        return f"{words} inside the log."
+    words += " over all points"
+    if record.expected_inside:
+        inside = millimetres(record.expected_inside["mean"], ".2g")
+        words += f", {inside} at those reached inside the log"
     if record.in_domain is not None and record.in_domain < 1.0:
         outside = percent(1.0 - record.in_domain)
-        words += f"; {outside} of the path is outside, where nothing is known"
-    report.text(f"{words}{better}.")
+        words += f"; {outside} of the path is outside, where errors can be larger"
+    return f"{words}{better}."
 
 
 def track_path(
@@ -137,6 +191,8 @@ def track_path(
     start: ArrayLike | str = "rest",
     tol: float = 1e-4,
     delay: float = 0.0,
+    counts: Counts | None = None,
+    out_of_reach: bool = False,
     force: bool = False,
     progress: Progress = quiet,
 ) -> Report[TrackRecord]:
@@ -145,10 +201,11 @@ def track_path(
     ``track.csv`` has one row per point in the units, names and sign of the robot's logs: time,
     commands, the model's tip, the target, the error and its status. Figures and a report are
     written beside it. Points far apart are connected by several steps on a straight line. If points
-    are not reached, other starts and postures are tried, and the track that reaches most points in
-    the domain is kept. Rows with the status LEAD_IN move from `start` to the path, below ``dq_max``
-    (default: a tenth of the largest range per second) and ``ddq_max``. With backlash, columns
-    ``effective_NAME`` hold the motion of the actuators, half the backlash from the commands.
+    are not reached, another start and smaller steps are tried, and the track that reaches most
+    points in the domain is kept. Errors and statuses are those of the commands in the file, which
+    are all that the robot gets. Rows with the status LEAD_IN move from `start` to the path, below
+    ``dq_max`` (default: a tenth of the largest range per second) and ``ddq_max``. With backlash,
+    columns ``effective_NAME`` hold the motion of the actuators, half its width from the commands.
 
     Parameters
     ----------
@@ -169,9 +226,13 @@ def track_path(
     delay : float, default=0.0
         How much later than its command a tip will be read [s]. It is noted for `verify_track`; the
         commands do not depend on it.
+    counts : Counts, optional
+        Whole numbers to which commands are rounded. Default: not rounded. A step can then exceed
+        ``dq_max`` by one number.
+    out_of_reach : bool, default=False
+        If points of the path are out of reach, track them as closely as possible.
     force : bool, default=False
-        If points of the path are out of reach, track them as closely as possible; and replace files
-        of `out` that `track` did not write.
+        Replace files of `out` that `track` did not write.
     progress : callable, optional
         Called with (what, done, total).
 
@@ -183,31 +244,59 @@ def track_path(
     Raises
     ------
     ValueError
-        If points of the path are out of reach; the message gives the largest scale in reach.
+        If more than a tenth of the checked points of the path are out of reach; the message gives
+        the largest scale in reach.
     """
     check_out(out, "track", ["track.csv", "track.png", "commands.png"], force=force)
     domain = Domain(loaded, limits or path_limits(loaded))
     stands = _start(domain, start)
-    check_reach(domain, path, tol, force, progress)
-    track = best_track(domain, path, tol, progress)
-    statuses = [IKStatus(int(code)).name for code in track.status]
-    lead_in = _lead_in(track, stands, domain)
+    check_reach(domain, path, tol, out_of_reach, progress)
+    attempts = Attempts(progress)
+    if loaded.play is None or stands is None:
+        track = best_track(domain, path, tol, attempts)
+        lead_in = _lead_in(track, stands, domain)
+    else:
+        # The state of the hysteresis after the lead-in decides the commands of the path.
+        first = best_track(domain, path, tol, attempts, finest=_FINER[0])
+        lead_in = _lead_in(first, stands, domain)
+        track = best_track(domain, path, tol, attempts, lead_in)
     n_lead = len(lead_in) - 1
-    if loaded.play is not None and n_lead > 0:
-        track = best_track(domain, path, tol, progress, lead_in)
+    rounded = None
+    if counts is not None:
+        exact = track
+        lead_in = _rounded(lead_in, counts, domain)
+        track = _with_commands(
+            track,
+            _rounded(track.q, counts, domain),
+            domain,
+            tol,
+            _state_after(lead_in, track, domain),
+        )
+        rounded = {
+            "before": float(exact.error.mean()),
+            "after": float(track.error.mean()),
+        }
     whole = _with_lead_in(track, lead_in[:-1], loaded)
+    statuses = [IKStatus(int(code)).name for code in track.status]
     inside = loaded.domain_distance(track.effective) <= 1.0
+    _, reached = score(track)
+    missed = np.isin(track.status, _REACHED, invert=True)
     better = ""
     if loaded.hybrid is not None and inside.mean() < 1.0 - _MOST_OUTSIDE:
         better = f": {better_place(domain, path, tol)}"
     record = TrackRecord(
         model=str(loaded.path),
         n=len(path),
-        reached=score(track)[1],
+        reached=reached,
+        missed=len(path) - reached,
+        missed_by=float(track.error[missed].max(initial=0.0)),
         errors=Errors.of(track.error),
         statuses=dict(Counter(statuses)),
         in_domain=None if loaded.hybrid is None else float(inside.mean()),
-        expected=_expected(loaded, track.effective[inside]),
+        expected=_expected(loaded, track),
+        expected_inside=_expected(loaded, track, track.status == IKStatus.CONVERGED),
+        rounded=rounded,
+        backend=domain.solver().tracker(track.q[0]).backend,
         play=play_widths(loaded.hybrid),
         lead_in=n_lead,
         limits=domain.limits,
@@ -221,17 +310,27 @@ def track_path(
     _add_path(report, loaded, track)
     _add_commands(report, domain, whole.t, commands, n_lead)
     statuses = [LEAD_IN] * n_lead + statuses
-    _add_track(report, whole, commands, statuses, loaded.log_format())
+    digits = 9 if counts is None else 15
+    _add_track(report, whole, commands, statuses, loaded.log_format(), digits)
     report.write(out)
     return report
 
 
-def _expected(loaded: LoadedModel, q: NDArray) -> dict[str, float]:
-    """Return the mean errors to expect where the actuators do q (N, n); empty if not known."""
-    promised = loaded.promised_errors(q)
-    if promised is None or len(q) == 0:
+def _expected(
+    loaded: LoadedModel, track: Track, rows: NDArray | slice = slice(None)
+) -> dict[str, float]:
+    """Return the mean errors to expect at rows of a track; empty if not known.
+
+    The directions in which the solver and the model miss a point do not depend on each other.
+    """
+    promised = loaded.promised_errors(track.effective[rows])
+    if promised is None or len(promised.mean) == 0:
         return {}
-    return {"mean": promised.mean.mean(), "p95": promised.p95.mean()}
+    missed = track.error[rows]
+    means = np.hypot(promised.mean, missed)
+    # Where some points are missed by far, these are the largest errors of the path.
+    p95 = max(np.hypot(promised.p95, missed).mean(), np.quantile(means, 0.95))
+    return {"mean": float(means.mean()), "p95": float(p95)}
 
 
 def _start(domain: Domain, start: ArrayLike | str) -> NDArray | None:
@@ -310,16 +409,37 @@ def _with_lead_in(track: Track, lead_in: NDArray, loaded: LoadedModel) -> Track:
     )
 
 
+class Attempts:
+    """Progress of tracks that are computed one after another, each under its number."""
+
+    def __init__(self, progress: Progress) -> None:
+        self._progress = progress
+        self._number = 0
+
+    def __call__(self, done: int, total: int) -> None:
+        """Report that point `done` of a track begins."""
+        if done == 0:
+            self._number += 1
+        if done % max(1, total // _SHOWN) and done + 1 < total:
+            return
+        what = "tracking"
+        if self._number > 1:
+            what = f"tracking, attempt {self._number}"
+        self._progress(what, done + 1, total)
+
+
 def best_track(
     domain: Domain,
     path: Trajectory,
     tol: float,
-    progress: Progress,
+    attempts: Attempts,
     lead_in: NDArray | None = None,
+    finest: int = _FINER[-1],
 ) -> Track:
     """Return the track of several attempts that reaches most points in the domain.
 
-    After the commands `lead_in` (N + 1, n) it starts at the last of them, with its hysteresis.
+    Each attempt has smaller steps, up to `finest` times as many; it starts where the one before
+    did. After the commands `lead_in` (N + 1, n) it starts at the last of them, with its hysteresis.
     """
     commands, tips = domain.sample
     state = None
@@ -328,23 +448,21 @@ def best_track(
         _, state = domain.loaded.play.apply(lead_in, None, _period(path))
     way = np.linalg.norm(np.diff(path.x, axis=0), axis=1).max(initial=0.0)
     extent = np.linalg.norm(np.ptp(tips, axis=0))
-    every = max(1, math.ceil(way / (_STEP * extent)))
-    fine = _in_steps(path, every)
-    dt = float(np.diff(fine.t).max()) if len(fine) > 1 else 0.01
+    least = max(1, math.ceil(way / (_STEP * extent)))
     tracks: list[Track] = []
-    for attempt, pull in enumerate(_PULLS):
-        ik = domain.solver(domain.posture(pull), dt)
-
-        def report(
-            done: int, total: int, what: str = f"tracking, attempt {attempt + 1}"
-        ) -> None:
-            progress(what, done + 1, total)
-
-        track = ik.track(fine, q0=commands, tol=tol, progress=report, state=state)
+    for finer in _FINER:
+        if finer > finest:
+            break
+        every = finer * least
+        fine = _in_steps(path, every)
+        dt = float(np.diff(fine.t).max()) if len(fine) > 1 else 0.01
+        ik = domain.solver(dt)
+        track = ik.track(fine, q0=commands, tol=tol, progress=attempts, state=state)
         # Only the points are kept, not the steps between them.
-        tracks.append(_after_commands(_thinned(track, every), domain.loaded, state))
+        tracks.append(_alone(_thinned(track, every), domain, tol, state))
         if score(tracks[-1]) == (len(path), len(path)):
             break
+        commands = track.q[0]
     return max(tracks, key=score)  # of equal tracks the first
 
 
@@ -362,15 +480,90 @@ def _thinned(track: Track, every: int) -> Track:
     return replace(track, **rows)
 
 
-def _after_commands(track: Track, loaded: LoadedModel, state: Any) -> Track:
-    """Return a track with what the actuators do if they get only its commands."""
-    if loaded.play is None:
+def _alone(track: Track, domain: Domain, tol: float, state: Any) -> Track:
+    """Return a track whose commands are sent without those between its points.
+
+    With hysteresis other commands can do the same at the points: what an actuator does between
+    them, such as a reversal, depends on all commands. The better ones of both are kept.
+    """
+    play = domain.loaded.play
+    if play is None:
         return track
-    steps = np.diff(track.t, prepend=track.t[0])
-    effective, _ = loaded.play.apply(track.q, state, steps)
+    commands = [track.q]
+    exact, _ = play.command(track.effective, state, _steps(track))
+    exact = _within_speeds(exact.clip(*domain.of_commands), track, domain)
+    if exact is not None:
+        commands.append(exact)
+    tracks = [_with_commands(track, q, domain, tol, state) for q in commands]
+    return max(tracks, key=score)
+
+
+def _within_speeds(q: NDArray, track: Track, domain: Domain) -> NDArray | None:
+    """Return commands (N, n) within the limits of speed; None if they accelerate too much."""
+    limits = domain.limits
+    seconds = _steps(track)[:, None]
+    if limits.dq_max is not None:
+        q = q.copy()
+        for k in range(1, len(q)):
+            most = limits.dq_max * seconds[k]
+            q[k] = q[k - 1] + (q[k] - q[k - 1]).clip(-most, most)
+    if limits.ddq_max is not None:
+        speed = np.diff(q, axis=0, prepend=q[:1]) / np.where(
+            seconds > 0.0, seconds, 1.0
+        )
+        change = np.abs(np.diff(speed, axis=0)) / seconds[1:]
+        if (change > limits.ddq_max * (1.0 + 1e-9)).any():
+            return None
+    return q
+
+
+def _steps(track: Track) -> NDArray:
+    """Return the time before every point of a track (N,) [s]; before the first: 0."""
+    return np.diff(track.t, prepend=track.t[0])
+
+
+def _with_commands(
+    track: Track, q: NDArray, domain: Domain, tol: float, state: Any
+) -> Track:
+    """Return a track with commands q (N, n) that are sent alone, and what they do."""
+    loaded = domain.loaded
+    effective = q
+    if loaded.play is not None:
+        effective, _ = loaded.play.apply(q, state, _steps(track))
     x = loaded.tips(effective)
-    error = np.linalg.norm(x - track.target, axis=1)
-    return replace(track, effective=effective, x=x, error=error)
+    e, motion = map(torch.from_numpy, (track.target - x, effective))
+    status = statuses(
+        domain.solver().settings.task,
+        motion,
+        e,
+        tol,
+        known=torch.from_numpy(track.status != IKStatus.INVALID_INPUT),
+        held=torch.from_numpy(track.status == IKStatus.AT_LIMITS),
+        singular=torch.from_numpy(track.status == IKStatus.SINGULAR),
+    )
+    return replace(
+        track,
+        q=q,
+        effective=effective,
+        x=x,
+        error=e.norm(dim=-1).numpy(),
+        status=status.numpy(),
+    )
+
+
+def _rounded(q: NDArray, counts: Counts, domain: Domain) -> NDArray:
+    """Return commands (N, n) rounded to the numbers of the log, within the limits."""
+    log = domain.loaded.log_format()
+    low, high = np.sort(log.to_log(np.stack(domain.of_commands)), axis=0)
+    return log.from_log(counts.rounded(log.to_log(q), low, high))
+
+
+def _state_after(lead_in: NDArray, track: Track, domain: Domain) -> Any:
+    """Return the state of the hysteresis after the commands of a lead-in, None without."""
+    play = domain.loaded.play
+    if play is None or len(lead_in) < 2:
+        return None
+    return play.apply(lead_in, None, _period(track))[1]
 
 
 def read_track(path: str | Path, log_format: LogFormat) -> Log:
@@ -403,13 +596,14 @@ def _add_track(
     commands: Mapping[str, NDArray],
     statuses: Sequence[str],
     log: LogFormat,
+    digits: int,
 ) -> None:
-    """Add commands, and with backlash the motion of the actuators, point by point."""
+    """Add commands with so many digits, and with backlash what actuators do, point by point."""
     lengths = np.column_stack([track.x, track.target, track.error]) / METRES[log.x_unit]
     head = [TIME, *log.q, *log.x, *TARGET, "error", "status"]
     columns = [
         _text(track.t),
-        *_text(log.to_log(commands["command"])),
+        *_text(log.to_log(commands["command"]), digits),
         *_text(lengths),
         statuses,
     ]
@@ -419,8 +613,8 @@ def _add_track(
     report.table_file("track.csv", head, zip(*columns, strict=True))
 
 
-def _text(values: NDArray) -> NDArray:
-    return np.char.mod("%.9g", values + 0.0).T  # no -0
+def _text(values: NDArray, digits: int = 9) -> NDArray:
+    return np.char.mod(f"%.{digits}g", values + 0.0).T  # no -0
 
 
 def _add_path(report: Report[TrackRecord], loaded: LoadedModel, track: Track) -> None:
