@@ -103,6 +103,7 @@ IK_BENT, IK_WAY_SQ, IK_SHARE, IK_PROMISED = 0, 1, 2, 3
 
 # The way out of a singular configuration, eq. (22).
 IK_STUCK = 0.01  # of a motion: a step that promises less does not get there
+IK_FLAT = 1e-3  # sine of the angle between error and motion: less changes no error to first order
 IK_PROBE = 1e-4  # of the ranges: to see how J changes
 IK_BENDS = 1e-5  # of |J|^2: least negative curvature that leads out
 IK_BENDS_MOST = 0.02  # of all curvature that was seen: less is the error of the probe

@@ -10,6 +10,7 @@ from torch import Tensor
 from hybridkin._core.kernel_numbers import (
     IK_BENDS,
     IK_BENDS_MOST,
+    IK_FLAT,
     IK_HEALTHY,
     IK_PROBE,
     IK_TURNS,
@@ -46,8 +47,11 @@ def way_out(
     n = q.shape[1]
     spans = settings.spans.to(q).expand(n)
     spans = torch.where(torch.isfinite(spans), spans, 1.0)
-    up = (bounds.upper > 0.0).expand_as(q)
-    down = (bounds.lower < 0.0).expand_as(q)
+    # Open is what the bounds allow, and what does not raise the error to first order.
+    slope = apply_columns(J, e)
+    flat = IK_FLAT * J.norm(dim=-2) * e.norm(dim=-1, keepdim=True)
+    up = (bounds.upper > 0.0) & (slope >= -flat)
+    down = (bounds.lower < 0.0) & (slope <= flat)
     largest = J.square().sum((-2, -1))
     damping_sq = IK_HEALTHY**2 * largest
 
@@ -60,7 +64,7 @@ def way_out(
         return torch.where(size > 0.0, u / size, u)
 
     # The second derivative of x along e, by differences inwards.
-    probe = torch.where(up, IK_PROBE * spans, -IK_PROBE * spans)
+    probe = torch.where(bounds.upper > 0.0, IK_PROBE * spans, -IK_PROBE * spans)
     beside = (q[:, None] + torch.diag_embed(probe)).flatten(0, 1)
     _, there = settings.evaluate(beside)
     change = there.unflatten(0, (len(q), n)) - J[:, None]

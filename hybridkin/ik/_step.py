@@ -159,7 +159,7 @@ def control_step(
     if spaces is None or tip is None:
         step = law.step(J, v, posture, bounds)
         if not settings.pulls.any():
-            step = _escaping(settings, at, J, v, e, step, bounds)
+            step = _escaping(law, at, J, v, e, step, bounds)
     else:
         margin = spaces.margin(torch.where(fine, tip, 0.0))
         if settings.accelerates:
@@ -290,7 +290,7 @@ def _braking(law: Law, J: Tensor, way: Tensor, change: Tensor) -> Tensor:
 
 
 def _escaping(
-    settings: StepSettings,
+    law: Law,
     q: Tensor,
     J: Tensor,
     v: Tensor,
@@ -300,14 +300,15 @@ def _escaping(
 ) -> StepRows:
     """Return steps that leave singular configurations in which they promise almost nothing of v."""
     promised = apply_rows(J, step.dq).norm(dim=-1)
-    singular = (step.damping > 0.0) | ~(step.sigma_min > 0.0)
+    damped = step.damping.square() > 1.001 * law.least
+    singular = damped | ~(step.sigma_min > 0.0)
     stuck = singular & (promised <= IK_STUCK * v.norm(dim=-1)) & (_norm(e)[:, 0] > 0.0)
     rows = stuck.nonzero()[:, 0]
     if rows.numel() == 0:
         return step
     lower, upper = (end.expand_as(q) for end in bounds)
     of_rows = Bounds(lower[rows], upper[rows])
-    way = way_out(settings, q[rows], J[rows], e[rows], step.dq[rows], of_rows)
+    way = way_out(law.settings, q[rows], J[rows], e[rows], step.dq[rows], of_rows)
     dq = step.dq.index_put((rows,), of_rows.clip(step.dq[rows] + way))
     left = torch.zeros_like(stuck).index_put((rows,), (way != 0.0).any(-1))
     held = torch.where(left[:, None], bounds.held(dq), step.saturated)

@@ -604,10 +604,10 @@ static inline real ik_span(const ik_settings *ik, int j) {
     return span < R(INFINITY) ? span : R(1.0);
 }
 
-/* Take out of a direction u (n) what moves the tip, where it can move well, and what the plane and
-   the bounds of a step forbid; make it a unit vector. */
+/* Take out of a direction u (n) what moves the tip, where it can move well, and what the plane forbids,
+   or a sign that is not open; make it a unit vector. */
 static inline void ik_allow(const ik_settings *ik, const real *J, const ik_factors *f,
-                            const ik_step_t *s, real *u) {
+                            const unsigned char *up, const unsigned char *down, real *u) {
     const int n = ik->n, m = ik->m;
     real moved[IK_ROWS] = {R(0.0)}, mu[IK_ROWS];
     IK_OF(m, ik_rows_of, n, J, u, moved);
@@ -616,7 +616,7 @@ static inline void ik_allow(const ik_settings *ik, const real *J, const ik_facto
     IK_OF(m, ik_columns_of, n, J, mu, u, u);
     ik_in_plane(ik, 1, u);
     for (int j = 0; j < n; j++)
-        if (u[j] > R(0.0) ? !(s->upper[j] > R(0.0)) : !(s->lower[j] < R(0.0))) u[j] = R(0.0);
+        if (u[j] > R(0.0) ? !up[j] : !down[j]) u[j] = R(0.0);
     const real size = ik_norm(n, u);
     for (int j = 0; j < n && size > R(0.0); j++) u[j] /= size;
 }
@@ -629,6 +629,7 @@ static HK_NOINLINE void ik_escape(const ik_settings *ik, const real *q, const re
     const int n = ik->n, m = ik->m;
     real *there = ik_slot(ik, IK_END), bent[HK_MAX_N * HK_MAX_N], g[IK_PAIRS], at[HK_MAX_N];
     real x[IK_WIDTH], u[HK_MAX_N], next[HK_MAX_N], spans[HK_MAX_N], moved[IK_ROWS] = {R(0.0)};
+    unsigned char up[HK_MAX_N], down[HK_MAX_N];
     ik_factors f;
     ik_products(m, n, J, NULL, g);
     const real largest = ik_trace(m, g);
@@ -636,10 +637,18 @@ static HK_NOINLINE void ik_escape(const ik_settings *ik, const real *q, const re
     for (int j = 0; j < n; j++) {
         spans[j] = ik_span(ik, j);
         at[j] = q[j];
+        /* Open is what the bounds allow, and what does not raise the error to first order. */
+        real slope = R(0.0), size = R(0.0);
+        for (int i = 0; i < m; i++) {
+            slope += J[n * i + j] * e[i];
+            size += J[n * i + j] * J[n * i + j];
+        }
+        const real flat = IK_FLAT * HK_MATH(sqrt)(size) * ik_norm(m, e);
+        up[j] = s->upper[j] > R(0.0) && slope >= -flat;
+        down[j] = s->lower[j] < R(0.0) && slope <= flat;
         /* A start with a part of each direction. */
         u[j] = (j % 2 ? -R(1.0) : R(1.0)) / (R(1.0) + (real)j);
-        if (!(s->upper[j] > R(0.0) && s->lower[j] < R(0.0)))
-            u[j] = s->upper[j] > R(0.0) ? ik_abs(u[j]) : -ik_abs(u[j]);
+        if (!(up[j] && down[j])) u[j] = up[j] ? ik_abs(u[j]) : -ik_abs(u[j]);
     }
     /* The second derivative of x along e, by differences inwards. */
     for (int j = 0; j < n; j++) {
@@ -654,14 +663,14 @@ static HK_NOINLINE void ik_escape(const ik_settings *ik, const real *q, const re
         }
     }
     const real seen = ik_norm(n * n, bent);
-    ik_allow(ik, J, &f, s, u);
+    ik_allow(ik, J, &f, up, down, u);
     for (int turn = 0; turn < IK_TURNS; turn++) {
         for (int j = 0; j < n; j++) {
             next[j] = seen * u[j];
             for (int l = 0; l < n; l++) next[j] += R(0.5) * (bent[n * j + l] + bent[n * l + j]) * u[l];
         }
         for (int j = 0; j < n; j++) u[j] = next[j];
-        ik_allow(ik, J, &f, s, u);
+        ik_allow(ik, J, &f, up, down, u);
     }
     real curved = R(0.0), length = R(INFINITY);
     IK_OF(m, ik_rows_of, n, J, u, moved);
@@ -731,7 +740,8 @@ static HK_NOINLINE void ik_control(const ik_settings *ik, const real *q, const r
             ik_bound(ik, q, seconds, last, ends, s);
             ik_limited_step(ik, J, v, slides, NULL, s);
             IK_OF(m, ik_rows_of, n, J, s->dq, s->promised);
-            const int lost = !(s->sigma_min > R(0.0)) || s->damping > R(0.0);
+            const real damping_sq = s->damping * s->damping;
+            const int lost = !(s->sigma_min > R(0.0)) || damping_sq > R(1.001) * ik->least;
             if (lost && !(ik->flags & IK_PULLS) && sizes[0] > R(0.0) &&
                 ik_norm(m, s->promised) <= IK_STUCK * ik_norm(m, v))
                 ik_escape(ik, q, J, e, s);
