@@ -1,6 +1,6 @@
 """The law of one step, eq. (1): a task, a posture in its null space, and limits of the step.
 
-Equations (17) to (20) are those of the page "Theory" of the documentation.
+Equations (17) to (22) are those of the page "Theory" of the documentation.
 """
 
 from __future__ import annotations

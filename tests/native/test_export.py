@@ -19,6 +19,7 @@ from hybridkin import (
     InverseKinematics,
     as_forward_model,
     load_model,
+    robots,
 )
 from hybridkin._core.plan import NoKernel
 from hybridkin.hybrid._features import PoseFeatures, Readout
@@ -158,6 +159,31 @@ int main(void) {
     return 0;
 }
 """
+
+
+@needs_cc
+@pytest.mark.slow
+@pytest.mark.parametrize(  # beyond the tip; within reach, but singular
+    ("distance", "limits"), [(0.02, {"dq_max": 0.2, "ddq_max": 1.0}), (-0.02, {})]
+)
+def test_the_code_rests_and_leaves_singular_configurations_as_python_does(
+    tmp_path, distance, limits
+):
+    chain = robots.bionic_handling_assistant()
+    ik = InverseKinematics(chain, q_min=0.15, q_max=0.35, beta=0.0, **limits)
+    start = np.full(9, 0.35)
+    target = ik.tracker(start).x + np.array([0.0, 0.0, distance])
+    if distance > 0.0:
+        start = np.linspace(0.3, 0.34, 9)
+    export_c(ik, tmp_path, name="robot")
+    numbers = (", ".join(map(repr, map(float, a))) for a in (start, target))
+    (tmp_path / "main.c").write_text(FOLLOWS % tuple(numbers))
+    printed = subprocess.check_output([built(tmp_path, sources=("main.c", "robot.c"))], text=True)
+    *commands, error = np.array(printed.split(), float).reshape(120, 10).T
+    tracker = ik.tracker(start)
+    expected = [tracker.step(target) for _ in range(120)]
+    np.testing.assert_allclose(np.array(commands).T, expected, rtol=0, atol=1e-9)
+    assert abs(error[-1] - max(distance, 0.0)) < 1e-5
 
 
 @needs_cc
