@@ -488,7 +488,7 @@ class InverseKinematics:
         x, J = settings.evaluate(q_plain)
         e = task.difference(x, target)
         error = e.norm(dim=-1)
-        singular = row_gram(J)
+        singular = row_gram(J, task.n_free)
         status = statuses(
             task,
             q_plain,

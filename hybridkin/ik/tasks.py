@@ -1,4 +1,4 @@
-"""Tasks of inverse kinematics: positions, poses, several points."""
+"""Tasks of inverse kinematics: positions, poses, axes, several points, several tasks."""
 
 from __future__ import annotations
 
@@ -12,16 +12,24 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
-from hybridkin._core.arrays import as_tensor, identity, number, whole
+from hybridkin._core.arrays import (
+    Numbers,
+    as_tensor,
+    check_shape,
+    identity,
+    number,
+    whole,
+)
 from hybridkin._core.blocks import in_blocks
+from hybridkin._core.kernel_numbers import IK_NO_AXIS
 from hybridkin._core.model import Fitted, ForwardModel, PoseModel, as_forward_model
-from hybridkin._core.rotations import rotation_vector
+from hybridkin._core.rotations import least_turn, rotation_vector
 from hybridkin.native.hysteresis import Hysteresis
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-__all__ = ["PointsTask", "PoseTask", "PositionTask", "Task"]
+__all__ = ["AxisTask", "PointsTask", "PoseTask", "PositionTask", "Task"]
 
 Tolerance: TypeAlias = float | tuple[float, ...]
 
@@ -45,6 +53,8 @@ class Task:
         The estimator that the model was taken from, and its module then.
     has_rotation : bool
         Whether targets are poses (4, 4).
+    n_free : int
+        Number of directions of the m rows that the task leaves free: no motion changes them.
     hysteresis : Hysteresis or None
         The hysteresis of the actuators before the model, that of the estimator.
     """
@@ -56,6 +66,7 @@ class Task:
     estimator: Fitted | None = None
     module: nn.Module | None = None
     has_rotation = False
+    n_free = 0
     hysteresis: Hysteresis | None = None
 
     def present(self) -> Self:
@@ -113,6 +124,17 @@ class Task:
 
     def check(self, x_target: Tensor, name: str) -> None:
         """Raise if targets ``(..., *shape)`` are not valid, e.g. their rotations."""
+
+    def reading(self, x: Tensor) -> Tensor:
+        """Return a measured x ``(..., *shape)``, also from one without rotation, which is NaN."""
+        return x
+
+    def completed(self, reading: Tensor, x: Tensor) -> Tensor:
+        """Return measured rows ``(N, *shape)`` with rotations that are NaN taken from those of x.
+
+        Rows without a position stay as they are.
+        """
+        return reading
 
     @property
     def steered(self) -> tuple[ForwardModel, ...]:
@@ -243,7 +265,36 @@ class PositionTask(Task):
         return x
 
 
-class PoseTask(Task):
+class _OfPoses(Task):
+    """A task of the pose of the tip, with a weight of rotations [m/rad]."""
+
+    def _suitable(self, model: ForwardModel) -> ForwardModel:
+        if not model.has_pose:
+            raise TypeError(
+                "`model` must be a PoseModel, which returns the pose of the tip, got "
+                f"{type(model).__name__}; use a chain, or fit a hybrid with output='pose'."
+            )
+        return model
+
+    @property
+    def steered(self) -> tuple[ForwardModel, ...]:
+        """The model of the tip."""
+        return (self.models[0].tip_model,)
+
+    def distances(self, x: Tensor, x_target: Tensor) -> Tensor:
+        """Return distances of x to targets, with chords instead of angles of rotations."""
+        points = self._in_metres(x)
+        targets = self._in_metres(x_target)
+        if len(points) == 1:  # much faster
+            return torch.cdist(targets, points[0])
+        return torch.cdist(targets[:, None], points)[:, 0]
+
+    def _in_metres(self, x: Tensor) -> Tensor:
+        """Return points (..., k) whose distances are those of x, for small rotations."""
+        raise NotImplementedError
+
+
+class PoseTask(_OfPoses):
     """Task to bring the tip to a pose, position and orientation: six rows.
 
     The error of the rotation is its logarithm: the rotation vector from the present to the desired
@@ -272,25 +323,10 @@ class PoseTask(Task):
     has_rotation = True
 
     def __init__(self, model: object, radian: float = 0.1) -> None:
-        if not 0.0 < number(radian, "radian") < math.inf:
-            raise ValueError(f"`radian` must be a positive length [m], got {radian!r}.")
         self.shape = (4, 4)
         self.parts = (3, 3)
-        self.units = (1.0, float(radian))
+        self.units = (1.0, _length(radian, "radian"))
         self._follow(model)
-
-    def _suitable(self, model: ForwardModel) -> ForwardModel:
-        if not model.has_pose:
-            raise TypeError(
-                "`model` must be a PoseModel, which returns the pose of the tip, got "
-                f"{type(model).__name__}; use a chain, or fit a hybrid with output='pose'."
-            )
-        return model
-
-    @property
-    def steered(self) -> tuple[ForwardModel, ...]:
-        """The model of the tip."""
-        return (self.models[0].tip_model,)
 
     def evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return the tip's poses (N, 4, 4) and J (N, 6, n), its angular rows times `radian`."""
@@ -310,13 +346,22 @@ class PoseTask(Task):
         """Return the positions of poses (..., 4, 4), shape (..., 3)."""
         return x[..., :3, 3]
 
-    def distances(self, x: Tensor, x_target: Tensor) -> Tensor:
-        """Return distances of x to targets, with chords instead of angles of rotations."""
-        points = self._in_metres(x)
-        targets = self._in_metres(x_target)
-        if len(points) == 1:  # much faster
-            return torch.cdist(targets, points[0])
-        return torch.cdist(targets[:, None], points)[:, 0]
+    def reading(self, x: Tensor) -> Tensor:
+        """Return measured poses (..., 4, 4); of positions (..., 3) the rotations are NaN."""
+        if x.ndim == 0 or x.shape[-1] != 3:
+            return x
+        T = torch.full((*x.shape[:-1], 4, 4), math.nan, dtype=x.dtype, device=x.device)
+        T[..., :3, 3] = x
+        T[..., 3, :] = T.new_tensor([0.0, 0.0, 0.0, 1.0])
+        return T
+
+    def completed(self, reading: Tensor, x: Tensor) -> Tensor:
+        """Return measured poses (N, 4, 4) with rotations that are NaN taken from those of x."""
+        unknown = reading[:, :3, :3].isnan().flatten(1).all(1)
+        rows = unknown & torch.isfinite(reading[:, :3, 3]).all(1)
+        completed = torch.where(rows[:, None, None], x, reading)
+        completed[:, :3, 3] = reading[:, :3, 3]
+        return completed
 
     def _in_metres(self, T: Tensor) -> Tensor:
         """Return positions and scaled rotation matrices side by side, (..., 12)."""
@@ -333,6 +378,101 @@ class PoseTask(Task):
             raise ValueError(
                 f"`{name}` must hold rotations in its upper left 3 x 3 blocks (orthonormal, "
                 f"right-handed), got a block that is off by {float(off.max()):.3g}."
+            )
+
+
+class AxisTask(_OfPoses):
+    """Task to bring the tip to a position, and one of its axes to a direction: 5 degrees of freedom.
+
+    A turn about the axis is free, as for a drill, a needle or a camera. A target (6,) holds the
+    position and the direction; the length of the direction does not matter. The error of the
+    direction is the rotation vector of least angle from the present to the desired axis, in the
+    measuring frame; for opposite axes, see `least_turn`, one of its many directions.
+
+    Parameters
+    ----------
+    model : PoseModel
+        A chain, or a hybrid fitted with ``output="pose"``.
+    axis : array-like of shape (3,), default=(0, 0, 1)
+        The axis in the frame of the tip; of chains of arcs z is along the backbone.
+    length : float, default=0.1
+        Weight of the direction: metres per radian. As if a second point, so far along the axis,
+        had a target, too.
+
+    Examples
+    --------
+    A point from which the tip of a trunk looks straight down, aside from its base:
+
+    >>> import numpy as np
+    >>> from hybridkin import InverseKinematics, robots
+    >>> from hybridkin.ik.tasks import AxisTask
+    >>> task = AxisTask(robots.bionic_handling_assistant())
+    >>> ik = InverseKinematics(task, q_min=0.1, q_max=0.4)
+    >>> target = np.array([0.35, 0.0, 0.45, 0.0, 0.0, -1.0])
+    >>> solution = ik.solve(target, tol=(1e-6, 1e-5))  # [m], [rad]
+    >>> solution.converged, solution.x.round(6)
+    """
+
+    def __init__(
+        self, model: object, axis: Numbers = (0.0, 0.0, 1.0), length: float = 0.1
+    ) -> None:
+        along = as_tensor(axis, "axis").cpu().double()
+        check_shape(along, "axis", [3], "a direction in the frame of the tip")
+        size = float(along.norm())
+        if not IK_NO_AXIS < size < math.inf:
+            raise ValueError(
+                f"`axis` must be finite and not zero, got {along.tolist()}."
+            )
+        self.axis = along / size
+        self.shape = (6,)
+        self.parts = (3, 3)
+        self.units = (1.0, _length(length, "length"))
+        self.n_free = 1
+        self._follow(model)
+
+    def evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return positions and axes (N, 6) and J (N, 6, n), its angular rows times `length`."""
+        model = cast(PoseModel, self.models[0])
+        T, J = in_blocks(model.pose_and_jacobian, q)
+        axis = T[:, :3, :3] @ self.axis.to(T)
+        turn = J[:, 3:] - axis[:, :, None] * (axis[:, None] @ J[:, 3:])
+        scaled = torch.cat([J[:, :3], self.units[1] * turn], dim=-2)
+        return torch.cat([T[:, :3, 3], axis], dim=-1).to(q), scaled.to(q)
+
+    def difference(self, x: Tensor, x_target: Tensor) -> Tensor:
+        """Return the displacement [m] and the least turn of the axis [rad] times `length`."""
+        displacement = x_target[..., :3] - x[..., :3]
+        turn = self.units[1] * least_turn(x[..., 3:], x_target[..., 3:])
+        return torch.cat([displacement, turn], dim=-1)
+
+    def positions(self, x: Tensor) -> Tensor:
+        """Return the positions in x (..., 6), shape (..., 3)."""
+        return x[..., :3]
+
+    def reading(self, x: Tensor) -> Tensor:
+        """Return measured x (..., 6); of positions (..., 3) the axes are NaN."""
+        if x.ndim == 0 or x.shape[-1] != 3:
+            return x
+        return torch.cat([x, torch.full_like(x, math.nan)], dim=-1)
+
+    def completed(self, reading: Tensor, x: Tensor) -> Tensor:
+        """Return measured rows (N, 6) with axes that are NaN taken from those of x."""
+        unknown = reading[:, 3:].isnan().all(1) & torch.isfinite(reading[:, :3]).all(1)
+        axes = torch.where(unknown[:, None], x[:, 3:], reading[:, 3:])
+        return torch.cat([reading[:, :3], axes], dim=-1)
+
+    def _in_metres(self, x: Tensor) -> Tensor:
+        """Return positions and scaled unit axes side by side, (..., 6)."""
+        axes = nn.functional.normalize(x[..., 3:], dim=-1)
+        return torch.cat([x[..., :3], self.units[1] * axes], dim=-1)
+
+    def check(self, x_target: Tensor, name: str) -> None:
+        """Raise if the direction of a target is zero."""
+        sizes = x_target[..., 3:].norm(dim=-1)
+        if (sizes <= IK_NO_AXIS).any():
+            raise ValueError(
+                f"`{name}` must hold directions in its last 3 numbers, of any length but zero, got "
+                f"one of length {float(sizes.nan_to_num(math.inf).min()):.3g}."
             )
 
 
@@ -419,6 +559,14 @@ def as_task(model: object) -> Task:
             "a subclass of tasks.Task."
         )
     return model if isinstance(model, Task) else PositionTask(model)
+
+
+def _length(value: float, name: str) -> float:
+    """Return the weight of a rotation [m/rad], checked."""
+    length = number(value, name)
+    if not 0.0 < length < math.inf:
+        raise ValueError(f"`{name}` must be a positive length [m], got {value!r}.")
+    return length
 
 
 def _through_numpy(function: Callable[[NDArray], ArrayLike], q: Tensor) -> Tensor:

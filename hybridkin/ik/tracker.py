@@ -407,7 +407,7 @@ class Tracker(Portable):
             held = tick.step.held
             damped = tick.step.damped
         *states, J, held, damped = map(torch.cat, zip(*rows, strict=True))
-        return [*states, row_gram(J).sigma_min, held, damped]
+        return [*states, row_gram(J, task.n_free).sigma_min, held, damped]
 
     def _measured(self, plant: Plant, i: int) -> Tensor:
         """Return the plant's tip (1, ...), NaN if the plant raises.
