@@ -287,11 +287,11 @@ class InverseKinematics:
         """Warn where arguments of a step whose error is too large have another unit."""
         settings = self._settings
         messages = settings.posture_messages(settings.configurations(q, "q"), "q")
-        tips = {"x_target": x_target, "x_measured": x_measured}
-        for name, value in tips.items():
-            if value is not None:
-                points = settings.points(value, name)
-                messages += settings.far_messages(points, name)
+        tips = {"x_target": settings.points(x_target, "x_target")}
+        if x_measured is not None:
+            tips["x_measured"] = settings.readings(x_measured, "x_measured")
+        for name, points in tips.items():
+            messages += settings.far_messages(points, name)
         for message in messages:
             warnings.warn(message, stacklevel=3)
 
@@ -316,7 +316,7 @@ class InverseKinematics:
             m = sum(task.parts)
             arguments["dx"] = (settings.points(dx, "dx", rows, shape=(m,)), 1)
         if x_measured is not None:
-            tip = settings.points(x_measured, "x_measured", rows)
+            tip = settings.readings(x_measured, "x_measured", rows)
             arguments["x_measured"] = (tip, axes)
         if dq is not None:
             arguments["dq"] = (settings.configurations(dq, "dq").to(rows), 1)
@@ -339,7 +339,7 @@ class InverseKinematics:
         x, J = settings.evaluate(rows)
         tip = x
         if measured is not None:
-            tip = measured
+            tip = task.completed(measured, x)
         e = task.difference(tip, target)
         step = control_step(settings, rows, J, e, feed_forward, last=last, tip=tip)
         results = (

@@ -23,7 +23,7 @@ from hybridkin._core.arrays import (
 from hybridkin._core.blocks import in_blocks
 from hybridkin._core.kernel_numbers import IK_NO_AXIS
 from hybridkin._core.model import Fitted, ForwardModel, PoseModel, as_forward_model
-from hybridkin._core.rotations import least_turn, rotation_vector
+from hybridkin._core.rotations import least_turn, rotation, rotation_vector
 from hybridkin.native.hysteresis import Hysteresis
 
 if TYPE_CHECKING:
@@ -53,6 +53,10 @@ class Task:
         The estimator that the model was taken from, and its module then.
     has_rotation : bool
         Whether targets are poses (4, 4).
+    of_poses : bool
+        Whether x is that of the pose of a tip.
+    about_target : str
+        What a target is.
     n_free : int
         Number of directions of the m rows that the task leaves free: no motion changes them.
     hysteresis : Hysteresis or None
@@ -66,6 +70,8 @@ class Task:
     estimator: Fitted | None = None
     module: nn.Module | None = None
     has_rotation = False
+    of_poses = False
+    about_target = "desired x now [m];"
     n_free = 0
     hysteresis: Hysteresis | None = None
 
@@ -121,6 +127,10 @@ class Task:
         They tell which targets no configuration can reach.
         """
         return x.flatten(x.ndim - len(self.shape))[..., :0]
+
+    def moved(self, x: Tensor, motion: Tensor, turn: Tensor) -> Tensor:
+        """Return x moved by vectors [m] and turned by rotation vectors (..., 3), where it turns."""
+        return x + motion
 
     def check(self, x_target: Tensor, name: str) -> None:
         """Raise if targets ``(..., *shape)`` are not valid, e.g. their rotations."""
@@ -268,6 +278,8 @@ class PositionTask(Task):
 class _OfPoses(Task):
     """A task of the pose of the tip, with a weight of rotations [m/rad]."""
 
+    of_poses = True
+
     def _suitable(self, model: ForwardModel) -> ForwardModel:
         if not model.has_pose:
             raise TypeError(
@@ -321,6 +333,10 @@ class PoseTask(_OfPoses):
     """
 
     has_rotation = True
+    about_target = (
+        "desired pose now, a homogeneous (4, 4) matrix, row by row [m]; one that holds no rotation "
+        "counts as NaN;"
+    )
 
     def __init__(self, model: object, radian: float = 0.1) -> None:
         self.shape = (4, 4)
@@ -363,11 +379,18 @@ class PoseTask(_OfPoses):
         completed[:, :3, 3] = reading[:, :3, 3]
         return completed
 
+    def moved(self, x: Tensor, motion: Tensor, turn: Tensor) -> Tensor:
+        """Return poses (..., 4, 4) moved and turned, each about its tip."""
+        T = x.clone()
+        T[..., :3, 3] += motion
+        T[..., :3, :3] = rotation(turn)[0] @ T[..., :3, :3]
+        return T
+
     def _in_metres(self, T: Tensor) -> Tensor:
         """Return positions and scaled rotation matrices side by side, (..., 12)."""
-        rotation = T[..., :3, :3].flatten(-2)
+        turned = T[..., :3, :3].flatten(-2)
         metres_per_radian = self.units[1] / math.sqrt(2.0)
-        return torch.cat([T[..., :3, 3], metres_per_radian * rotation], dim=-1)
+        return torch.cat([T[..., :3, 3], metres_per_radian * turned], dim=-1)
 
     def check(self, x_target: Tensor, name: str) -> None:
         """Raise if a finite target does not hold a rotation."""
@@ -412,6 +435,11 @@ class AxisTask(_OfPoses):
     >>> solution = ik.solve(target, tol=(1e-6, 1e-5))  # [m], [rad]
     >>> solution.converged, solution.x.round(6)
     """
+
+    about_target = (
+        "desired position now [m], then the direction of the axis, of any length; one without a "
+        "direction counts as NaN;"
+    )
 
     def __init__(
         self, model: object, axis: Numbers = (0.0, 0.0, 1.0), length: float = 0.1
@@ -460,6 +488,11 @@ class AxisTask(_OfPoses):
         unknown = reading[:, 3:].isnan().all(1) & torch.isfinite(reading[:, :3]).all(1)
         axes = torch.where(unknown[:, None], x[:, 3:], reading[:, 3:])
         return torch.cat([reading[:, :3], axes], dim=-1)
+
+    def moved(self, x: Tensor, motion: Tensor, turn: Tensor) -> Tensor:
+        """Return x (..., 6) moved and turned about its position."""
+        axes = (rotation(turn)[0] @ x[..., 3:, None])[..., 0]
+        return torch.cat([x[..., :3] + motion, axes], dim=-1)
 
     def _in_metres(self, x: Tensor) -> Tensor:
         """Return positions and scaled unit axes side by side, (..., 6)."""

@@ -332,8 +332,8 @@ class Tracker(Portable):
 
     def _look(self, name: str, value: Array) -> None:
         """Warn if the first target or tip after `reset` has another unit than the robot."""
-        points = self._settings.points(value, name, lead="")
-        if not torch.isfinite(points).all():
+        points = self._settings.readings(value, name, lead="")
+        if not torch.isfinite(self._settings.task.positions(points)).all():
             return
         self._unseen.discard(name)
         for message in self._settings.far_messages(points, name):
@@ -359,7 +359,7 @@ class Tracker(Portable):
             feed_forward = settings.dt * velocity[None]
         tip = None
         if x_measured is not None:
-            tip = settings.points(x_measured, "x_measured", like, lead="")[None]
+            tip = settings.readings(x_measured, "x_measured", like, lead="")[None]
         self._robot.advance(None, target[None], feed_forward, tip, age)
 
     def follow(
@@ -417,7 +417,7 @@ class Tracker(Portable):
         """
         try:
             tip = plant(self.q)
-            return self._settings.points(tip, "tip", self._like, lead="")[None]
+            return self._settings.readings(tip, "tip", self._like, lead="")[None]
         except Exception as error:
             warnings.warn(
                 f"`plant` failed at point {i}: {error!r}; its tip is NaN.", stacklevel=7
