@@ -120,10 +120,10 @@ def least_turn(a: Tensor, b: Tensor) -> Tensor:
     square = normal.square().sum(-1, keepdim=True)
 
     # Near zero the series of asin(s) / s, with s the sine of the angle.
-    tiny = square < 1e-12
-    sine = torch.where(tiny, 1.0, square).sqrt()
-    ratio = torch.where(tiny, 1.0 + square / 6.0, torch.atan2(sine, cosine) / sine)
+    tiny = (cosine > 0.0) & (square < 1e-12)
     opposite = (cosine < 0.0) & (square <= torch.finfo(a.dtype).eps)
+    sine = torch.where(tiny | opposite, 1.0, square).sqrt()
+    ratio = torch.where(tiny, 1.0 + square / 6.0, torch.atan2(sine, cosine) / sine)
     return torch.where(opposite, _half_turn(a), ratio * normal)
 
 

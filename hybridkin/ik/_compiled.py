@@ -530,6 +530,7 @@ class _CoreTask(Task):
         self.has_rotation = task.has_rotation
         self.of_poses = task.of_poses
         self.reading = task.reading
+        self.misses = task.misses
         self.check = task.check
         self.difference = task.difference
         self.distances = task.distances

@@ -280,12 +280,7 @@ class StepSettings(Portable):
         """Return proven lower bounds (N,) of the errors at targets [m]; not positive: no proof."""
         low, high = self.box(target.double())
         largest = torch.maximum(low.abs(), high.abs()).clamp(max=LARGEST)
-        positions = self.task.positions(target)
-        if positions.shape[-1] == 0:
-            return positions.new_zeros(len(positions))
-        missed = self.task.models[0].misses(positions, largest)
-        worst_point = missed[..., None].flatten(1).amax(-1)
-        return worst_point * min(self.task.units)
+        return self.task.misses(target, largest)
 
     @property
     def middle(self) -> Tensor | None:
@@ -324,8 +319,11 @@ class StepSettings(Portable):
             `hybridkin.tasks`, or a posture that is a function; or if n is not known.
         """
         n = self.n_actuators
-        if type(self.task) not in (PositionTask, PoseTask, PointsTask, AxisTask):
-            raise TypeError(f"a {type(self.task).__name__} has no kernel")
+        for part in self.task.stacked:
+            if type(part) not in (PositionTask, PoseTask, PointsTask, AxisTask):
+                raise TypeError(f"a {type(part).__name__} has no kernel")
+            if part.of_poses and len(self.task.stacked) > 1:
+                raise TypeError("a Stack with poses or axes has no kernel")
         if callable(self.posture):
             raise TypeError("a posture that is a function has no kernel")
         if n is None:

@@ -14,9 +14,11 @@ from torch import Tensor, nn
 
 from hybridkin._core.arrays import (
     Numbers,
+    as_array,
     as_tensor,
     check_shape,
     identity,
+    leading,
     number,
     whole,
 )
@@ -29,7 +31,7 @@ from hybridkin.native.hysteresis import Hysteresis
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-__all__ = ["AxisTask", "PointsTask", "PoseTask", "PositionTask", "Task"]
+__all__ = ["AxisTask", "PointsTask", "PoseTask", "PositionTask", "Stack", "Task"]
 
 Tolerance: TypeAlias = float | tuple[float, ...]
 
@@ -150,6 +152,25 @@ class Task:
     def steered(self) -> tuple[ForwardModel, ...]:
         """The models whose outputs, side by side, are the points that are steered."""
         return self.models
+
+    @property
+    def angular(self) -> tuple[bool, ...]:
+        """Whether the parts of the error are angles, one for each part."""
+        return (False,) * len(self.parts)
+
+    @property
+    def stacked(self) -> tuple[Task, ...]:
+        """The tasks that this one consists of: itself, or those of a `Stack`."""
+        return (self,)
+
+    def misses(self, x_target: Tensor, largest: Tensor) -> Tensor:
+        """Return lower bounds (N,) of errors [m], of all q with ``|q| <= largest``; 0: unknown."""
+        positions = self.positions(x_target)
+        if positions.shape[-1] == 0:
+            return positions.new_zeros(len(positions))
+        missed = self.models[0].misses(positions, largest)
+        worst_point = missed[..., None].flatten(1).amax(-1)
+        return worst_point * min(self.units)
 
     def reached(self, error: Tensor, tol: Tolerance) -> Tensor:
         """Return whether errors (N, m) are within one tolerance [m], or one for every part."""
@@ -280,6 +301,11 @@ class _OfPoses(Task):
 
     of_poses = True
 
+    @property
+    def angular(self) -> tuple[bool, ...]:
+        """Whether the parts of the error are angles: the second one."""
+        return (False, True)
+
     def _suitable(self, model: ForwardModel) -> ForwardModel:
         if not model.has_pose:
             raise TypeError(
@@ -405,9 +431,9 @@ class PoseTask(_OfPoses):
 
 
 class AxisTask(_OfPoses):
-    """Task to bring the tip to a position, and one of its axes to a direction: 5 degrees of freedom.
+    """Task to bring the tip to a position, and one of its axes to a direction.
 
-    A turn about the axis is free, as for a drill, a needle or a camera. A target (6,) holds the
+    It has five degrees of freedom in six rows. A turn about the axis is free, as for a drill, a needle or a camera. A target (6,) holds the
     position and the direction; the length of the direction does not matter. The error of the
     direction is the rotation vector of least angle from the present to the desired axis, in the
     measuring frame; for opposite axes, see `least_turn`, one of its many directions.
@@ -424,7 +450,7 @@ class AxisTask(_OfPoses):
 
     Examples
     --------
-    A point from which the tip of a trunk looks straight down, aside from its base:
+    The tip of a trunk bends over and looks back along the base:
 
     >>> import numpy as np
     >>> from hybridkin import InverseKinematics, robots
@@ -433,7 +459,8 @@ class AxisTask(_OfPoses):
     >>> ik = InverseKinematics(task, q_min=0.1, q_max=0.4)
     >>> target = np.array([0.35, 0.0, 0.45, 0.0, 0.0, -1.0])
     >>> solution = ik.solve(target, tol=(1e-6, 1e-5))  # [m], [rad]
-    >>> solution.converged, solution.x.round(6)
+    >>> solution.converged, bool(np.allclose(solution.x, target, atol=1e-6))
+    (True, True)
     """
 
     about_target = (
@@ -583,13 +610,219 @@ class PointsTask(Task):
         return x
 
 
+class Stack(Task):
+    """Several tasks of one robot at once, e.g. the position of the tip and an axis before it.
+
+    The errors of the tasks stand one after another, and so do their targets: a target of the stack
+    is one array (K,), the targets of the tasks side by side, poses row by row. `join` makes it of
+    the targets of the tasks, and `split` takes an x apart. Tolerances are those of the parts of all
+    tasks.
+
+    If the tasks cannot all be reached, the weights decide. Tasks of positions and points run in the
+    compiled core; with poses or axes torch computes the stack.
+
+    Parameters
+    ----------
+    tasks : sequence of Task
+        Tasks of the same actuators. Settings, limits and hysteresis of the robot are those of the
+        first one.
+    weights : sequence of float, optional
+        Factor on the errors of every task. Default: 1 each.
+
+    Examples
+    --------
+    The tip of a trunk at a point, and its second segment upright at its end:
+
+    >>> import torch
+    >>> from hybridkin import InverseKinematics, robots
+    >>> from hybridkin.ik.tasks import AxisTask, PositionTask, Stack
+    >>> trunk = robots.bionic_handling_assistant()
+    >>> middle = trunk.with_tip(2.0)
+    >>> task = Stack([PositionTask(trunk), AxisTask(middle)], weights=[1.0, 0.1])
+    >>> at_rest = middle(torch.full((9,), 0.25, dtype=torch.float64))
+    >>> up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    >>> target = task.join([0.05, 0.0, 0.8], torch.cat([at_rest, up]))
+    >>> solution = InverseKinematics(task, q_min=0.1, q_max=0.4).solve(target)
+    >>> tip, axis = task.split(solution.x)
+    >>> solution.converged, bool(axis[5] > 0.9999)
+    (tensor(True), True)
+    """
+
+    def __init__(
+        self, tasks: Sequence[Task], weights: Sequence[float] | None = None
+    ) -> None:
+        parts = tuple(tasks)
+        if len(parts) == 0 or not all(isinstance(task, Task) for task in parts):
+            names = [type(task).__name__ for task in parts]
+            raise TypeError(
+                f"`tasks` must be tasks, e.g. PositionTask(model), at least one, got {names}."
+            )
+        if weights is None:
+            weights = (1.0,) * len(parts)
+        self.weights = tuple(number(w, "weights") for w in weights)
+        positive = all(0.0 < w < math.inf for w in self.weights)
+        if len(self.weights) != len(parts) or not positive:
+            raise ValueError(
+                "`weights` must be positive, one for every task, got "
+                f"{self.weights} for {len(parts)} tasks."
+            )
+        sizes = {task.n_actuators for task in parts} - {None}
+        if len(sizes) > 1:
+            raise ValueError(
+                f"`tasks` must have the same actuators, got {sorted(sizes)} of them."
+            )
+        self._take(parts)
+
+    def _take(self, tasks: tuple[Task, ...]) -> None:
+        """Set the tasks."""
+        self._tasks = tasks
+        self.widths = tuple(math.prod(task.shape) for task in tasks)
+        self.rows = tuple(sum(task.parts) for task in tasks)
+        self.shape = (sum(self.widths),)
+        self.parts = tuple(part for task in tasks for part in task.parts)
+        units = []
+        for task, weight in zip(tasks, self.weights, strict=True):
+            units += [weight * unit for unit in task.units]
+        self.units = tuple(units)
+        self.models = tuple(model for task in tasks for model in task.models)
+        self.n_free = sum(task.n_free for task in tasks)
+        self.estimator = tasks[0].estimator
+        self.module = tasks[0].module
+        self.hysteresis = tasks[0].hysteresis
+
+    @property
+    def angular(self) -> tuple[bool, ...]:
+        """Whether the parts of the error are angles, one for each part of the tasks."""
+        return tuple(turns for task in self._tasks for turns in task.angular)
+
+    @property
+    def stacked(self) -> tuple[Task, ...]:
+        """The tasks."""
+        return self._tasks
+
+    @property
+    def steered(self) -> tuple[ForwardModel, ...]:
+        """The models whose outputs, side by side, are the points that are steered."""
+        return tuple(model for task in self._tasks for model in task.steered)
+
+    def present(self) -> Self:
+        """Return the stack for the modules that the estimators of its tasks have now."""
+        tasks = tuple(task.present() for task in self._tasks)
+        if all(a is b for a, b in zip(tasks, self._tasks, strict=True)):
+            return self
+        return self._with(tasks)
+
+    def frozen(self) -> Self:
+        """Return the stack with copies of its models."""
+        return self._with(tuple(task.frozen() for task in self._tasks))
+
+    def _with(self, tasks: tuple[Task, ...]) -> Self:
+        stack = copy.copy(self)
+        stack._take(tasks)
+        return stack
+
+    def join(self, *targets: ArrayLike | Tensor) -> Tensor | NDArray:
+        """Return a target (..., K) of the targets ``(..., *shape)`` of the tasks.
+
+        It is a tensor if one of them is, else an array.
+        """
+        if len(targets) != len(self._tasks):
+            raise ValueError(
+                f"`targets` must be one for every task, {len(self._tasks)}, got {len(targets)}."
+            )
+        rows = []
+        for i, (task, target) in enumerate(zip(self._tasks, targets, strict=True)):
+            name = f"targets[{i}]"
+            x = as_tensor(target, name, self.device)
+            check_shape(x, name, ("...", *task.shape), type(task).__name__)
+            task.check(x, name)
+            rows.append(x.flatten(x.ndim - len(task.shape)))
+        dtype = rows[0].dtype
+        for row in rows:
+            dtype = torch.promote_types(dtype, row.dtype)
+        lead = leading([(row, 1) for row in rows])
+        joined = torch.cat([row.to(dtype).expand(*lead, -1) for row in rows], dim=-1)
+        if any(isinstance(target, Tensor) for target in targets):
+            return joined
+        return as_array(joined)
+
+    def split(self, x: Tensor | NDArray) -> list[Tensor | NDArray]:
+        """Return the x of the tasks ``(..., *shape)`` in an x (..., K) of the stack."""
+        parts = []
+        start = 0
+        for task, width in zip(self._tasks, self.widths, strict=True):
+            part = x[..., start : start + width]
+            parts.append(part.reshape(*x.shape[:-1], *task.shape))
+            start += width
+        return parts
+
+    def _joined(self, parts: Sequence[Tensor]) -> Tensor:
+        """Return x of the stack (..., K) from those of the tasks."""
+        rows = []
+        for task, x in zip(self._tasks, parts, strict=True):
+            rows.append(x.flatten(x.ndim - len(task.shape)))
+        return torch.cat(rows, dim=-1)
+
+    def evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return x (N, K) and the weighted J (N, m, n), one task after another."""
+        parts = []
+        weighted = []
+        for task, weight in zip(self._tasks, self.weights, strict=True):
+            x, J = task.evaluate(q)
+            parts.append(x)
+            weighted.append(weight * J)
+        return self._joined(parts), torch.cat(weighted, dim=-2)
+
+    def difference(self, x: Tensor, x_target: Tensor) -> Tensor:
+        """Return the weighted errors (N, m), one task after another."""
+        errors = []
+        pairs = zip(self._tasks, self.split(x), self.split(x_target), strict=True)
+        for (task, part, target), weight in zip(pairs, self.weights, strict=True):
+            errors.append(weight * task.difference(part, target))
+        return torch.cat(errors, dim=-1)
+
+    def positions(self, x: Tensor) -> Tensor:
+        """Return the points (..., P, 3) of the tasks that have them, (..., 0) if none has."""
+        points = []
+        for task, part in zip(self._tasks, self.split(x), strict=True):
+            at = task.positions(part)
+            if at.shape[-1] == 3:
+                points.append(at.reshape(*x.shape[:-1], -1, 3))
+        return torch.cat(points, dim=-2) if points else x[..., :0]
+
+    def misses(self, x_target: Tensor, largest: Tensor) -> Tensor:
+        """Return lower bounds (N,) of errors [m]: that of the task that is missed by most."""
+        bounds = []
+        for i, part in enumerate(self.split(x_target)):
+            missed = self._tasks[i].misses(part, largest)
+            bounds.append(self.weights[i] * missed)
+        return torch.stack(bounds).amax(0)
+
+    def moved(self, x: Tensor, motion: Tensor, turn: Tensor) -> Tensor:
+        """Return x (..., K) of points, moved by vectors (..., P, 3) [m]."""
+        return x + motion.flatten(-2)
+
+    def check(self, x_target: Tensor, name: str) -> None:
+        """Raise if the part of a target that belongs to a task is not valid."""
+        for i, part in enumerate(self.split(x_target)):
+            self._tasks[i].check(part, f"part {i} of {name}")
+
+    def completed(self, reading: Tensor, x: Tensor) -> Tensor:
+        """Return measured rows (N, K) with rotations and axes that are NaN taken from x."""
+        parts = []
+        pairs = zip(self.split(reading), self.split(x), strict=True)
+        for task, (part, model) in zip(self._tasks, pairs, strict=True):
+            parts.append(task.completed(part, model))
+        return self._joined(parts)
+
+
 def as_task(model: object) -> Task:
     """Return a task unchanged, and for a model the task to bring its tip to a point."""
     if isinstance(model, (list, tuple)) and any(isinstance(a, Task) for a in model):
         raise TypeError(
-            f"`model` must be one task, got {len(model)} of them; for several points of a backbone "
-            "use tasks.PointsTask, for position and orientation tasks.PoseTask, for anything else "
-            "a subclass of tasks.Task."
+            f"`model` must be one task, got {len(model)} of them; for several of them at once "
+            "use tasks.Stack, for several points of a backbone tasks.PointsTask, for position and "
+            "orientation tasks.PoseTask, for anything else a subclass of tasks.Task."
         )
     return model if isinstance(model, Task) else PositionTask(model)
 

@@ -867,6 +867,21 @@ static inline int ik_is_valid(const ik_settings *ik, const real *x) {
     return !IK_IS_POSE(ik) || ik_is_rotation(x);
 }
 
+/* Take what a measured tip does not tell, its rotation or axis, from x; it has a position. */
+static inline void ik_complete(const ik_settings *ik, const real *x, real *tip) {
+    const int poses = IK_IS_POSE(ik);
+    int unknown = poses || IK_IS_AXIS(ik);
+    for (int i = 0; i < 3 && unknown; i++) {
+        unknown &= ik_finite(1, tip + (poses ? 4 * i + 3 : i));
+        for (int j = 0; j < (poses ? 3 : 1); j++) {
+            const real turn = tip[poses ? 4 * i + j : 3 + i];
+            unknown &= turn != turn;
+        }
+    }
+    for (int i = 0; i < ik->width && unknown; i++)
+        if (poses ? i % 4 < 3 : i > 2) tip[i] = x[i];
+}
+
 /* y (n) = what actuators would do after a command q, by the state that is tried. */
 static inline void ik_try(const ik_settings *ik, const ik_state *now, real seconds, const real *q,
                           real *y) {
@@ -1047,6 +1062,7 @@ static inline int ik_tick(const ik_settings *ik, real *state, real *seen) {
         ik_difference(ik, now.x, now.target, used);
         ik_difference(ik, x_before, now.target, before);
         for (int i = 0; i < m; i++) before[i] -= used[i];
+        if (alone && tip) ik_complete(ik, now.x, now.tip);
         if (alone) ik_difference(ik, tip ? tip : now.x, now.target, now.error);
         for (int i = 0; i < m; i++) {
             if (alone) now.offset[i] = used[i] - now.error[i];
