@@ -66,7 +66,7 @@ class InverseKinematics:
     model : ForwardModel, fitted estimator, nn.Module, callable, (callable, callable) or Task
         Maps q ``(..., n)`` to tips ``(..., 3)`` [m], row by row, torch to torch; a pair is such a
         function and its Jacobian, see `as_forward_model`. Its `in_domain` separates CONVERGED from
-        OUT_OF_DOMAIN. For poses, several points and NumPy functions pass a task, see
+        OUT_OF_DOMAIN. For poses, axes, several points and NumPy functions pass a task, see
         `hybridkin.tasks`; then x has the shape of its targets.
     q_min, q_max : float or array-like of shape (n,), optional
         Limits of q, in the unit of q; infinity means none. Default: those of the model, e.g. the
@@ -248,7 +248,8 @@ class InverseKinematics:
         dx : array-like of shape (..., 3), optional
             Velocities of the targets [m/s], one for every row of the task. Default: at rest.
         x_measured : array-like of shape (..., 3), optional
-            Measured tips [m] for feedback. Default: the model's tips.
+            Measured tips [m] for feedback. Default: the model's tips. Of poses and axes positions
+            (..., 3) are enough, or NaN rotations: these stay with the model.
         dq : array-like of shape (..., n), optional
             The previous steps, to which `ddq_max` refers. Default: at rest.
 
@@ -563,6 +564,7 @@ class InverseKinematics:
             `q_pref` and an even sample of the limits.
         plant : callable, optional
             The robot: maps a commanded q (n,) to the measured tip (3,) [m]; NumPy or torch as path.
+            Of a pose or axis its position is enough; the rotation in `x_measured` is then NaN.
         feedback : {"model", "measured"} or None, default="model"
             Source of the error: the model's tip (with a plant: the paper's feed-forward control),
             the measured tip, or none.

@@ -412,11 +412,11 @@ class PoseTask(_OfPoses):
         T[..., :3, :3] = rotation(turn)[0] @ T[..., :3, :3]
         return T
 
-    def _in_metres(self, T: Tensor) -> Tensor:
+    def _in_metres(self, x: Tensor) -> Tensor:
         """Return positions and scaled rotation matrices side by side, (..., 12)."""
-        turned = T[..., :3, :3].flatten(-2)
+        turned = x[..., :3, :3].flatten(-2)
         metres_per_radian = self.units[1] / math.sqrt(2.0)
-        return torch.cat([T[..., :3, 3], metres_per_radian * turned], dim=-1)
+        return torch.cat([x[..., :3, 3], metres_per_radian * turned], dim=-1)
 
     def check(self, x_target: Tensor, name: str) -> None:
         """Raise if a finite target does not hold a rotation."""
@@ -459,7 +459,7 @@ class AxisTask(_OfPoses):
     >>> ik = InverseKinematics(task, q_min=0.1, q_max=0.4)
     >>> target = np.array([0.35, 0.0, 0.45, 0.0, 0.0, -1.0])
     >>> solution = ik.solve(target, tol=(1e-6, 1e-5))  # [m], [rad]
-    >>> solution.converged, bool(np.allclose(solution.x, target, atol=1e-6))
+    >>> bool(solution.converged), bool(np.allclose(solution.x, target, atol=1e-6))
     (True, True)
     """
 
@@ -666,7 +666,7 @@ class Stack(Task):
                 "`weights` must be positive, one for every task, got "
                 f"{self.weights} for {len(parts)} tasks."
             )
-        sizes = {task.n_actuators for task in parts} - {None}
+        sizes = {task.n_actuators for task in parts if task.n_actuators}
         if len(sizes) > 1:
             raise ValueError(
                 f"`tasks` must have the same actuators, got {sorted(sizes)} of them."
