@@ -6,7 +6,7 @@ import copy
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Protocol, TypeAlias, cast, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, TypeAlias, TypeVar, cast, runtime_checkable
 
 import torch
 from numpy.typing import ArrayLike, NDArray
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 __all__ = ["AxisTask", "PointsTask", "PoseTask", "PositionTask", "Stack", "Task"]
 
 Tolerance: TypeAlias = float | tuple[float, ...]
+_Rows = TypeVar("_Rows", Tensor, NDArray)
 
 
 class Task:
@@ -433,10 +434,11 @@ class PoseTask(_OfPoses):
 class AxisTask(_OfPoses):
     """Task to bring the tip to a position, and one of its axes to a direction.
 
-    It has five degrees of freedom in six rows. A turn about the axis is free, as for a drill, a needle or a camera. A target (6,) holds the
-    position and the direction; the length of the direction does not matter. The error of the
-    direction is the rotation vector of least angle from the present to the desired axis, in the
-    measuring frame; for opposite axes, see `least_turn`, one of its many directions.
+    It has five degrees of freedom in six rows: a turn about the axis is free, as for a drill, a
+    needle or a camera. A target (6,) holds the position and the direction, whose length does not
+    matter, but must not be zero. The error of the direction is the rotation vector of least angle
+    from the present to the desired axis, in the measuring frame; for opposite axes, which have many
+    such turns, always the same one.
 
     Parameters
     ----------
@@ -746,7 +748,7 @@ class Stack(Task):
             return joined
         return as_array(joined)
 
-    def split(self, x: Tensor | NDArray) -> list[Tensor | NDArray]:
+    def split(self, x: _Rows) -> list[_Rows]:
         """Return the x of the tasks ``(..., *shape)`` in an x (..., K) of the stack."""
         parts = []
         start = 0

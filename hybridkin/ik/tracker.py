@@ -275,8 +275,8 @@ class Tracker(Portable):
             for second order in dt. Default: at rest.
         x_measured : array-like of shape (3,), optional
             Measured tip [m] for feedback; of a pose or axis the position alone, (3,), is enough.
-            Without one (default), or where it is NaN, the offset between robot and model stays as it
-            is, or decays with `memory`; before the first reading it is zero.
+            Without one (default), or where it is NaN, the offset between robot and model stays as
+            it is, or decays with `memory`; before the first reading it is zero.
         at : float, optional
             Time of the measured tip [s], on the clock of `time`: for a tip of a given age,
             ``at=tracker.time - age``. Default: `delay` before `time`.
