@@ -64,6 +64,12 @@ HK_IF_SAME = 4  # only if what the plan was made of has not changed
 # A step of inverse kinematics.
 IK_LIMITED, IK_POSTURE, IK_WEIGHTS, IK_ACCELERATES, IK_PULLS = 1, 2, 4, 8, 16  # flags
 IK_POSE = 32  # the task is a pose, and not a vector of coordinates
+IK_AXIS = 64  # the task is a position and the direction of an axis of the tip
+IK_HALF_TURN = 3.141592653589793  # [rad]
+IK_NO_AXIS = 1e-12  # a direction that is shorter is none
+HK_ASIDE = (
+    0.6  # a component of a unit vector below which a coordinate axis is not along it
+)
 IK_HEALTHY = 0.02  # sigma_min / sigma_max above which no damping is needed
 IK_NEWTON = 60  # Newton steps in a box; a handful is usual
 IK_SWEEPS = 30  # of Jacobi's method for eigenvalues; six are usual

@@ -1,11 +1,14 @@
-"""Rotations: the exponential map, its left Jacobian, the logarithm, and the nearest rotation."""
+"""Rotations: the exponential map, its left Jacobian, the logarithm, the nearest, the least one."""
 
 from __future__ import annotations
+
+import math
 
 import torch
 from torch import Tensor, nn
 
 from hybridkin._core.arrays import identity
+from hybridkin._core.kernel_numbers import HK_ASIDE
 from hybridkin._core.stumpff import stumpff
 
 
@@ -102,3 +105,35 @@ def rotation_vector(R: Tensor) -> Tensor:
     near = 2.0 + square / 3.0
     far = 2.0 * torch.atan2(size, w) / size
     return torch.where(tiny, near, far) * v
+
+
+def least_turn(a: Tensor, b: Tensor) -> Tensor:
+    """Return the rotation vectors (..., 3) of least angle from directions a to b (..., 3) [rad].
+
+    Their lengths do not matter. Opposite directions, to half of the digits, have many such turns:
+    the one about the cross product of a and the first coordinate axis that is not along it.
+    """
+    a = nn.functional.normalize(a, dim=-1)
+    b = nn.functional.normalize(b, dim=-1)
+    normal = torch.linalg.cross(a, b, dim=-1)
+    cosine = (a * b).sum(-1, keepdim=True)
+    square = normal.square().sum(-1, keepdim=True)
+
+    # Near zero the series of asin(s) / s, with s the sine of the angle.
+    tiny = (cosine > 0.0) & (square < 1e-12)
+    opposite = (cosine < 0.0) & (square <= torch.finfo(a.dtype).eps)
+    sine = torch.where(tiny | opposite, 1.0, square).sqrt()
+    ratio = torch.where(tiny, 1.0 + square / 6.0, torch.atan2(sine, cosine) / sine)
+    return torch.where(opposite, _half_turn(a), ratio * normal)
+
+
+def _half_turn(a: Tensor) -> Tensor:
+    """Return a half turn (..., 3) that reverses unit vectors a (..., 3)."""
+    x, y, z = a.unbind(-1)
+    zero = torch.zeros_like(x)
+    by_x = torch.stack([zero, z, -y], dim=-1)
+    by_y = torch.stack([-z, zero, x], dim=-1)
+    by_z = torch.stack([y, -x, zero], dim=-1)
+    axis = torch.where(y.abs()[..., None] < HK_ASIDE, by_y, by_z)
+    axis = torch.where(x.abs()[..., None] < HK_ASIDE, by_x, axis)
+    return math.pi * nn.functional.normalize(axis, dim=-1)

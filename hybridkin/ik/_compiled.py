@@ -247,7 +247,7 @@ class Core:
         result = torch.from_numpy(outcome)
         iterations = torch.from_numpy(n_iter).long()
         x = torch.full_like(target, math.nan)  # of other tasks than positions: not used
-        if target.shape == error.shape:
+        if not self.settings.task.of_poses and target.shape == error.shape:
             x = target - error
         return Found(
             torch.from_numpy(best),
@@ -528,6 +528,9 @@ class _CoreTask(Task):
     def __init__(self, task: Task, core: Core, programs: list[Program]) -> None:
         vars(self).update(vars(task))
         self.has_rotation = task.has_rotation
+        self.of_poses = task.of_poses
+        self.reading = task.reading
+        self.misses = task.misses
         self.check = task.check
         self.difference = task.difference
         self.distances = task.distances

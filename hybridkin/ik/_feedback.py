@@ -88,13 +88,10 @@ def expected_innovation(settings: StepSettings) -> tuple[Tensor, float]:
     if radius is not None and math.isfinite(radius.inside):
         length = max(length, _RADII * radius.inside)
     most = 2.0 * reach / length if math.isfinite(length) else math.inf
-    expected = [length * unit for unit in task.units]
-    if task.has_rotation:
-        expected[-1] = _TURN * task.units[-1]
-        most += math.pi / _TURN
     rows: list[float] = []
-    for size, count in zip(expected, task.parts, strict=True):
-        rows += [size] * count
+    for unit, count, turns in zip(task.units, task.parts, task.angular, strict=True):
+        rows += [(_TURN if turns else length) * unit] * count
+        most += math.pi / _TURN if turns else 0.0
     return torch.tensor(rows, dtype=torch.float64, device="cpu"), most
 
 

@@ -29,7 +29,7 @@ class RowGram(NamedTuple):
         return self.sigma_min < IK_HEALTHY * self.sigma_max
 
 
-def row_gram(J: Tensor) -> RowGram:
+def row_gram(J: Tensor, n_free: int = 0) -> RowGram:
     """Return G = J J^T with the smallest and largest singular value of J.
 
     The singular values are accurate to sqrt(eps) of the largest, because G holds their squares.
@@ -38,6 +38,8 @@ def row_gram(J: Tensor) -> RowGram:
     ----------
     J : Tensor of shape (..., m, n)
         Jacobians.
+    n_free : int, default=0
+        Number of directions of the rows that no motion changes, see `Task`; they do not count.
 
     Returns
     -------
@@ -46,7 +48,7 @@ def row_gram(J: Tensor) -> RowGram:
     """
     if J.shape[-2] != 3:
         squares, vectors = torch.linalg.eigh(_finite_gram(J))
-        roots = _roots(squares[..., 0], squares[..., -1])
+        roots = _roots(squares[..., n_free], squares[..., -1])
         return RowGram((squares, vectors), *roots)
     entries = _entries_3x3(J)
     return RowGram(entries, *_roots(*_extreme_eigenvalues(*entries)))

@@ -111,7 +111,7 @@ class Search:
             q = self._beside_singular_start(q, target)
         best = self._attempt(q, target)
         missed = (~best.reached).nonzero()[:, 0]
-        rows = missed[row_gram(best.J[missed]).is_singular]
+        rows = missed[row_gram(best.J[missed], settings.task.n_free).is_singular]
         nudged = self._nudged(best)[rows]
         self._try_again(best, rows, nudged[:, None])
         if restarts > 0:
@@ -128,7 +128,7 @@ class Search:
         At a straight backbone, motions that cancel to first order would be missed.
         """
         _, J = self.settings.evaluate(q[:1])
-        if not row_gram(J).is_singular.all():
+        if not row_gram(J, self.settings.task.n_free).is_singular.all():
             return q
         at_start = self._start(q, target)
         stay = at_start.reached | ~torch.isfinite(at_start.error)

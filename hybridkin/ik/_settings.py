@@ -23,6 +23,7 @@ from hybridkin._core.arrays import (
 )
 from hybridkin._core.kernel_numbers import (
     IK_ACCELERATES,
+    IK_AXIS,
     IK_FRACTION,
     IK_LIMITED,
     IK_NORMALS,
@@ -36,7 +37,14 @@ from hybridkin._core.named_rows import without_warnings
 from hybridkin._core.plan import NoKernel, Plan
 from hybridkin.ik._feedback import expected_innovation
 from hybridkin.ik._half_spaces import HalfSpaces
-from hybridkin.ik.tasks import PointsTask, PoseTask, PositionTask, Task, Tolerance
+from hybridkin.ik.tasks import (
+    AxisTask,
+    PointsTask,
+    PoseTask,
+    PositionTask,
+    Task,
+    Tolerance,
+)
 from hybridkin.native.hysteresis import stage_numbers
 
 Array: TypeAlias = Numbers | Transform  # what a caller may pass
@@ -272,12 +280,7 @@ class StepSettings(Portable):
         """Return proven lower bounds (N,) of the errors at targets [m]; not positive: no proof."""
         low, high = self.box(target.double())
         largest = torch.maximum(low.abs(), high.abs()).clamp(max=LARGEST)
-        positions = self.task.positions(target)
-        if positions.shape[-1] == 0:
-            return positions.new_zeros(len(positions))
-        missed = self.task.models[0].misses(positions, largest)
-        worst_point = missed[..., None].flatten(1).amax(-1)
-        return worst_point * min(self.task.units)
+        return self.task.misses(target, largest)
 
     @property
     def middle(self) -> Tensor | None:
@@ -316,8 +319,11 @@ class StepSettings(Portable):
             `hybridkin.tasks`, or a posture that is a function; or if n is not known.
         """
         n = self.n_actuators
-        if type(self.task) not in (PositionTask, PoseTask, PointsTask):
-            raise TypeError(f"a {type(self.task).__name__} has no kernel")
+        for part in self.task.stacked:
+            if type(part) not in (PositionTask, PoseTask, PointsTask, AxisTask):
+                raise TypeError(f"a {type(part).__name__} has no kernel")
+            if part.of_poses and len(self.task.stacked) > 1:
+                raise TypeError("a Stack with poses or axes has no kernel")
         if callable(self.posture):
             raise TypeError("a posture that is a function has no kernel")
         if n is None:
@@ -338,6 +344,8 @@ class StepSettings(Portable):
         numbers += [weights**-0.5, self.kernel_rates(), scale]
         expected, most = expected_innovation(self)
         numbers += [as_array(expected), [most]]
+        if isinstance(self.task, AxisTask):
+            numbers.append(as_array(self.task.axis))
         for vector in (self.periods, self.pulls):
             numbers.append(np.broadcast_to(as_array(vector), n))
 
@@ -367,6 +375,7 @@ class StepSettings(Portable):
         flags |= IK_ACCELERATES * self.accelerates
         flags |= IK_PULLS * bool(self.pulls.any())
         flags |= IK_POSE * self.task.has_rotation
+        flags |= IK_AXIS * isinstance(self.task, AxisTask)
         entries = [model, flags, n_normals, n_spaces, *stages]
         return plan.node("ik", n, len(scale), numbers, *entries)
 
@@ -564,6 +573,13 @@ class StepSettings(Portable):
         if like is None:
             return x
         return x.to(like)
+
+    def readings(
+        self, value: Array, name: str, like: Tensor | None = None, lead: str = "..."
+    ) -> Tensor:
+        """Return measured tips (..., *shape), see `points`, also from positions alone."""
+        x = self.task.reading(as_tensor(value, name, self.task.device))
+        return self.points(x, name, like, lead=lead)
 
     def times(self, t: Array | None, target: Tensor) -> tuple[Tensor, list[float]]:
         """Return the times of a path's points, and the period after each point."""

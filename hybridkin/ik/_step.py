@@ -212,7 +212,7 @@ def limited_step(
         mu = solve_rows(J, v, damping_sq)
         sigma_min = torch.full_like(damping_sq, math.nan)
     else:
-        gram = row_gram(J)
+        gram = row_gram(J, settings.task.n_free)
         sigma_min = gram.sigma_min
         if isinstance(settings.damping, str):
             damping_sq = adaptive_damping(gram)

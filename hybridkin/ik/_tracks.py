@@ -53,7 +53,7 @@ def followed(
     q, effective, x, measured, e, rejected, sigma_min, held, damped = columns
     judged = e
     if loop.feedback != "measured":
-        e = task.difference(measured, target)
+        e = task.difference(task.completed(measured, x), target)
         judged = task.difference(x, target)
     error = e.norm(dim=-1)
     status = statuses(

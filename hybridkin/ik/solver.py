@@ -66,7 +66,7 @@ class InverseKinematics:
     model : ForwardModel, fitted estimator, nn.Module, callable, (callable, callable) or Task
         Maps q ``(..., n)`` to tips ``(..., 3)`` [m], row by row, torch to torch; a pair is such a
         function and its Jacobian, see `as_forward_model`. Its `in_domain` separates CONVERGED from
-        OUT_OF_DOMAIN. For poses, several points and NumPy functions pass a task, see
+        OUT_OF_DOMAIN. For poses, axes, several points and NumPy functions pass a task, see
         `hybridkin.tasks`; then x has the shape of its targets.
     q_min, q_max : float or array-like of shape (n,), optional
         Limits of q, in the unit of q; infinity means none. Default: those of the model, e.g. the
@@ -248,7 +248,8 @@ class InverseKinematics:
         dx : array-like of shape (..., 3), optional
             Velocities of the targets [m/s], one for every row of the task. Default: at rest.
         x_measured : array-like of shape (..., 3), optional
-            Measured tips [m] for feedback. Default: the model's tips.
+            Measured tips [m] for feedback. Default: the model's tips. Of poses and axes positions
+            (..., 3) are enough, or NaN rotations: these stay with the model.
         dq : array-like of shape (..., n), optional
             The previous steps, to which `ddq_max` refers. Default: at rest.
 
@@ -287,11 +288,11 @@ class InverseKinematics:
         """Warn where arguments of a step whose error is too large have another unit."""
         settings = self._settings
         messages = settings.posture_messages(settings.configurations(q, "q"), "q")
-        tips = {"x_target": x_target, "x_measured": x_measured}
-        for name, value in tips.items():
-            if value is not None:
-                points = settings.points(value, name)
-                messages += settings.far_messages(points, name)
+        tips = {"x_target": settings.points(x_target, "x_target")}
+        if x_measured is not None:
+            tips["x_measured"] = settings.readings(x_measured, "x_measured")
+        for name, points in tips.items():
+            messages += settings.far_messages(points, name)
         for message in messages:
             warnings.warn(message, stacklevel=3)
 
@@ -316,7 +317,7 @@ class InverseKinematics:
             m = sum(task.parts)
             arguments["dx"] = (settings.points(dx, "dx", rows, shape=(m,)), 1)
         if x_measured is not None:
-            tip = settings.points(x_measured, "x_measured", rows)
+            tip = settings.readings(x_measured, "x_measured", rows)
             arguments["x_measured"] = (tip, axes)
         if dq is not None:
             arguments["dq"] = (settings.configurations(dq, "dq").to(rows), 1)
@@ -339,7 +340,7 @@ class InverseKinematics:
         x, J = settings.evaluate(rows)
         tip = x
         if measured is not None:
-            tip = measured
+            tip = task.completed(measured, x)
         e = task.difference(tip, target)
         step = control_step(settings, rows, J, e, feed_forward, last=last, tip=tip)
         results = (
@@ -488,7 +489,7 @@ class InverseKinematics:
         x, J = settings.evaluate(q_plain)
         e = task.difference(x, target)
         error = e.norm(dim=-1)
-        singular = row_gram(J)
+        singular = row_gram(J, task.n_free)
         status = statuses(
             task,
             q_plain,
@@ -563,6 +564,7 @@ class InverseKinematics:
             `q_pref` and an even sample of the limits.
         plant : callable, optional
             The robot: maps a commanded q (n,) to the measured tip (3,) [m]; NumPy or torch as path.
+            Of a pose or axis its position is enough; the rotation in `x_measured` is then NaN.
         feedback : {"model", "measured"} or None, default="model"
             Source of the error: the model's tip (with a plant: the paper's feed-forward control),
             the measured tip, or none.

@@ -274,9 +274,9 @@ class Tracker(Portable):
             Velocity of the target [m/s], one for every row of the task; (next target - target) / dt
             for second order in dt. Default: at rest.
         x_measured : array-like of shape (3,), optional
-            Measured tip [m] for feedback. Without one (default), or where it is NaN, the offset
-            between robot and model stays as it is, or decays with `memory`; before the first
-            reading it is zero.
+            Measured tip [m] for feedback; of a pose or axis the position alone, (3,), is enough.
+            Without one (default), or where it is NaN, the offset between robot and model stays as
+            it is, or decays with `memory`; before the first reading it is zero.
         at : float, optional
             Time of the measured tip [s], on the clock of `time`: for a tip of a given age,
             ``at=tracker.time - age``. Default: `delay` before `time`.
@@ -332,8 +332,8 @@ class Tracker(Portable):
 
     def _look(self, name: str, value: Array) -> None:
         """Warn if the first target or tip after `reset` has another unit than the robot."""
-        points = self._settings.points(value, name, lead="")
-        if not torch.isfinite(points).all():
+        points = self._settings.readings(value, name, lead="")
+        if not torch.isfinite(self._settings.task.positions(points)).all():
             return
         self._unseen.discard(name)
         for message in self._settings.far_messages(points, name):
@@ -359,7 +359,7 @@ class Tracker(Portable):
             feed_forward = settings.dt * velocity[None]
         tip = None
         if x_measured is not None:
-            tip = settings.points(x_measured, "x_measured", like, lead="")[None]
+            tip = settings.readings(x_measured, "x_measured", like, lead="")[None]
         self._robot.advance(None, target[None], feed_forward, tip, age)
 
     def follow(
@@ -407,7 +407,7 @@ class Tracker(Portable):
             held = tick.step.held
             damped = tick.step.damped
         *states, J, held, damped = map(torch.cat, zip(*rows, strict=True))
-        return [*states, row_gram(J).sigma_min, held, damped]
+        return [*states, row_gram(J, task.n_free).sigma_min, held, damped]
 
     def _measured(self, plant: Plant, i: int) -> Tensor:
         """Return the plant's tip (1, ...), NaN if the plant raises.
@@ -417,7 +417,7 @@ class Tracker(Portable):
         """
         try:
             tip = plant(self.q)
-            return self._settings.points(tip, "tip", self._like, lead="")[None]
+            return self._settings.readings(tip, "tip", self._like, lead="")[None]
         except Exception as error:
             warnings.warn(
                 f"`plant` failed at point {i}: {error!r}; its tip is NaN.", stacklevel=7

@@ -32,7 +32,6 @@ from hybridkin._core.kernel_numbers import (
 from hybridkin._core.model import ForwardModel, as_forward_model
 from hybridkin._core.named_rows import without_warnings
 from hybridkin._core.plan import NoKernel, Plan
-from hybridkin._core.rotations import rotation
 from hybridkin._core.texts import c_comment, markdown
 from hybridkin._core.version import __version__
 
@@ -64,10 +63,6 @@ _STEP_PARTS = {
     "TICKS": "ticks.c",
     "STEP_README": "step.md",
 }
-_ABOUT_POSES = (
-    "desired pose now, a homogeneous (4, 4) matrix, row by row [m]; one that holds no rotation "
-    "counts as NaN;"
-)
 _ABOUT_SPACES = (
     " For the half-spaces of the tip it solves at most 11 times, usually once."
 )
@@ -89,13 +84,15 @@ Entries: TypeAlias = dict[str, object]  # what templates are filled with
 
 
 class _Task(Protocol):
-    has_rotation: bool
+    of_poses: bool
+    about_target: str
     shape: tuple[int, ...]
 
     @property
     def steered(self) -> tuple[ForwardModel, ...]: ...
     def evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]: ...
     def positions(self, x: Tensor) -> Tensor: ...
+    def moved(self, x: Tensor, motion: Tensor, turn: Tensor) -> Tensor: ...
 
 
 class _Settings(Protocol):
@@ -314,7 +311,7 @@ def _code(plan: Plan, controller: _Controller | None, dtype: str) -> Entries:
         task = controller.settings.task
         model = plan.entry(plan.root, 0)
         n_spaces = plan.entry(plan.root, 3)
-        poses = task.has_rotation
+        poses = task.of_poses
         step = _step_code(plan, task, n_spaces)
 
     # gcc warns about arrays of length 1 if it cannot see that loops over them run at all.
@@ -363,7 +360,7 @@ def _step_code(plan: Plan, task: _Task, n_spaces: int) -> Entries:
         "WIDTH": math.prod(task.shape),
         "NORMALS": plan.entry(plan.root, 2),
         "NEWTON": f"{10 * n**2 + (20 + 7 * m * m) * n:,}",
-        "ABOUT_TARGET": _ABOUT_POSES if task.has_rotation else "desired x now [m];",
+        "ABOUT_TARGET": task.about_target,
         "SPACES": _ABOUT_SPACES if n_spaces else "",
         "LEAD": n * plan.entry(plan.root, IK_STATE_ROWS),
         "SEEN": IK_DOUBTS + IK_AGREEING * m + IK_RING * (1 + math.prod(task.shape)),
@@ -563,14 +560,10 @@ def _doubles(rows: NDArray) -> Tensor:
 
 def _beside(task: _Task, x: Tensor, size: NDArray, rng: np.random.Generator) -> NDArray:
     """Return points or poses (N, steps, ...) beside those of a task, turned by up to 0.1 rad."""
-    beside = np.repeat(x.numpy()[:, None], _STEPS, axis=1)
-    change = rng.standard_normal((*beside.shape[:2], *size.shape)) * size
-    if not task.has_rotation:
-        return beside + change
-    beside[..., :3, 3] += change
-    turns = torch.from_numpy(0.1 * change / max(np.abs(change).max(), 1e-9))
-    beside[..., :3, :3] = rotation(turns)[0].numpy() @ beside[..., :3, :3]
-    return beside
+    rows = x[:, None].expand(-1, _STEPS, *x.shape[1:])
+    change = rng.standard_normal((*rows.shape[:2], *size.shape)) * size
+    turns = 0.1 * change / max(np.abs(change).max(), 1e-9)
+    return task.moved(rows, torch.from_numpy(change), torch.from_numpy(turns)).numpy()
 
 
 def _measured(source: str, texts: dict[str, str]) -> str:

@@ -24,7 +24,7 @@ from hybridkin import (
 from hybridkin._core.plan import NoKernel
 from hybridkin.hybrid._features import PoseFeatures, Readout
 from hybridkin.hybrid._module import HybridModule, InnerCorrection
-from hybridkin.ik.tasks import PointsTask, PoseTask, as_task
+from hybridkin.ik.tasks import AxisTask, PointsTask, PoseTask, as_task
 from hybridkin.native import export_c
 
 LOOP = Path(__file__).parents[2] / "examples" / "c" / "loop.c"
@@ -97,6 +97,7 @@ def test_the_code_of_a_correction_on_errors_of_the_structure(tmp_path, dtype):
 
 TASKS = {
     "pose": (lambda: PoseTask(trunk(), radian=0.1), {}),
+    "axis": (lambda: AxisTask(trunk(), [1.0, 0.0, 2.0], length=0.2), {}),
     "points": (lambda: PointsTask(trunk(), [0.5, 1.0]), {}),
     "half-spaces": (trunk, {"tip_limits": (np.eye(3), [0.03, 0.03, 0.29])}),
 }

@@ -19,7 +19,7 @@ from hybridkin import (
     robots,
 )
 from hybridkin.ik._compiled import core_of
-from hybridkin.ik.tasks import PointsTask, PoseTask, PositionTask
+from hybridkin.ik.tasks import AxisTask, PointsTask, PoseTask, PositionTask
 
 pytestmark = pytest.mark.needs_core
 
@@ -82,12 +82,16 @@ TASKS = {
     "pose of an arm": (lambda: PoseTask(arm()), -2.0, 2.0),
     "pose of a hybrid": (lambda: PoseTask(fitted_pose()), 0.15, 0.35),
     "pose of an adapted hybrid": (lambda: PoseTask(adapted_pose()), 0.15, 0.35),
+    "axis of arcs": (lambda: AxisTask(TURNED, [1.0, -2.0, 0.5], length=0.2), 0.15, 0.35),
+    "axis within a segment": (lambda: AxisTask(BHA.with_tip(2.5)), 0.15, 0.35),
+    "axis of an arm": (lambda: AxisTask(arm(), [1.0, 0.0, 0.0]), -2.0, 2.0),
+    "axis of an adapted hybrid": (lambda: AxisTask(adapted_pose()), 0.15, 0.35),
     "points": (lambda: PointsTask(BHA, [1.0, 1.5, 3.0], weights=[0.5, 0.1, 1.0]), 0.15, 0.35),
     "points of tendons": (lambda: PointsTask(ELASTIC, [2.0, 3.0]), -0.01, 0.01),
     "markers": (lambda: PositionTask(TURNED.with_markers(MARKERS), size=9), 0.15, 0.35),
     "markers of a hybrid": (lambda: PositionTask(hybrid_of_markers(), size=9), 0.15, 0.35),
 }
-FAST = ("pose of arcs", "pose of elastic tendons", "points", "pose of a hybrid")
+FAST = ("axis of arcs", "pose of arcs", "pose of elastic tendons", "points", "pose of a hybrid")
 NAMES = [name if name in FAST else pytest.param(name, marks=pytest.mark.slow) for name in TASKS]
 
 

@@ -16,9 +16,9 @@
 
 static HK_NOINLINE void ik_model(const ik_settings *ik, const real *q, real *x, real *J) {
     real tip[3], turn[9];
-    if (IK_IS_POSE(ik)) {
+    if (IK_IS_POSE(ik) || IK_IS_AXIS(ik)) {
         hk_pose(&ik->plan, ik->model, q, tip, turn, J, NULL, ik->work);
-        ik_pose_of(tip, turn, x);
+        ik_pose_of(ik, tip, turn, x);
     } else
         hk_model(&ik->plan, ik->model, q, x, J, NULL, ik->work);
 }

@@ -189,12 +189,18 @@ HK_INLINE void ik_eigen_solve(int m, const ik_eigen *e, const real *v, real damp
     }
 }
 
-/* The singular values of J from the eigenvalues of J J^T. */
-HK_INLINE void ik_eigen_ends(int m, const ik_eigen *e, real *low, real *high) {
+/* The singular values of J from the eigenvalues of J J^T, without the `n_free` smallest ones. */
+HK_INLINE void ik_eigen_ends(int m, int n_free, const ik_eigen *e, real *low, real *high) {
     real least = e->square[0], most = e->square[0];
     for (int i = 1; i < m; i++) {
         least = e->square[i] < least ? e->square[i] : least;
         most = e->square[i] > most ? e->square[i] : most;
+    }
+    for (int i = 0; n_free > 0 && i < m; i++) {
+        int smaller = 0;
+        for (int j = 0; j < m; j++)
+            smaller += e->square[j] < e->square[i] || (j < i && e->square[j] == e->square[i]);
+        if (smaller == n_free) least = e->square[i];
     }
     *low = HK_MATH(sqrt)(least < R(0.0) ? R(0.0) : least);
     *high = HK_MATH(sqrt)(most < R(0.0) ? R(0.0) : most);

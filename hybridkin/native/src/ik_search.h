@@ -226,10 +226,10 @@ static void ik_take(const ik_search_t *s, ik_row *r, const ik_point *now) {
 /* x (width) of one lane: a tip and its axes, or points. */
 static inline void ik_lane(const ik_settings *ik, int lane, const V *vx, const V *turn, real *x) {
     real tip[3], axes[9];
-    if (IK_IS_POSE(ik)) {
+    if (IK_IS_POSE(ik) || IK_IS_AXIS(ik)) {
         for (int j = 0; j < 3; j++) tip[j] = vx[j][lane];
         for (int j = 0; j < 9; j++) axes[j] = turn[j][lane];
-        ik_pose_of(tip, axes, x);
+        ik_pose_of(ik, tip, axes, x);
     } else
         for (int j = 0; j < ik->m; j++) x[j] = vx[j][lane];
 }
@@ -243,14 +243,14 @@ static void ik_look_at(const ik_settings *ik, int64_t rows, const real *q, real 
         const int count = (int)(rows - r < HK_LANES ? rows - r : HK_LANES);
         EACH(i)
             for (int j = 0; j < n; j++) vq[j][i] = q[(r + (i < count ? i : count - 1)) * n + j];
-        if (IK_IS_POSE(ik))
+        if (IK_IS_POSE(ik) || IK_IS_AXIS(ik))
             hkv_pose(&ik->plan, ik->model, vq, vx, turn, vJ, NULL, work);
         else
             hkv_model(&ik->plan, ik->model, vq, vx, vJ, NULL, work);
         for (int i = 0; i < count; i++, x += ik->width, J += m * n) {
             ik_lane(ik, i, vx, turn, x);
             for (int j = 0; j < m * n; j++) J[j] = vJ[j][i];
-            ik_scale_rows(ik, J);
+            ik_task_rows(ik, x, J);
         }
     }
 }
@@ -285,7 +285,7 @@ static void ik_search(ik_search_t *s, int64_t rows, const real *target, real *q,
                 for (int j = 0; j < n; j++) vq[j][i] = r->ask[j];
         }
         if (!busy) return;
-        if (IK_IS_POSE(&s->ik))
+        if (IK_IS_POSE(&s->ik) || IK_IS_AXIS(&s->ik))
             hkv_pose(&plan, s->ik.model, vq, vx, turn, vJ, &distance, work);
         else
             hkv_model(&plan, s->ik.model, vq, vx, vJ, &distance, work);
@@ -297,7 +297,7 @@ static void ik_search(ik_search_t *s, int64_t rows, const real *target, real *q,
             for (int j = 0; j < m * n; j++) now.J[j] = vJ[j][i];
             ik_lane(&s->ik, i, vx, turn, x);
             ik_difference(&s->ik, x, r->target, now.e);
-            ik_scale_rows(&s->ik, now.J);
+            ik_task_rows(&s->ik, x, now.J);
             ik_in_plane(&s->ik, m, now.J);
             now.error = ik_norm(m, now.e), now.distance = distance[i];
             ik_take(s, r, &now);

@@ -1,5 +1,5 @@
 /* One step of inverse kinematics, for a task of m rows: a position (3), several points, or a pose
-   (6). The damped inverse, a posture in its null space, and limits inside the step. One row at a
+   or a position with an axis (6). The damped inverse, a posture in its null space, and limits inside the step. One row at a
    time. */
 
 #include "hysteresis.h"
@@ -14,10 +14,12 @@ typedef struct {
     int model, n, m, width, flags; /* width: numbers of a target */
     int n_normals, n_spaces;       /* of the plane to keep to; half-spaces of the tip */
     int quick;                     /* estimates of singular values suffice */
+    int n_free;                    /* directions of the rows that no motion changes */
     const real *low, *high, *speed, *accel, *posture, *unit, *period, *pulls, *normals;
     const real *scale;             /* of every row of the task [m per unit] */
     const real *expected;          /* innovations of the rows; see feedback.h */
     real most, fraction;           /* the largest possible size of one, and how much is taken */
+    const real *axis;              /* (3) of the tip that is steered */
     const real *spaces, *offsets;  /* normals (m, n_spaces), and how far along them */
     hk_hysteresis hysteresis;
     real gain, beta, dt, damping;  /* gain < 0: 1 / dt; damping < 0: adaptive */
@@ -35,6 +37,7 @@ static inline real *ik_slot(const ik_settings *ik, int which) {
 }
 
 #define IK_IS_POSE(ik) (HK_POSES && (ik)->flags & IK_POSE)
+#define IK_IS_AXIS(ik) (HK_POSES && (ik)->flags & IK_AXIS)
 #define IK_IN_SPACES(ik) (HK_SPACES && (ik)->n_spaces > 0 && (ik)->flags & IK_LIMITED)
 
 enum { IK_WIDTH = HK_POSES && HK_MAX_R < 16 ? 16 : HK_MAX_R }; /* of a target at most */
@@ -51,7 +54,8 @@ static inline ik_settings ik_settings_of(const int32_t *code, const real *data, 
                                          real *work) {
     const int32_t *node = code + at, *more = node + HK_MORE;
     const int n = node[HK_N], m = node[HK_M], flags = more[1], n_normals = more[2];
-    const real *a = data + node[HK_DATA], *b = a + 6 * n, *c = b + 5 + 2 * m;
+    const real *a = data + node[HK_DATA], *b = a + 6 * n;
+    const real *c = b + 5 + 2 * m + (flags & IK_AXIS ? 3 : 0);
     const ik_settings ik = {
         .plan = {code, data, R(0.0)},
         .work = work + IK_SLOTS_WORK(n, m, n_normals),
@@ -61,6 +65,7 @@ static inline ik_settings ik_settings_of(const int32_t *code, const real *data, 
         .m = m,
         .width = HK_POSES && flags & IK_POSE ? IK_POSE_NUMBERS : m,
         .flags = flags,
+        .n_free = HK_POSES && flags & IK_AXIS ? 1 : 0,
         .n_normals = n_normals,
         .n_spaces = more[3],
         .low = a,
@@ -77,6 +82,7 @@ static inline ik_settings ik_settings_of(const int32_t *code, const real *data, 
         .expected = b + 4 + m,
         .most = b[4 + 2 * m],
         .fraction = b[0] < R(0.0) ? IK_FRACTION : R(1.0),
+        .axis = b + 5 + 2 * m,
         .period = c,
         .pulls = c + n,
         .normals = c + 2 * n,
@@ -114,6 +120,36 @@ static inline void ik_turn(const real *A, const real *B, real *e) {
     for (int i = 0; i < 3; i++) e[i] *= ratio;
 }
 
+/* c (3) = a x b. */
+static inline void ik_cross(const real *a, const real *b, real *c) {
+    for (int i = 0; i < 3; i++) {
+        const int j = (i + 1) % 3, k = (i + 2) % 3;
+        c[i] = a[j] * b[k] - a[k] * b[j];
+    }
+}
+
+/* e (3) = the rotation vector of least angle from a to b (3), of any length. Opposite ones turn about
+   the cross product of a and the first coordinate axis that is not along it. */
+static inline void ik_least_turn(const real *from, const real *to, real *e) {
+    const real from_size = ik_norm(3, from), to_size = ik_norm(3, to);
+    real a[3], b[3], angle, cosine = R(0.0);
+    for (int i = 0; i < 3; i++) {
+        a[i] = from[i] / from_size, b[i] = to[i] / to_size;
+        cosine += a[i] * b[i];
+    }
+    ik_cross(a, b, e);
+    real sine = ik_norm(3, e);
+    angle = HK_MATH(atan2)(sine, cosine);
+    if (cosine < R(0.0) && sine * sine <= HK_EPS) {
+        const int beside = ik_abs(a[0]) < HK_ASIDE ? 0 : ik_abs(a[1]) < HK_ASIDE ? 1 : 2;
+        const real unit[3] = {(real)(beside == 0), (real)(beside == 1), (real)(beside == 2)};
+        ik_cross(a, unit, e);
+        sine = ik_norm(3, e), angle = IK_HALF_TURN;
+    }
+    const real ratio = sine > R(0.0) ? angle / sine : R(1.0);
+    for (int i = 0; i < 3; i++) e[i] *= ratio;
+}
+
 /* The error e (m) of x to a target, both of `width` numbers. */
 static inline void ik_difference(const ik_settings *ik, const real *x, const real *target,
                                  real *e) {
@@ -121,22 +157,37 @@ static inline void ik_difference(const ik_settings *ik, const real *x, const rea
         for (int i = 0; i < 3; i++) e[i] = target[4 * i + 3] - x[4 * i + 3];
         ik_turn(target, x, e + 3);
         for (int i = 0; i < 6; i++) e[i] *= ik->scale[i];
+    } else if (IK_IS_AXIS(ik)) {
+        for (int i = 0; i < 3; i++) e[i] = target[i] - x[i];
+        ik_least_turn(x + 3, target + 3, e + 3);
+        for (int i = 0; i < 6; i++) e[i] *= ik->scale[i];
     } else
         for (int i = 0; i < ik->m; i++) e[i] = ik->scale[i] * (target[i] - x[i]);
 }
 
 #include "feedback.h"
 
-/* x (16) of a pose, from the tip and its axes (3, 3). */
-static inline void ik_pose_of(const real *tip, const real *turn, real *x) {
+/* x (16) of a pose, or (6) with one axis, from the tip and its axes (3, 3). */
+static inline void ik_pose_of(const ik_settings *ik, const real *tip, const real *turn, real *x) {
+    for (int i = 0; IK_IS_AXIS(ik) && i < 3; i++) {
+        x[i] = tip[i], x[3 + i] = R(0.0);
+        for (int j = 0; j < 3; j++) x[3 + i] += turn[3 * i + j] * ik->axis[j];
+    }
+    if (IK_IS_AXIS(ik)) return;
     for (int i = 0; i < 16; i++) {
         const int row = i / 4, column = i % 4;
         x[i] = row == 3 ? (real)(column == 3) : column == 3 ? tip[row] : turn[3 * row + column];
     }
 }
 
-/* Take the units of the task into J (m, n). */
-static inline void ik_scale_rows(const ik_settings *ik, real *J) {
+/* Make J (m, n) of the model at x that of the task: without turns about an axis, in its units. */
+static inline void ik_task_rows(const ik_settings *ik, const real *x, real *J) {
+    const int n = ik->n;
+    for (int j = 0; IK_IS_AXIS(ik) && j < n; j++) {
+        real *turn = J + 3 * n + j, along = R(0.0);
+        for (int i = 0; i < 3; i++) along += x[3 + i] * turn[n * i];
+        for (int i = 0; i < 3; i++) turn[n * i] -= x[3 + i] * along;
+    }
     for (int i = 0; i < ik->m; i++)
         for (int j = 0; ik->scale[i] != R(1.0) && j < ik->n; j++) J[ik->n * i + j] *= ik->scale[i];
 }
@@ -190,7 +241,7 @@ HK_INLINE void ik_limited_step_of(int m, int n, const ik_settings *ik, const rea
                                   int slides, const real *trust, ik_step_t *s) {
     real ends[2 * HK_MAX_N], z[HK_MAX_N], mu[IK_ROWS], g[IK_PAIRS];
     real low = R(0.0), high, damping_sq, *dq = s->dq;
-    const int exact = m != 3 && !trust && !ik->quick;
+    const int exact = m != 3 && !trust && (!ik->quick || ik->n_free > 0);
     const real *lower = s->lower, *upper = s->upper;
     for (int j = 0; j < n; j++) z[j] = slides ? s->posture[j] : R(0.0);
     if (ik->flags & IK_WEIGHTS) {
@@ -207,7 +258,7 @@ HK_INLINE void ik_limited_step_of(int m, int n, const ik_settings *ik, const rea
     if (exact) {
         ik_eigen e;
         ik_eigen_of(m, g, &e);
-        ik_eigen_ends(m, &e, &low, &high);
+        ik_eigen_ends(m, ik->n_free, &e, &low, &high);
         damping_sq = hk_larger(ik_damping_sq(ik, low, high), ik->least);
         ik_eigen_solve(m, &e, v, damping_sq, mu);
         if (slides) ik_eigen_projection(m, n, J, &e, z);
@@ -480,7 +531,7 @@ static void ik_model(const ik_settings *ik, const real *q, real *x, real *J);
 /* x (width) at q, and the motions J (m, n) of the task that keep to the plane. */
 static inline void ik_look(const ik_settings *ik, const real *q, real *x, real *J) {
     ik_model(ik, q, x, J);
-    ik_scale_rows(ik, J);
+    ik_task_rows(ik, x, J);
     ik_in_plane(ik, ik->m, J);
 }
 
@@ -810,6 +861,27 @@ static inline int ik_is_rotation(const real *T) {
     return off <= R(1e-3) && det > R(0.0);
 }
 
+/* Whether x holds a rotation or a direction, as the task needs it, or what is not finite. */
+static inline int ik_is_valid(const ik_settings *ik, const real *x) {
+    if (IK_IS_AXIS(ik)) return !(ik_norm(3, x + 3) <= IK_NO_AXIS);
+    return !IK_IS_POSE(ik) || ik_is_rotation(x);
+}
+
+/* Take what a measured tip does not tell, its rotation or axis, from x; it has a position. */
+static inline void ik_complete(const ik_settings *ik, const real *x, real *tip) {
+    const int poses = IK_IS_POSE(ik);
+    int unknown = poses || IK_IS_AXIS(ik);
+    for (int i = 0; i < 3 && unknown; i++) {
+        unknown &= ik_finite(1, tip + (poses ? 4 * i + 3 : i));
+        for (int j = 0; j < (poses ? 3 : 1); j++) {
+            const real turn = tip[poses ? 4 * i + j : 3 + i];
+            unknown &= turn != turn;
+        }
+    }
+    for (int i = 0; i < ik->width && unknown; i++)
+        if (poses ? i % 4 < 3 : i > 2) tip[i] = x[i];
+}
+
 /* y (n) = what actuators would do after a command q, by the state that is tried. */
 static inline void ik_try(const ik_settings *ik, const ik_state *now, real seconds, const real *q,
                           real *y) {
@@ -964,7 +1036,8 @@ static inline void ik_remember(const ik_settings *ik, const real *from, const re
 }
 
 /* One period of a robot that follows targets, with what readings have `seen` (unused by a step alone,
-   which must see). Returns 0, and does nothing, if a pose in the state holds no rotation. */
+   which must see). Returns 0, and does nothing, if a target or a measured tip in the state holds no
+   rotation or direction. */
 static inline int ik_tick(const ik_settings *ik, real *state, real *seen) {
     const int n = ik->n, m = ik->m, mode = (int)state[IK_MODE];
     const ik_state now = ik_state_of(ik, state);
@@ -976,8 +1049,7 @@ static inline int ik_tick(const ik_settings *ik, real *state, real *seen) {
     real x_before[IK_WIDTH], before[IK_ROWS];
     ik_settings damped;
     ik_step_t step;
-    if (IK_IS_POSE(ik) && ((mode & IK_HAS_TARGET && !ik_is_rotation(now.target)) ||
-                           (tip && !ik_is_rotation(tip))))
+    if ((mode & IK_HAS_TARGET && !ik_is_valid(ik, now.target)) || (tip && !ik_is_valid(ik, tip)))
         return 0;
     for (int i = 0; i < ik->width; i++) x_before[i] = now.x[i];
     ik_look(ik, at, now.x, now.J);
@@ -990,6 +1062,7 @@ static inline int ik_tick(const ik_settings *ik, real *state, real *seen) {
         ik_difference(ik, now.x, now.target, used);
         ik_difference(ik, x_before, now.target, before);
         for (int i = 0; i < m; i++) before[i] -= used[i];
+        if (alone && tip) ik_complete(ik, now.x, now.tip);
         if (alone) ik_difference(ik, tip ? tip : now.x, now.target, now.error);
         for (int i = 0; i < m; i++) {
             if (alone) now.offset[i] = used[i] - now.error[i];

@@ -5,7 +5,7 @@ static void ik_model(const ik_settings *ik, const real *q, real *x, real *J) {
 #if HK_POSES
     real tip[3], turn[9];
     hk_pose(&plan, @MODEL@, q, tip, turn, J, NULL, ik->work);
-    ik_pose_of(tip, turn, x);
+    ik_pose_of(ik, tip, turn, x);
 #else
     hk_model(&plan, @MODEL@, q, x, J, NULL, ik->work);
 #endif
@@ -62,7 +62,7 @@ static void step_within(const ik_settings *ik, @NAME@_state *state, const @REAL@
     all[IK_PERIOD] = ik->dt;
     all[IK_MEMORY] = state->memory;
     state->seen[IK_AGE] = state->delay;
-    if (!ik_tick(ik, all, state->seen)) { /* no rotation: not known */
+    if (!ik_tick(ik, all, state->seen)) { /* no rotation or direction: not known */
         for (int i = 0; i < @WIDTH@; i++) now.target[i] = now.tip[i] = (real)NAN;
         ik_tick(ik, all, state->seen);
     }
