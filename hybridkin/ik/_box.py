@@ -49,14 +49,14 @@ class BoxProblem(NamedTuple):
         return self.z + apply_columns(self.J, mu)
 
 
-def calmed(z: Tensor, task: Tensor, calm: Tensor | float) -> Tensor:
-    """Return steps z (N, n), where `calm` (N,) is positive at most half as long as those of a task.
+def calmed(z: Tensor, task: Tensor, calm: Tensor) -> Tensor:
+    """Return steps z (N, n), in the rows `calm` (N,) at most half as long as those of a task.
 
     Else the way to a posture would go on shaking a robot that rests where its target is out of
     reach.
     """
     share = task.norm(dim=-1) / (2.0 * z.norm(dim=-1))
-    share = torch.where(torch.as_tensor(calm) > 0.0, share.clamp_max(1.0), 1.0)
+    share = torch.where(calm, share.clamp_max(1.0), 1.0)
     return share.nan_to_num(1.0)[..., None] * z
 
 
@@ -158,8 +158,8 @@ def strict_box_step(problem: BoxProblem, calm: Tensor) -> Tensor:
     problem : BoxProblem
         With lambda^2 >= 0. Below 1e-6 of sigma_max^2 (float64) the box-limited step is solved with
         this minimum, and proximal rounds on the multipliers remove its task error.
-    calm : Tensor of shape (N,)
-        Where it is positive, z is at most half as long as the step of the task.
+    calm : bool Tensor of shape (N,)
+        Where z is at most half as long as the step of the task.
 
     Returns
     -------

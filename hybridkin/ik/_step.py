@@ -223,7 +223,8 @@ def limited_step(
         if posture is not None:
             z = null_projection(J, gram, posture)
     dq = apply_columns(J, mu)
-    z = calmed(z, dq, least)
+    calm = least + torch.zeros_like(damping_sq) > 0.0
+    z = calmed(z, dq, calm)
     dq = dq + z
 
     # Rows within all limits keep this step; eq. (19) is solved for the others. Weights turn J out
@@ -237,7 +238,6 @@ def limited_step(
             lower = box.lower.expand_as(dq)
             upper = box.upper.expand_as(dq)
             problem = BoxProblem(rows, motion, z, damping_sq, lower, upper)
-            calm = least + torch.zeros_like(damping_sq)
             clipped[over] = strict_box_step(problem.take(over), calm[over])
         dq = clipped
     held = box.held(dq)

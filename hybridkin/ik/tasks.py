@@ -445,7 +445,8 @@ class AxisTask(_OfPoses):
     model : PoseModel
         A chain, or a hybrid fitted with ``output="pose"``.
     axis : array-like of shape (3,), default=(0, 0, 1)
-        The axis in the frame of the tip; of chains of arcs z is along the backbone.
+        The axis in the frame of the tip, of any length [1]; of chains of arcs z is along the
+        backbone.
     length : float, default=0.1
         Weight of the direction: metres per radian. As if a second point, so far along the axis,
         had a target, too.

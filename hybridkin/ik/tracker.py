@@ -392,7 +392,10 @@ class Tracker(Portable):
             if plant is not None:
                 tip = self._measured(plant, i)
             reading = tip if feedback == "measured" else None
-            command = torch.as_tensor(self._robot.command())[None]  # a copy
+            here = self._like.device
+            command = torch.as_tensor(self._robot.command(), device=here)[
+                None
+            ]  # a copy
             if not finite[i] or feedback is None:
                 target = None
             tick = self._robot.advance(
