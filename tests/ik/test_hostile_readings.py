@@ -93,6 +93,7 @@ class State(ctypes.Structure):
         ("held", 9 * ctypes.c_ubyte),
         ("stopped", ctypes.c_ubyte),
         ("offset", 3 * ctypes.c_double),
+        ("rest", 9 * ctypes.c_double),
         ("memory", ctypes.c_double),
         ("delay", ctypes.c_double),
         ("rejected", ctypes.c_ubyte),

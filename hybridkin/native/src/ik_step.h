@@ -150,19 +150,40 @@ static inline void ik_least_turn(const real *from, const real *to, real *e) {
     for (int i = 0; i < 3; i++) e[i] *= ratio;
 }
 
-/* The error e (m) of x to a target, both of `width` numbers. */
-static inline void ik_difference(const ik_settings *ik, const real *x, const real *target,
-                                 real *e) {
+/* The error e (6) of a pose or an axis to a target. */
+static HK_NOINLINE void ik_turned(const ik_settings *ik, const real *x, const real *target,
+                                  real *e) {
     if (IK_IS_POSE(ik)) {
         for (int i = 0; i < 3; i++) e[i] = target[4 * i + 3] - x[4 * i + 3];
         ik_turn(target, x, e + 3);
-        for (int i = 0; i < 6; i++) e[i] *= ik->scale[i];
-    } else if (IK_IS_AXIS(ik)) {
+    } else {
         for (int i = 0; i < 3; i++) e[i] = target[i] - x[i];
         ik_least_turn(x + 3, target + 3, e + 3);
-        for (int i = 0; i < 6; i++) e[i] *= ik->scale[i];
-    } else
+    }
+    for (int i = 0; i < 6; i++) e[i] *= ik->scale[i];
+}
+
+/* The error e (m) of x to a target, both of `width` numbers. */
+static inline void ik_difference(const ik_settings *ik, const real *x, const real *target,
+                                 real *e) {
+    if (IK_IS_POSE(ik) || IK_IS_AXIS(ik))
+        ik_turned(ik, x, target, e);
+    else
         for (int i = 0; i < ik->m; i++) e[i] = ik->scale[i] * (target[i] - x[i]);
+}
+
+/* The motion (m) of the task to first order for a step dq (n). */
+static HK_NOINLINE void ik_motion(const ik_settings *ik, const real *J, const real *dq,
+                                  real *motion) {
+    IK_OF(ik->m, ik_rows_of, ik->n, J, dq, motion);
+}
+
+/* Shorten a posture step z to half of the step J^T mu of the task, in its null space. */
+static HK_NOINLINE void ik_calm_posture(int m, int n, const real *J, const real *mu, real *z) {
+    real task[HK_MAX_N] = {R(0.0)};
+    for (int i = 0; i < m; i++)
+        for (int j = 0; j < n; j++) task[j] += J[n * i + j] * mu[i];
+    ik_calm(n, task, z);
 }
 
 #include "feedback.h"
@@ -277,11 +298,7 @@ HK_INLINE void ik_limited_step_of(int m, int n, const ik_settings *ik, const rea
         ik_solve(m, &f, v, mu);
         if (slides) ik_null_projection(m, n, J, g, z);
     }
-    if (ik->least > R(0.0)) {
-        real none[HK_MAX_N] = {R(0.0)};
-        ik_columns_of(m, n, J, mu, none, dq);
-        ik_calm(n, dq, z);
-    }
+    if (ik->least > R(0.0)) ik_calm_posture(m, n, J, mu, z);
     ik_columns_of(m, n, J, mu, z, dq);
     if (ik->flags & IK_LIMITED) {
         int over =
@@ -436,7 +453,7 @@ static inline int ik_leaves(const ik_settings *ik, const real *J, const real *dq
                             const real *margin, real *over) {
     real moved[IK_ROWS];
     int any = 0;
-    IK_OF(ik->m, ik_rows_of, ik->n, J, dq, moved);
+    ik_motion(ik, J, dq, moved);
     ik_along(ik, moved, over);
     for (int i = 0; i < ik->n_spaces; i++) {
         over[i] -= margin[i];
@@ -468,7 +485,7 @@ static HK_NOINLINE int ik_project(const ik_settings *ik, const real *J, const re
         /* A bit farther in, because a step in a box is right to rounding only. */
         for (int i = 0; i < ik->n_spaces; i++) over[i] = -over[i] - R(256.0) * HK_EPS;
         ik_way_in(ik, over, wanted);
-        IK_OF(ik->m, ik_rows_of, ik->n, J, s->dq, moved);
+        ik_motion(ik, J, s->dq, moved);
         for (int r = 0; r < ik->m; r++) wanted[r] = moved[r] + IK_EXCESS * wanted[r];
         ik_limited_step(ik, J, wanted, slides, NULL, s);
         out = ik_leaves(ik, J, s->dq, margin, over);
@@ -697,14 +714,14 @@ static HK_NOINLINE void ik_control(const ik_settings *ik, const real *q, const r
         } else {
             ik_bound(ik, q, seconds, last, ends, s);
             ik_limited_step(ik, J, v, slides, NULL, s);
-            IK_OF(m, ik_rows_of, n, J, s->dq, s->promised);
+            ik_motion(ik, J, s->dq, s->promised);
             const real damping_sq = s->damping * s->damping;
             const int lost = !(s->sigma_min > R(0.0)) || damping_sq > R(1.001) * ik->least;
             if (lost && !(ik->flags & IK_PULLS) && sizes[0] > R(0.0) &&
                 ik_norm(m, s->promised) <= IK_STUCK * ik_norm(m, v))
                 ik_escape(ik, q, J, e, s);
         }
-        IK_OF(m, ik_rows_of, n, J, s->dq, s->promised);
+        ik_motion(ik, J, s->dq, s->promised);
         if (ik->flags & IK_PULLS && ik_finite(n, s->dq)) ik_arrive(ik, q, x, J, v, s);
         if (ik_finite(n, s->dq)) return; /* else v is too large to compute with */
     }
@@ -882,7 +899,7 @@ static HK_NOINLINE void ik_lead(const ik_settings *ik, const ik_state *now, cons
     }
     hk_hysteresis_apply(&ik->hysteresis, seconds, now->lead);
     for (int j = 0; j < n; j++) missed[j] = y[j] - missed[j];
-    IK_OF(ik->m, ik_rows_of, n, now->J, missed, moved);
+    ik_motion(ik, now->J, missed, moved);
     for (int i = 0; i < ik->m; i++) s->promised[i] += moved[i];
 }
 

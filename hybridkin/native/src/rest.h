@@ -13,14 +13,14 @@ static inline real ik_span(const ik_settings *ik, int j) {
 
 /* Take out of a direction u (n) what moves the tip, where it can move well, and what the plane forbids,
    or a sign that is not open; make it a unit vector. */
-static inline void ik_allow(const ik_settings *ik, const real *J, const ik_factors *f,
+static HK_NOINLINE void ik_allow(const ik_settings *ik, const real *J, const ik_factors *f,
                             const unsigned char *up, const unsigned char *down, real *u) {
     const int n = ik->n, m = ik->m;
     real moved[IK_ROWS] = {R(0.0)}, mu[IK_ROWS];
-    IK_OF(m, ik_rows_of, n, J, u, moved);
+    ik_motion(ik, J, u, moved);
     ik_solve(m, f, moved, mu);
     for (int i = 0; i < m; i++) mu[i] = -mu[i];
-    IK_OF(m, ik_columns_of, n, J, mu, u, u);
+    ik_columns_of(m, n, J, mu, u, u);
     ik_in_plane(ik, 1, u);
     for (int j = 0; j < n; j++)
         if (u[j] > R(0.0) ? !up[j] : !down[j]) u[j] = R(0.0);
@@ -80,7 +80,7 @@ static HK_NOINLINE void ik_escape(const ik_settings *ik, const real *q, const re
         ik_allow(ik, J, &f, up, down, u);
     }
     real curved = R(0.0), length = R(INFINITY);
-    IK_OF(m, ik_rows_of, n, J, u, moved);
+    ik_motion(ik, J, u, moved);
     for (int i = 0; i < m; i++) curved -= moved[i] * moved[i];
     for (int j = 0; j < n; j++)
         for (int l = 0; l < n; l++) curved += u[j] * bent[n * j + l] * u[l];
