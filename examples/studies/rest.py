@@ -40,10 +40,20 @@ from hybridkin.ik.tasks import PointsTask, PoseTask
 TICKS, LAST = 1500, 300
 BEYOND = {"2 mm": 0.002, "20 mm": 0.02, "far": np.inf}  # [m]
 AT_REST, NEAR = 1e-4, 1.05
-SPEEDS = {"none": {}, "dq_max": {"dq_max": 0.5}, "ddq_max": {"dq_max": 0.5, "ddq_max": 2.0}}
+SPEEDS = {
+    "none": {},
+    "dq_max": {"dq_max": 0.5},
+    "ddq_max": {"dq_max": 0.5, "ddq_max": 2.0},
+}
 HEADER = ("robot", "limit", "beyond", "targets", "at rest", "largest late step")
 HEADER += ("within 5 % of the local minimum", "within 5 % of solve", "backend")
-SINGULAR = ("robot", "singular start", "reachable targets", "reached", "moved where out of reach")
+SINGULAR = (
+    "robot",
+    "singular start",
+    "reachable targets",
+    "reached",
+    "moved where out of reach",
+)
 
 
 class Kind(NamedTuple):
@@ -89,7 +99,9 @@ def kinds() -> Iterator[Kind]:
     arm = seven_joints()
     yield Kind("seven joints", RigidChain.from_urdf(arm.urdf(), "tip"), *arm.limits)
     yield Kind("trunk, poses", PoseTask(trunk), 0.1, 0.4)
-    yield Kind("tendon segments, two points", PointsTask(tendons[2], [1.0, 2.0]), -0.02, 0.02)
+    yield Kind(
+        "tendon segments, two points", PointsTask(tendons[2], [1.0, 2.0]), -0.02, 0.02
+    )
 
 
 def seven_joints() -> Arm:
@@ -121,7 +133,9 @@ def targets(kind: Kind, n: int, beyond: float) -> tuple[NDArray, NDArray]:
     return q[::-1][out], nearest[out]
 
 
-def late_steps(follow: Callable[[NDArray], NDArray], q: NDArray, target: NDArray) -> tuple:
+def late_steps(
+    follow: Callable[[NDArray], NDArray], q: NDArray, target: NDArray
+) -> tuple:
     """Return where a tracker ends, and its largest late step of every actuator."""
     late = np.zeros_like(q)
     for k in range(TICKS):
@@ -150,7 +164,14 @@ def rest_line(kind: Kind, speed: str, beyond: str, n: int) -> list[Any]:
     shares = [np.mean(np.array(late) < AT_REST), max(late)]
     shares += [np.mean(error <= NEAR * local), np.mean(error <= NEAR * best)]
     backend = tracker.backend if tracker else ""
-    return [kind.name, speed, beyond, len(goals), *(f"{x:.3g}" for x in shares), backend]
+    return [
+        kind.name,
+        speed,
+        beyond,
+        len(goals),
+        *(f"{x:.3g}" for x in shares),
+        backend,
+    ]
 
 
 def singular_line(kind: Kind, n: int) -> list[Any]:
@@ -172,13 +193,21 @@ def singular_line(kind: Kind, n: int) -> list[Any]:
         end = tracker.step(tip - 10.0 * inwards)
     moved = np.abs(ik.step(end, tip).x - tip).max()
     name = np.array2string(q, precision=2)
-    return [kind.name, name, int(reachable.sum()), int(reached), f"{1e3 * moved:.3g} mm"]
+    return [
+        kind.name,
+        name,
+        int(reachable.sum()),
+        int(reached),
+        f"{1e3 * moved:.3g} mm",
+    ]
 
 
 def mink_follower(arm: Arm, q: NDArray) -> Callable[[NDArray], NDArray]:
     """Return mink's tracker with limits of q, whole steps."""
     mink, mujoco = import_module("mink"), import_module("mujoco")
-    header = '="arm"><mujoco><compiler fusestatic="false" discardvisual="false"/></mujoco>'
+    header = (
+        '="arm"><mujoco><compiler fusestatic="false" discardvisual="false"/></mujoco>'
+    )
     model = mujoco.MjSpec.from_string(arm.urdf().replace('="arm">', header)).compile()
     configuration = mink.Configuration(model)
     configuration.update(q)
@@ -187,7 +216,9 @@ def mink_follower(arm: Arm, q: NDArray) -> Callable[[NDArray], NDArray]:
 
     def follow(target: NDArray) -> NDArray:
         task.set_target(mink.SE3.from_translation(target))
-        speed = mink.solve_ik(configuration, [task], 1.0, "daqp", damping=1e-9, limits=limits)
+        speed = mink.solve_ik(
+            configuration, [task], 1.0, "daqp", damping=1e-9, limits=limits
+        )
         configuration.integrate_inplace(speed, 1.0)
         return configuration.q.copy()
 
@@ -204,7 +235,12 @@ def pink_follower(arm: Arm, q: NDArray) -> Callable[[NDArray], NDArray]:
 
     def follow(target: NDArray) -> NDArray:
         task.set_target(pinocchio.SE3(np.eye(3), target))
-        options = {"solver": "daqp", "damping": 1e-9, "limits": limits, "safety_break": False}
+        options = {
+            "solver": "daqp",
+            "damping": 1e-9,
+            "limits": limits,
+            "safety_break": False,
+        }
         speed = pink.solve_ik(configuration, [task], 1.0, **options)
         configuration.integrate_inplace(speed, 1.0)
         return configuration.q.copy()
@@ -237,7 +273,14 @@ def peer_lines(n: int) -> Iterator[list[Any]]:
             best = np.minimum(free.solve(goals).error, local)
             shares = [np.mean(np.array(late) < AT_REST), max(late)]
             shares += [np.mean(error <= NEAR * local), np.mean(error <= NEAR * best)]
-            yield [kind.name, "none", beyond, len(goals), *(f"{x:.3g}" for x in shares), program]
+            yield [
+                kind.name,
+                "none",
+                beyond,
+                len(goals),
+                *(f"{x:.3g}" for x in shares),
+                program,
+            ]
 
 
 def main() -> None:
