@@ -146,6 +146,19 @@ def late_steps(
     return q, late
 
 
+def shares_at_rest(
+    kind: Kind, ends: NDArray, goals: NDArray, late: NDArray
+) -> list[str]:
+    """Return the share at rest, the largest late step, and the shares near both minima."""
+    free = kind.ik()
+    error = free.step(ends, goals).error
+    local = free.solve(goals, ends, restarts=0).error
+    best = np.minimum(free.solve(goals).error, local)
+    shares = [np.mean(late < AT_REST), late.max()]
+    shares += [np.mean(error <= NEAR * local), np.mean(error <= NEAR * best)]
+    return [f"{share:.3g}" for share in shares]
+
+
 def rest_line(kind: Kind, speed: str, beyond: str, n: int) -> list[Any]:
     """Return the line of `HEADER` of a robot with limits of motion, for targets beyond reach."""
     span = np.subtract(kind.high, kind.low)
@@ -157,21 +170,9 @@ def rest_line(kind: Kind, speed: str, beyond: str, n: int) -> list[Any]:
         end, step = late_steps(tracker.step, q, goal)
         ends.append(end)
         late.append((step / span).max())
-    free = kind.ik()
-    error = free.step(np.array(ends), goals).error
-    local = free.solve(goals, np.array(ends), restarts=0).error
-    best = np.minimum(free.solve(goals).error, local)
-    shares = [np.mean(np.array(late) < AT_REST), max(late)]
-    shares += [np.mean(error <= NEAR * local), np.mean(error <= NEAR * best)]
+    shares = shares_at_rest(kind, np.array(ends), goals, np.array(late))
     backend = tracker.backend if tracker else ""
-    return [
-        kind.name,
-        speed,
-        beyond,
-        len(goals),
-        *(f"{x:.3g}" for x in shares),
-        backend,
-    ]
+    return [kind.name, speed, beyond, len(goals), *shares, backend]
 
 
 def singular_line(kind: Kind, n: int) -> list[Any]:
@@ -267,20 +268,8 @@ def peer_lines(n: int) -> Iterator[list[Any]]:
                 end, step = late_steps(follower(arm, q), q, goal)
                 ends.append(np.clip(end, low, high))
                 late.append((step / (high - low)).max())
-            free = kind.ik()
-            error = free.step(np.array(ends), goals).error
-            local = free.solve(goals, np.array(ends), restarts=0).error
-            best = np.minimum(free.solve(goals).error, local)
-            shares = [np.mean(np.array(late) < AT_REST), max(late)]
-            shares += [np.mean(error <= NEAR * local), np.mean(error <= NEAR * best)]
-            yield [
-                kind.name,
-                "none",
-                beyond,
-                len(goals),
-                *(f"{x:.3g}" for x in shares),
-                program,
-            ]
+            shares = shares_at_rest(kind, np.array(ends), goals, np.array(late))
+            yield [kind.name, "none", beyond, len(goals), *shares, program]
 
 
 def main() -> None:

@@ -82,8 +82,8 @@ def way_out(
 
     curved = (u * apply_rows(bent, u)).sum(-1) - apply_rows(J, u).square().sum(-1)
     leads = (curved > IK_BENDS * largest) & (curved > IK_BENDS_MOST * seen)
-    room = torch.where(u > 0.0, bounds.upper - dq, dq - bounds.lower)
-    most = (torch.minimum(room, IK_WAY_OUT * spans) / u.abs()).nan_to_num(math.inf)
+    left = torch.where(u > 0.0, bounds.upper - dq, dq - bounds.lower)
+    most = (torch.minimum(left, IK_WAY_OUT * spans) / u.abs()).nan_to_num(math.inf)
     most = most.amin(-1)
     length = torch.minimum(e.norm(dim=-1) * (2.0 / curved).sqrt(), most)
     length = torch.where(leads, length, 0.0).nan_to_num(0.0, math.inf)

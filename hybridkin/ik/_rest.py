@@ -80,7 +80,8 @@ class Rest(NamedTuple):
         promised = start - left
         bend = (end - left) / self.way_sq
         missing = promised - fall
-        tells = promised.abs().maximum(fall.abs()) > IK_NO_FALL * start
+        none = max(IK_NO_FALL, 32.0 * torch.finfo(e.dtype).eps)
+        tells = promised.abs().maximum(fall.abs()) > none * start
         tells &= self.share > IK_NO_WAY
         tells &= _squared(before - self.error) <= IK_JUMP**2 * start
         weak = tells & (missing > 0.5 * promised.abs()) & (bend > IK_CURVED * largest)

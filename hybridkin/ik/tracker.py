@@ -319,9 +319,8 @@ class Tracker(Portable):
         """Return the age of a reading [s]."""
         at = number(at, "at")
         oldest = self._time - MOST_PERIODS * self._settings.dt
-        oldest = (
-            oldest if oldest > 0.0 else -math.inf
-        )  # before the start it stood still
+        if oldest <= 0.0:
+            oldest = -math.inf  # before the start it stood still
         close = IK_ON_TIME * self._settings.dt
         require(
             oldest - close <= at <= self._time + close,
@@ -392,10 +391,8 @@ class Tracker(Portable):
             if plant is not None:
                 tip = self._measured(plant, i)
             reading = tip if feedback == "measured" else None
-            here = self._like.device
-            command = torch.as_tensor(self._robot.command(), device=here)[
-                None
-            ]  # a copy
+            copied = self._robot.command()
+            command = torch.as_tensor(copied, device=self._like.device)[None]
             if not finite[i] or feedback is None:
                 target = None
             tick = self._robot.advance(

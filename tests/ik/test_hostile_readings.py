@@ -97,7 +97,7 @@ class State(ctypes.Structure):
         ("memory", ctypes.c_double),
         ("delay", ctypes.c_double),
         ("rejected", ctypes.c_ubyte),
-        ("seen", 400 * ctypes.c_double),  # room enough
+        ("seen", 400 * ctypes.c_double),  # at least as many
     ]
 
 

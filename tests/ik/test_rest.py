@@ -110,6 +110,17 @@ def test_out_of_reach_the_core_commands_what_torch_does(name, speed):
             np.testing.assert_allclose(core.step(x), expected, rtol=0, atol=min(close, 1e-6))
 
 
+@pytest.mark.slow
+def test_it_rests_in_single_precision():
+    ik = ik_of("tendons")
+    (q,), (x,) = beyond("tendons", 1, 0.02)
+    tracker = ik.tracker(torch.from_numpy(q.copy()).float())
+    steps = [tracker.step(torch.from_numpy(x).float()).numpy() for _ in range(250)]
+    assert np.abs(np.diff(steps[-50:], axis=0)).max() < 1e-4 * 0.04
+    nearest = ik.solve(x, steps[-1].astype(float), restarts=0)
+    assert tracker.error == pytest.approx(float(nearest.error), rel=1e-3)
+
+
 @pytest.mark.needs_core
 def test_hysteresis_rests_too():
     from operators import with_hysteresis

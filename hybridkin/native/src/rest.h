@@ -87,8 +87,8 @@ static HK_NOINLINE void ik_escape(const ik_settings *ik, const real *q, const re
     if (!(curved > IK_BENDS * largest && curved > IK_BENDS_MOST * seen)) return;
     /* As far as this curvature takes back the error, within limits. */
     for (int j = 0; j < n; j++) {
-        const real room = u[j] > R(0.0) ? s->upper[j] - s->dq[j] : s->dq[j] - s->lower[j];
-        const real way = IK_WAY_OUT * spans[j], most = (room < way ? room : way) / ik_abs(u[j]);
+        const real left = u[j] > R(0.0) ? s->upper[j] - s->dq[j] : s->dq[j] - s->lower[j];
+        const real way = IK_WAY_OUT * spans[j], most = (left < way ? left : way) / ik_abs(u[j]);
         length = most < length ? most : length;
     }
     const real whole = ik_norm(m, e) * HK_MATH(sqrt)(R(2.0) / curved);
@@ -108,14 +108,15 @@ static inline real ik_rest(const ik_settings *ik, const real *J, const real *bef
     real start = R(0.0), end = R(0.0), left = R(0.0), motion = R(0.0), jump = R(0.0);
     real largest = R(0.0), bent = rest[IK_BENT];
     for (int i = 0; i < ik->m; i++) {
-        const real move = rest[IK_PROMISED + i], rest_of = before[i] - move;
+        const real move = rest[IK_PROMISED + i], stays = before[i] - move;
         const real apart = before[i] - rest[IK_PROMISED + ik->m + i];
         start += before[i] * before[i], end += e[i] * e[i];
-        motion += move * move, left += rest_of * rest_of, jump += apart * apart;
+        motion += move * move, left += stays * stays, jump += apart * apart;
     }
     const real fall = start - end, promised = start - left, missing = promised - fall;
+    const real none = hk_larger(IK_NO_FALL, R(32.0) * HK_EPS);
     const int tells = rest[IK_SHARE] > IK_NO_WAY && jump <= IK_JUMP * IK_JUMP * start &&
-                      hk_larger(ik_abs(promised), ik_abs(fall)) > IK_NO_FALL * start;
+                      hk_larger(ik_abs(promised), ik_abs(fall)) > none * start;
     const int weak = tells && missing > R(0.5) * ik_abs(promised);
     if (!(weak || bent > R(0.0)) || !(end > R(0.0))) return R(0.0);
     for (int i = 0; i < ik->m; i++)
