@@ -23,6 +23,7 @@ from hybridkin.cli._values import (
     numbers,
     one_of,
     positive,
+    signs,
 )
 
 _NEEDED = object()  # the default of what must be given
@@ -41,12 +42,18 @@ class _Question(NamedTuple):
     default: Any = _NEEDED
 
 
-_KINDS = "tendons, elastic-tendons (they can go slack) or chambers (of measured length)"
-_SIZES = ("radius", "length", "angle", "gain", "spool_radius")
+_KINDS = "tendons, elastic-tendons (they can go slack) or chambers (of measured length or pressure)"
 _EACH = "[mm]; one value, or one for each segment"
 _LENGTHS = ", ".join(METRES)
-_UNIT = f"unit of the actuators: {_LENGTHS}; deg or rad of motors; another name, such as counts"
-_SIGN = "-1: a pulled tendon counts as positive in the log; 1: as negative"
+_UNIT = f"unit of the actuators: {_LENGTHS}; deg or rad; another name, as counts or bar"
+_SIGN = (
+    "-1: a pulled tendon counts as positive in the log; 1: as negative; one value, or one for each "
+    "actuator"
+)
+_ANGLE = (
+    "angle of the first actuator of a segment [degrees]; one value, one for each segment, or those "
+    "of all actuators"
+)
 QUESTIONS = (
     _Question("log", "log file: CSV, npz or parquet", existing, None),
     _Question("kind", _KINDS, one_of(*_MODELS)),
@@ -57,25 +64,37 @@ QUESTIONS = (
         f"radius of the circle on which the actuators lie {_EACH}",
         in_millimetres,
     ),
-    _Question("length", f"length of the backbone of a segment {_EACH}", in_millimetres),
-    _Question(
-        "angle", "angle of the first actuator of a segment [degrees]", numbers, (0,)
-    ),
+    _Question("angle", _ANGLE, numbers, (0,)),
     _Question("q_unit", _UNIT, str, "mm"),
+    _Question(
+        "length",
+        f"length of the backbone of a segment, or of its chambers where q is 0 {_EACH}",
+        in_millimetres,
+    ),
     _Question(
         "spool_radius", f"radius of the spools of motors {_EACH}", in_millimetres, None
     ),
     _Question("counts_per_turn", "q of a whole turn of a spool, in its unit", positive),
     _Question(
-        "gain", "change of length for a q of 1, if not from spools [mm]", in_millimetres
+        "gain",
+        f"change of length for a q of 1, if not from spools {_EACH}",
+        in_millimetres,
     ),
     _Question("x_unit", f"unit of the tip: {_LENGTHS}", one_of(*METRES), "mm"),
-    _Question("q_sign", _SIGN, one_of(1, -1)),
+    _Question("q_sign", _SIGN, signs),
     _Question("q", "columns of the actuators from base to tip, as A,B,...", names),
     _Question("x", "columns of the tip, as X,Y,Z", names),
     _Question("groups", "column that names the motion of a row, or none", str, None),
     _Question("time", "column of the time [s], or none", str, None),
 )
+_IN_WORDS = {  # by kind; the unit of q is known
+    "chambers": {
+        "length": "length of a chamber at 0 {unit}",
+        "gain": "length that 1 {unit} adds to a chamber",
+    },
+    "tendons": {"length": "length of the backbone of a segment"},
+}
+_IN_WORDS["elastic-tendons"] = _IN_WORDS["tendons"]
 _WORDS = {  # how names of columns begin
     "groups": "motion|pattern|group|run|trial|episode|traj|trajectory|sequence",
     "time": "t|time|times|timestamp|stamp|seconds",
@@ -93,7 +112,11 @@ def answered(given: _Answers, ask: bool) -> tuple[_Answers, list[str]]:
     columns = {}
     for question in QUESTIONS:
         name = question.name
-        if _is_needless(name, answers, given):
+        value = given[name]
+        needless = _why_needless(name, answers)
+        if needless and value is not None:
+            raise ValueError(f"{_option(name)} has no use: {needless}; leave it out.")
+        if needless or (name == "q_sign" and value is None and _has_chambers(answers)):
             continue
         if name == "q":
             if missing:
@@ -101,26 +124,50 @@ def answered(given: _Answers, ask: bool) -> tuple[_Answers, list[str]]:
             else:
                 columns = _proposed(answers, given["delimiter"])
         question = question._replace(default=columns.get(name, question.default))
-        value = given[name]
         if value is None:
-            value = _asked(question) if ask else question.default
+            value = _asked(_worded(question, answers)) if ask else question.default
         if value is _NEEDED:
-            missing.append(f"--{name.replace('_', '-')}")
+            missing.append(_option(name))
         answers[name] = None if value == "none" else value
     return answers, missing
 
 
-def _is_needless(name: str, answers: _Answers, given: _Answers) -> bool:
-    """Return whether the earlier answers leave no need to answer a question."""
-    if name in ("length", "q_sign"):
-        return answers["kind"] == "chambers"
+def _option(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
+
+
+def _has_chambers(answers: _Answers) -> bool:
+    return answers.get("kind") == "chambers"
+
+
+def _why_needless(name: str, answers: _Answers) -> str:
+    """Return why the earlier answers leave no need to answer a question; empty: it is needed."""
     unit = answers.get("q_unit")
-    spools = answers.get("spool_radius")
-    if name == "counts_per_turn":
-        return spools is None or unit in ("deg", "rad")
-    if name not in ("spool_radius", "gain") or given[name] is not None:
-        return False
-    return unit in METRES or (name == "gain" and spools is not None)
+    is_length = unit in METRES
+    has_spools = answers.get("spool_radius") is not None
+    chambers = _has_chambers(answers)
+    rules = (
+        ("length", "q is the length of the chambers", is_length and chambers),
+        ("spool_radius", "q is a length", is_length),
+        ("spool_radius", "chambers have no spools", chambers),
+        ("counts_per_turn", "it goes with --spool-radius", not has_spools),
+        ("counts_per_turn", f"q is an angle, in {unit}", unit in ("deg", "rad")),
+        ("gain", "q is a length", is_length),
+        ("gain", "the spools give it", has_spools),
+    )
+    for needless, reason, holds in rules:
+        if needless == name and holds:
+            return reason
+    return ""
+
+
+def _worded(question: _Question, answers: _Answers) -> _Question:
+    """Return a question in the words of the kind of robot and of the unit of q."""
+    of_kind = _IN_WORDS.get(answers.get("kind", ""), {})
+    if question.name not in of_kind:
+        return question
+    text = of_kind[question.name].format(unit=answers.get("q_unit"))
+    return question._replace(text=f"{text} {_EACH}")
 
 
 def _asked(question: _Question) -> Any:
@@ -177,30 +224,58 @@ def description(answers: _Answers, name: str) -> str:
     """Return the robot description of the answers, every key with a comment."""
     template = (files("hybridkin.cli") / "robot.toml").read_text(encoding="utf-8")
     head, segment, tail = re.split(r"(?=\[\[segment|# The logs)", template)
-    if per_turn := answers.get("counts_per_turn"):
-        gains = [
-            float(f"{math.tau * r / per_turn:.9g}") for r in answers["spool_radius"]
-        ]
-        answers = {**answers, "gain": gains, "spool_radius": None}
-    sizes = [_of_segments(answers, key) for key in _SIZES]
-    segments = [
-        _filled(segment, {**answers, "repeat": len([*alike]), **dict(values)})
-        for values, alike in itertools.groupby(zip(*sizes, strict=True))
-    ]
+    segments = []
+    for values, alike in itertools.groupby(_segments(answers)):
+        segments.append(_filled(segment, {**values, "repeat": len([*alike])}))
     values = {**answers, **_MODELS[answers["kind"]], "name": name}
     return "".join([_filled(head, values), *segments, _filled(tail, values)])
 
 
-def _of_segments(answers: _Answers, key: str) -> Sequence[tuple[str, float | None]]:
-    """Return a key and its value for every segment."""
+def _segments(answers: _Answers) -> list[_Answers]:
+    """Return what the template says of every segment."""
+    n = answers["segments"]
+    n_actuators = answers["actuators"]
+    angles = answers["angle"]
+    all_angles = len(angles) == n * n_actuators != n
+    columns = {
+        "radius": _each(answers, "radius"),
+        "length": _each(answers, "length"),
+        "gain": _each(answers, "gain"),
+        "spool_radius": _each(answers, "spool_radius"),
+    }
+    if not all_angles:
+        columns["angle"] = _each(answers, "angle")
+    per_turn = answers.get("counts_per_turn")
+    segments = []
+    for k in range(n):
+        values: _Answers = {key: column[k] for key, column in columns.items()}
+        values |= {"actuators": n_actuators, "clockwise": False, "angles": None}
+        values["zeros"] = None
+        if all_angles:
+            of_segment = slice(k * n_actuators, (k + 1) * n_actuators)
+            values |= dict.fromkeys(("actuators", "clockwise", "angle"))
+            values["angles"] = angles[of_segment]
+        if per_turn is not None:
+            gain = math.tau * values["spool_radius"] / per_turn
+            values["gain"] = float(f"{gain:.9g}")
+            values["spool_radius"] = None
+        if _has_chambers(answers) and values["length"] is not None:
+            values["zeros"] = float(f"{-values['length'] / values['gain']:.9g}")
+            values["length"] = None
+        segments.append(values)
+    return segments
+
+
+def _each(answers: _Answers, key: str) -> Sequence[float | None]:
+    """Return the value of every segment; None where there is no answer."""
     values = answers.get(key) or (None,)
     n = answers["segments"]
     if len(values) not in (1, n):
-        option = f"--{key.replace('_', '-')}"
+        of_all = ", or those of all actuators" if key == "angle" else ""
         raise ValueError(
-            f"{option} must be one value, or one for each segment, got {len(values)}."
+            f"{_option(key)} must be one value, or one for each segment{of_all}, got {len(values)}."
         )
-    return [(key, value) for value in values] * (n // len(values))
+    return [*values] * (n // len(values))
 
 
 def _filled(block: str, values: _Answers) -> str:

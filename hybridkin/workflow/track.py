@@ -25,7 +25,7 @@ from hybridkin.ik.trajectories import Trajectory
 from hybridkin.workflow.counts import Counts
 from hybridkin.workflow.domain import Domain, PathLimits, path_limits
 from hybridkin.workflow.errors import Errors
-from hybridkin.workflow.model import LoadedModel, hysteresis_in_words, play_widths
+from hybridkin.workflow.model import LoadedModel
 from hybridkin.workflow.reach import better_place, check_reach
 from hybridkin.workflow.report import (
     Progress,
@@ -80,7 +80,7 @@ class TrackRecord:
     backend : str
         What computed the steps: "compiled", or "torch: " and the reason.
     play : list of float or None
-        Width of the hysteresis of every actuator [m].
+        Width of the hysteresis of every actuator, in the unit of the robot's logs.
     lead_in : int
         Number of rows that lead from the robot's configuration to the path.
     limits : PathLimits
@@ -128,9 +128,9 @@ def _write(report: Report[TrackRecord], loaded: LoadedModel, better: str) -> Non
         "path.",
         unit=log.q_unit,
     )
-    if loaded.hybrid is not None and loaded.play is not None:
+    if loaded.play is not None:
         report.text(
-            f"The actuators have {hysteresis_in_words(loaded.hybrid)}: a command crosses the "
+            f"The actuators have {loaded.play.in_words(loaded.log_unit)}: a command crosses the "
             "width when its actuator reverses, and leads where they creep. Send q; effective_... "
             "is the motion of the actuators."
         )
@@ -297,7 +297,7 @@ def track_path(
         expected_inside=_expected(loaded, track, track.status == IKStatus.CONVERGED),
         rounded=rounded,
         backend=domain.solver().tracker(track.q[0]).backend,
-        play=play_widths(loaded.hybrid),
+        play=loaded.play_widths,
         lead_in=n_lead,
         limits=domain.limits,
         delay=delay,
