@@ -86,8 +86,8 @@ class CreepOperator(HysteresisOperator):
     def in_words(self, unit: LogUnit) -> str:
         """Return the largest share of a change that comes late, and the time constants."""
         late = 100.0 * self.gains.sum(axis=0).max()
-        times = ", ".join(f"{time:.3g}" for time in self.times)
-        return f"creep (up to {late:.2g} % late, with {times} s)"
+        times = [f"{time:.3g}" for time in np.unique(self.times[[0, -1]])]
+        return f"creep (up to {late:.2g} % late, with {' to '.join(times)} s)"
 
     def stages(self, n: int) -> list[Stage]:
         """Return the operator of n actuators as one stage of creep."""

@@ -182,7 +182,9 @@ def unmoved_directions(rows: LogRows) -> Iterator[LogFinding]:
         return
     directions = moved_directions(q)
     if directions.still.size:
-        still = in_terms(directions.normals(), column_names(rows.log, "q"))
+        signs = np.broadcast_to(rows.log.q_sign, q.shape[1])
+        of_columns = directions.normals() * signs[:, None]
+        still = in_terms(of_columns, column_names(rows.log, "q"))
         message = f"the log has no motion along {still}, or only by rounding or less than 1 %."
         advice = (
             "nothing is learned there. Commands keep to the log where the mechanical model knows "
