@@ -29,6 +29,10 @@ _CELLS = 2**14  # of the coarse search, at most
 _OVERLAP = 0.5  # of the shorter recording, at least
 _CANDIDATES = 6  # lags of the coarse search that are compared
 _ROWS = 2000  # camera rows that are compared, at most
+_FEATURES = 100  # of the rough model, at most
+_ROWS_PER_FEATURE = 5  # at least, for products of commands
+_WINDOWS = 30  # of the fine search, at most
+_PARTS = 10  # of a log, of which each is explained by the others
 _EXPLAINED = 0.5  # least share of the motion that the commands explain at the lag
 _RIVAL = 1.5  # least ratio of what the second best lag leaves to what the best leaves
 
@@ -164,7 +168,8 @@ class Merged(NamedTuple):
     lag : float
         How much later than the clock of the motors that of the camera is [s].
     explained : float
-        Share of the motion of the tips that a rough model of the commands explains at this lag.
+        Share of the variance of the tips that a rough model of the commands explains at this lag,
+        in parts of the log that it was not fitted to.
     is_estimated : bool
         Whether the lag was estimated.
     n_left_out : int
@@ -285,7 +290,13 @@ def merge_logs(
         file_units={"q": motors.unit, "x": camera.unit},
         source=f"{motors.source} and {camera.source}",
     )
-    explained = 1.0 - _unexplained(q, x)
+    explained = _explained(q, x)
+    if is_estimated and explained < _EXPLAINED:
+        raise ValueError(
+            f"The lag between {motors.source} and {camera.source} is not clear: the commands "
+            f"explain at most {explained:.0%} of the motion of the tip, at {lag:.6g} s. Check that "
+            "both record the same motion, or give `lag` (0 if they share a clock)."
+        )
     n_left_out = len(camera.time) - int(kept.sum())
     return Merged(log, lag, explained, is_estimated, n_left_out)
 
@@ -348,15 +359,8 @@ def _estimated_lag(motors: TimedColumns, camera: TimedColumns, hold: bool) -> fl
     fits = []
     for lag, width in _coarse_lags(motors, camera):
         fits.append(_refined(motors, camera, lag, width, hold))
-    fits.sort(key=lambda fit: fit[0])
-    unexplained, lag, width = fits[0]
-    if unexplained > 1.0 - _EXPLAINED:
-        raise ValueError(
-            f"The lag between {motors.source} and {camera.source} is not clear: the commands "
-            f"explain at most {1.0 - unexplained:.0%} of the motion of the tip, at {lag:.6g} s. "
-            "Check that both record the same motion, or give `lag` (0 if they share a clock)."
-        )
-    for other, other_lag, _ in fits[1:]:
+    unexplained, lag, width = min(fits)
+    for other, other_lag, _ in fits:
         if abs(other_lag - lag) > width and other < _RIVAL * unexplained:
             raise ValueError(
                 f"The lag between {motors.source} and {camera.source} is not clear: lags of "
@@ -442,46 +446,88 @@ def _correlation(a: NDArray, b: NDArray) -> tuple[NDArray, NDArray]:
 def _refined(
     motors: TimedColumns, camera: TimedColumns, lag: float, width: float, hold: bool
 ) -> tuple[float, float, float]:
-    """Return what the best lag within a width leaves unexplained, that lag, and the width."""
-    inside = (camera.time - lag - width >= motors.time[0]) & (
-        camera.time - lag + width <= motors.time[-1]
-    )
+    """Return what the best lag nearby leaves unexplained, that lag, and the width of the search."""
     tips = _tip(camera.values)
-    rows = np.flatnonzero(inside & np.isfinite(tips).all(axis=1))
-    few = np.linspace(0, len(rows) - 1, min(len(rows), _ROWS)).astype(int)
-    rows = rows[few]
-    if len(rows) < 3:
-        return np.inf, lag, width
+    known = np.isfinite(tips).all(axis=1)
+    cell = width / 8.0
+    shortest = _OVERLAP * min(np.ptp(motors.time), np.ptp(camera.time)) - 2.0 * width
+    for _ in range(_WINDOWS):
+        # Every lag of a window is judged by the same rows.
+        first = camera.time - lag - width
+        inside = (first >= motors.time[0]) & (first + 2.0 * width <= motors.time[-1])
+        rows = np.flatnonzero(inside & known)
+        rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), _ROWS)).astype(int)]
+        if len(rows) < 3 or np.ptp(camera.time[rows]) < shortest:
+            return np.inf, lag, width
 
-    def unexplained(seconds: float) -> float:
-        time = camera.time[rows] - seconds
-        return _unexplained(commands_at(motors, time, hold), tips[rows])
+        def unexplained(seconds: float, rows: NDArray = rows) -> float:
+            q = commands_at(motors, camera.time[rows] - seconds, hold)
+            return _unexplained(q, tips[rows])
 
-    lags = np.linspace(lag - width, lag + width, 17)
-    errors = [unexplained(seconds) for seconds in lags]
-    middle = lags[int(np.argmin(errors))]
-    cell = lags[1] - lags[0]
-    best = minimize_scalar(
+        lags = np.linspace(lag - width, lag + width, 17)
+        best = int(np.argmin([unexplained(seconds) for seconds in lags]))
+        lag = lags[best]
+        if 0 < best < len(lags) - 1:
+            break
+    fit = minimize_scalar(
         unexplained,
-        bounds=(middle - cell, middle + cell),
+        bounds=(lag - cell, lag + cell),
         method="bounded",
         options={"xatol": 1e-3 * cell},
     )
-    least = float(best.fun)  # pyright: ignore[reportAttributeAccessIssue]
-    return least, float(best.x), width  # pyright: ignore[reportAttributeAccessIssue]
+    lag = float(fit.x)  # pyright: ignore[reportAttributeAccessIssue]
+    q = commands_at(motors, camera.time[rows] - lag, hold)
+    return 1.0 - _explained(q, tips[rows]), lag, width
 
 
 def _unexplained(q: NDArray, x: NDArray) -> float:
-    """Return the share of the variance of tips that a quadratic of each command leaves."""
+    """Return the share of the variance of tips that a quadratic of the commands leaves."""
+    features = _features(q, q.min(axis=0), np.ptp(q, axis=0), squares=True)
+    weights = np.linalg.lstsq(features, x)[0]
+    n_free = max(len(x) - features.shape[1], 1)
+    left = np.square(x - features @ weights).sum() * len(x) / n_free
+    total = np.square(x - x.mean(axis=0)).sum()
+    return float(left / total) if total > 0.0 else 1.0
+
+
+def _explained(q: NDArray, x: NDArray) -> float:
+    """Return the share of the variance of tips that the commands explain in other parts of a log.
+
+    That of ten parts in a row, each from the other nine: a linear model, or a quadratic if that
+    explains more. Smooth motions that have nothing to do with each other agree within one part.
+    """
     tips = _tip(x)
     known = np.isfinite(tips).all(axis=1)
-    tips = tips[known]
     q = q[known]
-    ranges = np.ptp(q, axis=0)
-    z = 2.0 * (q - q.min(axis=0)) / np.where(ranges > 0.0, ranges, 1.0) - 1.0
-    features = np.hstack([np.ones((len(z), 1)), z, z**2])
-    weights = np.linalg.lstsq(features, tips)[0]
+    tips = tips[known]
+    few = np.linspace(0, len(q) - 1, min(len(q), _ROWS)).astype(int)
+    q = q[few]
+    tips = tips[few]
     total = np.square(tips - tips.mean(axis=0)).sum()
-    n_free = max(len(tips) - features.shape[1], 1)
-    left = np.square(tips - features @ weights).sum() * len(tips) / n_free
-    return float(left / total) if total > 0.0 else 1.0
+    if not total > 0.0:
+        return 0.0
+    low = q.min(axis=0)
+    ranges = np.ptp(q, axis=0)
+    shares = []
+    for squares in (False, True):
+        features = _features(q, low, ranges, squares)
+        left = 0.0
+        for part in np.array_split(np.arange(len(q)), _PARTS):
+            others = np.delete(np.arange(len(q)), part)
+            weights = np.linalg.lstsq(features[others], tips[others])[0]
+            left += np.square(tips[part] - features[part] @ weights).sum()
+        shares.append(1.0 - float(left / total))
+    return max(*shares, 0.0)
+
+
+def _features(q: NDArray, low: NDArray, ranges: NDArray, squares: bool) -> NDArray:
+    """Return 1 and z of commands (N, n), z from -1 to 1; with `squares` also their products."""
+    z = 2.0 * (q - low) / np.where(ranges > 0.0, ranges, 1.0) - 1.0
+    features = np.hstack([np.ones((len(z), 1)), z])
+    if not squares:
+        return features
+    features = np.hstack([features, z**2])
+    first, second = np.triu_indices(z.shape[1], k=1)
+    if features.shape[1] + len(first) <= min(_FEATURES, len(z) / _ROWS_PER_FEATURE):
+        features = np.hstack([features, z[:, first] * z[:, second]])
+    return features
