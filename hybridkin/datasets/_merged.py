@@ -28,6 +28,7 @@ _GAP = 5.0  # usual periods of the motor rows: longer ones are gaps
 _CELLS = 2**14  # of the coarse search, at most
 _OVERLAP = 0.5  # of the shorter recording, at least
 _CANDIDATES = 6  # lags of the coarse search that are compared
+_SURE = 0.7  # least score of a candidate, relative to the best
 _ROWS = 2000  # camera rows that are compared, at most
 _FEATURES = 100  # of the rough model, at most
 _ROWS_PER_FEATURE = 5  # at least, for products of commands
@@ -386,6 +387,7 @@ def _coarse_lags(
     peaks = np.flatnonzero(
         (score >= np.append(score[1:], -np.inf)) & (score > np.append(-np.inf, score[:-1]))
     )
+    peaks = peaks[score[peaks] >= _SURE * score[peaks].max()]
     best = peaks[np.argsort(-score[peaks])[:_CANDIDATES]]
     start = camera.time[0] - motors.time[0]
     return [(start - shift[k] * step, 2.0 * step) for k in best]
