@@ -87,7 +87,12 @@ class TimedColumns:
         kept = countable(self.values).all(axis=1)
         groups = None if self.groups is None else self.groups[kept]
         return TimedColumns(
-            self.values[kept], self.time[kept], self.names, self.unit, groups, self.source
+            self.values[kept],
+            self.time[kept],
+            self.names,
+            self.unit,
+            groups,
+            self.source,
         )
 
 
@@ -101,7 +106,7 @@ def read_columns(
     groups: str | None = None,
     delimiter: str | None = None,
 ) -> TimedColumns:
-    """Return columns of a recording that holds only commands, or only tips, with their times.
+    r"""Return columns of a recording that holds only commands, or only tips, with their times.
 
     Parameters
     ----------
@@ -136,7 +141,7 @@ def read_columns(
     >>> from hybridkin.datasets import read_columns
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     path = pathlib.Path(folder) / "camera.csv"
-    ...     _ = path.write_text("t,X,Y,Z\\n0.0,1,2,3\\n0.1,1,2,4\\n")
+    ...     _ = path.write_text("t,X,Y,Z\n0.0,1,2,3\n0.1,1,2,4\n")
     ...     read_columns(path, ["X", "Y", "Z"], time="t", unit="mm").values[1]
     array([0.001, 0.002, 0.004])
     """
@@ -248,6 +253,12 @@ def merge_logs(
     >>> round(merge_logs(motors, camera).lag, 3)
     1234.5
     """
+    for name, recording in (("motors", motors), ("camera", camera)):
+        if not isinstance(recording, TimedColumns):
+            raise TypeError(
+                f"`{name}` must be a recording as from `read_columns`, or `TimedColumns`, got "
+                f"{type(recording).__name__}."
+            )
     if camera.values.shape[1] % 3:
         raise ValueError(
             "`camera` must have three columns for each marker, got "
@@ -385,7 +396,8 @@ def _coarse_lags(
     x_speed = _speed(_tip(camera.values), camera.time, step)
     score, shift = _correlation(x_speed, q_speed)
     peaks = np.flatnonzero(
-        (score >= np.append(score[1:], -np.inf)) & (score > np.append(-np.inf, score[:-1]))
+        (score >= np.append(score[1:], -np.inf))
+        & (score > np.append(-np.inf, score[:-1]))
     )
     peaks = peaks[score[peaks] >= _SURE * score[peaks].max()]
     best = peaks[np.argsort(-score[peaks])[:_CANDIDATES]]

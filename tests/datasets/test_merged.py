@@ -85,9 +85,7 @@ def test_gaps_are_left_out_and_begin_runs():
     assert not ((log.time > 0.9) & (log.time < 3.0)).any()
     assert len(np.unique(log.runs)) == 2
     assert merged.n_left_out == len(seen) - len(log.q)
-    whole = merge_logs(
-        motors, TimedColumns(np.ones((len(seen), 3)), seen), lag=0.0, tolerance=3.0
-    )
+    whole = merge_logs(motors, TimedColumns(np.ones((len(seen), 3)), seen), lag=0.0, tolerance=3.0)
     assert ((whole.log.time > 1.0) & (whole.log.time < 3.0)).any()
     assert len(np.unique(whole.log.runs)) == 1
 
