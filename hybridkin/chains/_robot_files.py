@@ -142,6 +142,12 @@ _ROWS: list[tuple[str, str, str, _Test]] = [
         _many(_many(_is_number, 5)),
     ),
     ("log", "q_unit groups runs time", *_TEXT),
+    (
+        "log",
+        "unwrap",
+        "be true or false, a positive period, or a table of columns and their periods",
+        lambda v: isinstance(v, (bool, dict)) or _is_positive(v),
+    ),
     ("log", "group_suffix", "be text", lambda value: isinstance(value, str)),
     ("log", "x_unit", *_among(*METRES)),
     ("log", "q_sign", "be 1 or -1, or a list of them", _one_or_many(_among(1, -1)[1])),

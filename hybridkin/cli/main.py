@@ -538,7 +538,8 @@ def _log_format(
 ) -> LogFormat:
     """Return how the log is written: as described, with what the options say instead."""
     entries = {}
-    for name in ("q", "x", "q_unit", "x_unit", "q_sign", "groups", "runs", "time"):
+    names = ("q", "x", "q_unit", "x_unit", "q_sign", "groups", "runs", "time", "unwrap")
+    for name in names:
         value = vars(arguments)[name]
         if value is not None:
             entries[name] = None if value == "none" else value

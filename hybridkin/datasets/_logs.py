@@ -28,6 +28,7 @@ from hybridkin._core.arrays import (
 from hybridkin._core.commands import Commands
 from hybridkin._core.texts import csv_cell
 from hybridkin._core.units import METRES, UNITS
+from hybridkin.datasets._encoders import given_periods, unwrapped
 from hybridkin.datasets._log_report import named_rows
 from hybridkin.datasets._npz import arrays_of, check_expansion
 
@@ -158,6 +159,7 @@ def load_log(
     q_sign: ArrayLike = 1,
     delimiter: str | None = None,
     drop_invalid: bool = False,
+    unwrap: bool | float | Mapping[str, float] = False,
 ) -> Log:
     r"""Return actuator vectors and tip positions from a log: a CSV, npz or parquet file.
 
@@ -193,6 +195,12 @@ def load_log(
     drop_invalid : bool, default=False
         Leave out rows with a missing, NaN or infinite value, or without the name of their motion,
         instead of raising an error.
+    unwrap : bool, float or mapping of str to float, default=False
+        Correct encoders: readings that start again after a period, turns that are lost from some
+        row on, and single readings that are whole periods off. The period of the encoders in the
+        unit of the file, such as 4096 or 360; a mapping gives those of some columns. True: usual
+        periods are tried, and only what the tips confirm is corrected. A column is corrected up
+        to a constant number of periods. The rows of a run must be in order of time.
 
     Returns
     -------
@@ -268,6 +276,15 @@ def load_log(
         )
     commands = commands[valid]
     tips = tips[valid]
+    periods = given_periods(unwrap, q, q_unit)
+    if any(periods):
+        same_run = np.ones(len(commands) - 1, dtype=bool)
+        for (
+            labels_of_rows
+        ) in labelled.values():  # those of runs, if there are any, come last
+            names_of_rows = labels_of_rows[valid]
+            same_run = names_of_rows[1:] == names_of_rows[:-1]
+        commands = unwrapped(commands, tips[:, -3:], same_run, periods)
     for name, unit, column in (("q", q_unit, commands), ("x", x_unit, tips)):
         span = (np.nanmax(column, axis=0) - np.nanmin(column, axis=0)).max()
         middle = np.nanmedian(np.abs(column))
