@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import itertools
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -68,9 +69,7 @@ def recording(seed: int, n_motions: int) -> Recording:
     knots = (np.cumsum(bends, axis=1) @ ring).reshape(-1, 6)
     s = np.linspace(0.0, 1.0, ROWS, endpoint=False)[:, None]
     way = s * s * (3.0 - 2.0 * s)
-    q = np.concatenate(
-        [a + way * (b - a) for a, b in zip(knots, knots[1:], strict=False)]
-    )
+    q = np.concatenate([a + way * (b - a) for a, b in itertools.pairwise(knots)])
     q = np.round(q)
     x = robot(0.0085, 0.103)(torch.from_numpy(q)).numpy()
     x += 2e-4 * rng.standard_normal(x.shape)
@@ -91,7 +90,7 @@ def one_wraps(rng: np.random.Generator, q: NDArray) -> NDArray:
     """Return counts of which one column is within a turn."""
     column = rng.integers(6)
     bad = q.copy()
-    bad[:, column] = np.mod(q[:, column] + rng.integers(4096), PERIOD)
+    bad[:, column] = np.mod(q[:, column], PERIOD)
     return bad
 
 
@@ -132,7 +131,9 @@ def error(log: Log, test: Recording) -> float:
     """Return the mean error of a hybrid on new motions [mm]."""
     start = log.q - np.median(log.q[:20], axis=0)  # counts from the first posture
     shift = np.rint((log.q[0] - start[0]) / PERIOD) * PERIOD  # whole turns
-    model = HybridForwardModel(robot(), "quadratic", coupling="serial")
+    model = HybridForwardModel(
+        robot(), "quadratic", coupling="serial", calibrate="default"
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         model.fit(log.q - shift, log.x, groups=log.groups)
@@ -152,7 +153,9 @@ def tried(fault: str, seed: int, folder: Path) -> list[float]:
     off = mended.q - clean.q
     numbers = [
         "encoder" in kinds,
-        bool(kinds & {"order", "sign", "numbering", "units", "offset", "drift", "size"}),
+        bool(
+            kinds & {"order", "sign", "numbering", "units", "offset", "drift", "size"}
+        ),
         np.ptp(off, axis=0).max() == 0.0 and not np.mod(off, PERIOD).any(),
     ]
     if seed >= FITTED:
