@@ -21,6 +21,7 @@ from hybridkin._core.arrays import (
     real_array,
 )
 from hybridkin._core.units import METRES, UNITS
+from hybridkin.datasets._encoders import _features as rough_features
 from hybridkin.datasets._log_report import named_rows
 from hybridkin.datasets._logs import Log, _read
 
@@ -461,42 +462,58 @@ def _refined(
     motors: TimedColumns, camera: TimedColumns, lag: float, width: float, hold: bool
 ) -> tuple[float, float, float]:
     """Return what the best lag nearby leaves unexplained, that lag, and the width of the search."""
-    tips = _tip(camera.values)
-    known = np.isfinite(tips).all(axis=1)
     cell = width / 8.0
-    shortest = _OVERLAP * min(np.ptp(motors.time), np.ptp(camera.time)) - 2.0 * width
     for _ in range(_WINDOWS):
-        # Every lag of a window is judged by the same rows.
-        first = camera.time - lag - width
-        inside = (first >= motors.time[0]) & (first + 2.0 * width <= motors.time[-1])
-        rows = np.flatnonzero(inside & known)
-        rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), _ROWS)).astype(int)]
-        if len(rows) < 3 or np.ptp(camera.time[rows]) < shortest:
+        tips = _surely_covered(motors, camera, lag, width)
+        if not len(tips.time):
             return np.inf, lag, width
-
-        def unexplained(seconds: float, rows: NDArray = rows) -> float:
-            q = commands_at(motors, camera.time[rows] - seconds, hold)
-            return _unexplained(q, tips[rows])
-
         lags = np.linspace(lag - width, lag + width, 17)
-        best = int(np.argmin([unexplained(seconds) for seconds in lags]))
-        lag = lags[best]
+        errors = [_left_at(seconds, motors, tips, hold) for seconds in lags]
+        best = int(np.argmin(errors))
+        lag = float(lags[best])
         if 0 < best < len(lags) - 1:
             break
+    tips = _surely_covered(motors, camera, lag, width)
+    if not len(tips.time):
+        return np.inf, lag, width
     fit = minimize_scalar(
-        unexplained,
+        _left_at,
+        args=(motors, tips, hold),
         bounds=(lag - cell, lag + cell),
         method="bounded",
         options={"xatol": 1e-3 * cell},
     )
     lag = float(fit.x)  # pyright: ignore[reportAttributeAccessIssue]
-    q = commands_at(motors, camera.time[rows] - lag, hold)
-    return 1.0 - _explained(q, tips[rows]), lag, width
+    q = commands_at(motors, tips.time - lag, hold)
+    return 1.0 - _explained(q, tips.values), lag, width
+
+
+def _surely_covered(
+    motors: TimedColumns, camera: TimedColumns, lag: float, width: float
+) -> TimedColumns:
+    """Return some tips within the motor rows at every lag of a window; none if they are too short.
+
+    So every lag of a window is judged by the same rows.
+    """
+    tips = _tip(camera.values)
+    first = camera.time - lag - width
+    inside = (first >= motors.time[0]) & (first + 2.0 * width <= motors.time[-1])
+    rows = np.flatnonzero(inside & np.isfinite(tips).all(axis=1))
+    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), _ROWS)).astype(int)]
+    shortest = _OVERLAP * min(np.ptp(motors.time), np.ptp(camera.time)) - 2.0 * width
+    if len(rows) < 3 or np.ptp(camera.time[rows]) < shortest:
+        rows = rows[:0]
+    return TimedColumns(tips[rows], camera.time[rows])
+
+
+def _left_at(lag: float, motors: TimedColumns, tips: TimedColumns, hold: bool) -> float:
+    """Return the share of the variance of tips that the commands leave at a lag."""
+    return _unexplained(commands_at(motors, tips.time - lag, hold), tips.values)
 
 
 def _unexplained(q: NDArray, x: NDArray) -> float:
     """Return the share of the variance of tips that a quadratic of the commands leaves."""
-    features = _features(q, q.min(axis=0), np.ptp(q, axis=0), squares=True)
+    features = _features(q, squares=True)
     weights = np.linalg.lstsq(features, x)[0]
     n_free = max(len(x) - features.shape[1], 1)
     left = np.square(x - features @ weights).sum() * len(x) / n_free
@@ -520,11 +537,9 @@ def _explained(q: NDArray, x: NDArray) -> float:
     total = np.square(tips - tips.mean(axis=0)).sum()
     if not total > 0.0:
         return 0.0
-    low = q.min(axis=0)
-    ranges = np.ptp(q, axis=0)
     shares = []
     for squares in (False, True):
-        features = _features(q, low, ranges, squares)
+        features = _features(q, squares)
         left = 0.0
         for part in np.array_split(np.arange(len(q)), _PARTS):
             others = np.delete(np.arange(len(q)), part)
@@ -534,14 +549,14 @@ def _explained(q: NDArray, x: NDArray) -> float:
     return max(*shares, 0.0)
 
 
-def _features(q: NDArray, low: NDArray, ranges: NDArray, squares: bool) -> NDArray:
+def _features(q: NDArray, squares: bool) -> NDArray:
     """Return 1 and z of commands (N, n), z from -1 to 1; with `squares` also their products."""
-    z = 2.0 * (q - low) / np.where(ranges > 0.0, ranges, 1.0) - 1.0
-    features = np.hstack([np.ones((len(z), 1)), z])
+    n = q.shape[1]
+    features = rough_features(q, q)
     if not squares:
-        return features
-    features = np.hstack([features, z**2])
-    first, second = np.triu_indices(z.shape[1], k=1)
-    if features.shape[1] + len(first) <= min(_FEATURES, len(z) / _ROWS_PER_FEATURE):
+        return features[:, : 1 + n]
+    first, second = np.triu_indices(n, k=1)
+    if features.shape[1] + len(first) <= min(_FEATURES, len(q) / _ROWS_PER_FEATURE):
+        z = features[:, 1 : 1 + n]
         features = np.hstack([features, z[:, first] * z[:, second]])
     return features
