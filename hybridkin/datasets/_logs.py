@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-import csv
-import difflib
-import itertools
 import os
-import re
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,15 +20,11 @@ from hybridkin._core.arrays import (
     real_array,
 )
 from hybridkin._core.commands import Commands
-from hybridkin._core.texts import csv_cell
 from hybridkin._core.units import METRES, UNITS
 from hybridkin.datasets._log_report import named_rows
-from hybridkin.datasets._npz import arrays_of, check_expansion
+from hybridkin.datasets._table_files import read_table
 
-_DELIMITERS = (",", ";", "\t")
 _UNNAMED = ("", "nan", "NaN", "NaT", "None", "<NA>")  # a missing motion, as text
-_MOST_COLUMNS = 10_000  # of an array
-_LONGEST = 256  # characters of a motion's name
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -230,7 +220,7 @@ def load_log(
     >>> log.x, log.q_names
     (array([[0.01, 0.02, 0.03]]), ['a', 'b', 'c'])
     """
-    table = _read(as_path(path), delimiter)
+    table = read_table(as_path(path), delimiter)
     q = table.names("q", q)
     x = table.names("x", x)
     if len(x) % 3:
@@ -311,122 +301,7 @@ def log_columns(
     list of str
         In the order of the file.
     """
-    return _read(as_path(path), delimiter).header
-
-
-def _read(path: Path, delimiter: str | None) -> _Table:
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"`path` must be a log file, there is none at {str(path)!r}."
-        )
-    if path.suffix.lower() == ".npz":
-        return _read_npz(path)
-    if path.suffix.lower() in (".parquet", ".pq"):
-        return _read_parquet(path)
-    return _read_text(path, delimiter)
-
-
-class _Table(NamedTuple):
-    """The unconverted columns of a file; for text also the line of every row."""
-
-    path: Path
-    header: list[str]
-    columns: Sequence[NDArray | Sequence[str]]
-    lines: NDArray | None = None
-
-    def names(self, argument: str, names: Sequence[str]) -> list[str]:
-        """Return names of columns; the name of an array (N, k) becomes those of its columns."""
-        names = [names] if names is None or isinstance(names, str) else list(names)
-        if not names or not all(isinstance(name, str) for name in names):
-            raise ValueError(f"`{argument}` must be column names, got {names!r}.")
-        if len(set(names)) < len(names):
-            raise ValueError(f"`{argument}` names a column twice: {names}.")
-        columns = []
-        for name in names:
-            part = re.compile(rf"{re.escape(name)}\[\d+\]")
-            if name not in self.header and any(map(part.fullmatch, self.header)):
-                columns += filter(part.fullmatch, self.header)
-            else:
-                self.column(name)
-                columns.append(name)
-        return columns
-
-    def column(self, name: str) -> NDArray | Sequence[str]:
-        """Return the column of that name."""
-        if not isinstance(name, str):
-            raise TypeError(
-                f"`groups`, `runs` and `time` must be names of columns, got {name!r:.80}."
-            )
-        written = csv_cell(name).strip()  # as our own tables hold it
-        if name not in self.header and written in self.header:
-            name = written
-        count = self.header.count(name)
-        path = str(self.path)
-        if count > 1:
-            raise ValueError(
-                f"Column {name!r} occurs {count} times in {path!r}; rename it."
-            )
-        if count:
-            return self.columns[self.header.index(name)]
-        close = [other for other in self.header if other.lower() == name.lower()]
-        close = close or difflib.get_close_matches(name, self.header, n=3, cutoff=0.4)
-        hint = f"did you mean {', '.join(map(repr, close))}? Its" if close else "its"
-        if len(self.header) == 1:
-            hint = "it has only one column, check `delimiter`. Its"
-        raise ValueError(
-            f"There is no column {name!r} in {path!r}; {hint:.400} columns: {self.header!s:.1000}."
-        )
-
-    def numbers(self, name: str, as_time: bool) -> NDArray:
-        """Return the column of that name as numbers, NaN for empty cells; times in seconds."""
-        column = self.column(name)
-        if self.lines is not None:
-            numbers = []
-            for cell, line in zip(column, self.lines, strict=True):
-                numbers.append(_number(str(cell), name, line, self.path))
-            return np.array(numbers)
-        values = np.asarray(column)
-        kind = values.dtype
-        if as_time and kind.kind in "mM":
-            return (values - kind.type(0, "s")) / np.timedelta64(1, "s")
-        try:
-            # astype would use a real part, or ticks of some unit.
-            if kind.kind not in "cVmM":
-                return values.astype(float)
-        except (TypeError, ValueError, OverflowError):
-            pass
-        raise ValueError(
-            f"Column {name!r} of {str(self.path)!r} must hold numbers, got {kind}."
-        )
-
-    def values(self, names: list[str], time: str | None) -> NDArray:
-        """Return columns as numbers (N, k), that of the time in seconds."""
-        columns = {name: self.numbers(name, name == time) for name in names}
-        if len(columns) < len(names):
-            raise ValueError(
-                f"`q`, `x` and `time` must name a column once, got {names}."
-            )
-        sizes = {name: len(column) for name, column in columns.items()}
-        if len({*sizes.values()}) > 1:
-            raise ValueError(
-                f"The columns of {str(self.path)!r} must be equally long, got {sizes}."
-            )
-        if not all(sizes.values()):
-            header = "no" if self.lines is None else "a header but no"
-            raise ValueError(f"{str(self.path)!r} has {header} rows.")
-        return np.column_stack([*columns.values()])
-
-    def labels(self, argument: str, name: str, n_rows: int) -> NDArray:
-        """Return the column of that name as labels of the rows."""
-        labels = [str(value).strip() for value in self.column(name)]
-        longest = max(map(len, labels), default=0)
-        if len(labels) != n_rows or longest > _LONGEST:
-            raise ValueError(
-                f"`{argument}` must name each of {n_rows} rows in at most {_LONGEST} characters, "
-                f"but column {name!r} of {str(self.path)!r} has {len(labels)} rows of up to "
-                f"{longest} characters; check the file."
-            )
-        return np.array(labels)
+    return read_table(as_path(path), delimiter).header
 
 
 def _checked_factor(n: int, q_unit: str, x_unit: str, q_sign: ArrayLike) -> NDArray:
@@ -440,108 +315,3 @@ def _checked_factor(n: int, q_unit: str, x_unit: str, q_sign: ArrayLike) -> NDAr
             f"`q_sign` must be 1 or -1, or one per column of `q`, got {q_sign!r}."
         )
     return sign * UNITS[q_unit]
-
-
-def _read_text(path: Path, delimiter: str | None) -> _Table:
-    if delimiter is not None and not (
-        isinstance(delimiter, str) and len(delimiter) == 1
-    ):
-        raise ValueError(
-            f"`delimiter` must be one character or None, got {delimiter!r:.80}."
-        )
-    try:
-        with open(path, encoding="utf-8-sig", newline="") as file:
-            unquoted = re.sub('"[^"]*("|$)', "", file.readline())
-            delimiter = delimiter or max(_DELIMITERS, key=unquoted.count)
-            file.seek(0)
-            reader = csv.reader(file, delimiter=delimiter)
-            rows = [
-                (reader.line_num, row) for row in reader if any(map(str.strip, row))
-            ]
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(
-            f"{str(path)!r} is not a text file in UTF-8, or does not close a quote ({error}); save "
-            "the log as CSV, npz or parquet."
-        ) from error
-    if not rows:
-        raise ValueError(f"{str(path)!r} is empty; a header line and rows are needed.")
-    n = len(rows[0][1])
-    for line, row in rows:
-        if len(row) > n:
-            raise ValueError(
-                f"Line {line} of {str(path)!r} has {len(row)} cells, the header {n}; check "
-                f"`delimiter` (now {delimiter!r})."
-            )
-        # A cell may have line breaks, but with all delimiters of a row it hides one.
-        text = delimiter.join(row)
-        n_lines = len(text.splitlines()) - 1
-        if n_lines > 0 and text.count(delimiter) >= len(row) + n - 2:
-            raise ValueError(
-                f'A quote (") in line {line - n_lines} of {str(path)!r} hides rows up to line '
-                f"{line}; close or remove it."
-            )
-    lines, cells = zip(*rows, strict=True)
-    header = [name.strip() for name in cells[0]]
-    columns = [column[1:] for column in itertools.zip_longest(*cells, fillvalue="")]
-    return _Table(path, header, columns, np.array(lines[1:], dtype=int))
-
-
-def _read_npz(path: Path) -> _Table:
-    """Return the arrays (N,) of a file; columns of arrays (N, k) are named ``name[i]``."""
-    arrays = arrays_of(path)
-    columns = {name: array for name, array in arrays.items() if array.ndim == 1}
-    for name, array in arrays.items():
-        if array.ndim == 2 and array.shape[1] > _MOST_COLUMNS:
-            raise ValueError(
-                f"{name!r} of {str(path)!r} must have at most {_MOST_COLUMNS} columns, got "
-                f"{array.shape[1]}; transpose it if rows and columns are swapped."
-            )
-        if array.ndim == 2:
-            columns |= {f"{name}[{i}]": column for i, column in enumerate(array.T)}
-    return _Table(path, [*columns], [*columns.values()])
-
-
-def _read_parquet(path: Path) -> _Table:
-    try:
-        import pandas as pd
-
-        _check_rows(path)
-        frame = pd.read_parquet(path)
-        for name in frame.select_dtypes("datetimetz"):
-            frame[name] = frame[name].dt.tz_convert(None)  # to UTC
-    except ImportError as error:
-        raise ImportError(
-            f"Reading {str(path)!r} needs pandas and pyarrow (pip install pandas pyarrow); or "
-            "save the log as CSV or npz."
-        ) from error
-    except Exception as error:  # pyarrow and pandas have many kinds of them
-        raise ValueError(
-            f"{str(path)!r} is not a parquet file: {error!s:.200}."
-        ) from error
-    return _Table(
-        path, [*map(str, frame.columns)], [frame[c].to_numpy() for c in frame.columns]
-    )
-
-
-def _check_rows(path: Path) -> None:
-    """Raise if a parquet file has too many rows for its size, e.g. one value repeated."""
-    try:
-        from pyarrow.parquet import read_metadata
-    except ImportError:  # fastparquet reads it
-        return
-    metadata = read_metadata(path)
-    check_expansion(path, 8 * metadata.num_rows * metadata.num_columns)
-
-
-def _number(cell: str, name: str, line: int, path: Path) -> float:
-    text = cell.strip()
-    if not text:
-        return np.nan
-    try:
-        return float(text)
-    except ValueError:
-        raise ValueError(
-            f"Line {line} of {str(path)!r}, column {name!r}: a number is needed, got {text!r:.60}; "
-            "correct the cell (an empty cell is a missing value, see `drop_invalid`; decimals "
-            "need a point)."
-        ) from None
