@@ -6,6 +6,7 @@ import os
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,11 +21,12 @@ from hybridkin._core.arrays import (
     real_array,
 )
 from hybridkin._core.commands import Commands
+from hybridkin._core.text_rows import TextForm
 from hybridkin._core.units import METRES, UNITS
+from hybridkin.datasets._frames import frame_table
 from hybridkin.datasets._log_report import named_rows
 from hybridkin.datasets._table_files import read_table
-
-_UNNAMED = ("", "nan", "NaN", "NaT", "None", "<NA>")  # a missing motion, as text
+from hybridkin.datasets._tables import UNNAMED, Table
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -112,6 +114,57 @@ class Log:
             lines.append(f"time from {self.time[0]:.6g} to {self.time[-1]:.6g} s")
         return "\n  ".join(lines)
 
+    @classmethod
+    def from_frame(
+        cls,
+        df: Any,
+        q: Sequence[str],
+        x: Sequence[str],
+        groups: str | None = None,
+        *,
+        runs: str | None = None,
+        time: str | None = None,
+        q_unit: str = "m",
+        x_unit: str = "m",
+        q_sign: ArrayLike = 1,
+        missing: ArrayLike = (),
+        drop_invalid: bool = False,
+    ) -> Log:
+        """Return the log in a data frame, as `load_log` from a file.
+
+        Parameters
+        ----------
+        df : data frame
+            A frame of pandas, polars, modin or narwhals, or a table of pyarrow. Null is missing.
+        q, x, groups, runs, time, q_unit, x_unit, q_sign, missing, drop_invalid
+            As for `load_log`.
+
+        Returns
+        -------
+        Log
+            In SI units; its lines are the numbers of rows, from 0.
+
+        Raises
+        ------
+        TypeError
+            If `df` is no data frame.
+        ValueError
+            As for `load_log`.
+
+        Examples
+        --------
+        >>> import pandas as pd
+        >>> from hybridkin.datasets import Log
+        >>> df = pd.DataFrame({"a": [1.0, 2.0], "X": [10, 20], "Y": [0, 0], "Z": [50, 60]})
+        >>> Log.from_frame(df, q=["a"], x=["X", "Y", "Z"], q_unit="mm", x_unit="mm").x
+        array([[0.01, 0.  , 0.05],
+               [0.02, 0.  , 0.06]])
+        """
+        table = frame_table(df, "data frame")
+        columns = _Columns.of(table, q, x, time, {"groups": groups, "runs": runs})
+        conversion = _Conversion(q_unit, x_unit, q_sign, missing)
+        return _converted(table, columns, conversion, drop_invalid)
+
     @property
     def commands(self) -> Commands:
         """The actuator vectors with their runs, without such a column the motions, and times."""
@@ -147,6 +200,9 @@ def load_log(
     x_unit: str = "m",
     q_sign: ArrayLike = 1,
     delimiter: str | None = None,
+    header_line: int | None = None,
+    decimal: str = ".",
+    missing: ArrayLike = (),
     drop_invalid: bool = False,
 ) -> Log:
     r"""Return actuator vectors and tip positions from a log: a CSV, npz or parquet file.
@@ -155,7 +211,8 @@ def load_log(
     ----------
     path : path-like
         The file. ``.npz`` is read by NumPy, ``.parquet`` and ``.pq`` by pandas with pyarrow or
-        fastparquet, anything else as text with a header line.
+        fastparquet, anything else as text with a header: UTF-8, UTF-16 with its mark, or the
+        encoding of Windows (cp1252, with Latin-1).
     q : sequence of str
         Columns of the actuator vector, in the order of the robot model. In an npz file an array
         (N,) is a column; ``"name[2]"`` is column 2 of an array (N, k), ``"name"`` all its columns.
@@ -170,9 +227,10 @@ def load_log(
     time : str or None, default=None
         Column of the time stamp [s]. In npz and parquet files also dates, which become seconds
         since 1970 (UTC), and durations.
-    q_unit : {"m", "cm", "mm", "um", "in", "rad", "deg", "1"}, default="m"
+    q_unit : {"m", "cm", "mm", "um", "in", "rad", "deg", "1", "counts"}, default="m"
         Unit of the actuator columns in the file; lengths become metres and angles radians. "1" is
-        not converted: counts or pressures, for a chain with `gains`.
+        not converted: counts or pressures, for a chain with `gains`. "counts" is another name of
+        "1".
     x_unit : {"m", "cm", "mm", "um", "in"}, default="m"
         Unit of the tip columns in the file.
     q_sign : 1, -1 or sequence of them, default=1
@@ -180,6 +238,16 @@ def load_log(
         here a shortening is negative.
     delimiter : str or None, default=None
         Separator of a text file. None: the most frequent in the header of comma, semicolon and tab.
+    header_line : int or None, default=None
+        Line of the header of a text file, from 1; lines above it are not read. None: the block of
+        header lines of Motive, Vicon Nexus or Qualisys Track Manager, else line 1. In such a block
+        columns are named "marker X" or "body X", and the rotations "body rot X"; the unit of length
+        that it states must be `x_unit`.
+    decimal : {".", ","}, default="."
+        Decimal sign of a text file.
+    missing : array-like of float, default=()
+        Numbers in q and x that stand for missing values, such as 9999.999, in the unit of the
+        file. Zero means the 0, 0, 0 of a lost marker, not zeros elsewhere.
     drop_invalid : bool, default=False
         Leave out rows with a missing, NaN or infinite value, or without the name of their motion,
         instead of raising an error.
@@ -197,8 +265,9 @@ def load_log(
     ImportError
         If a parquet file is given and pandas cannot read it.
     ValueError
-        If a column is unknown or used twice, a cell is not a number, rows are invalid, a quote in
-        a text file is not closed, or no row is left.
+        If a column is unknown or used twice, a cell is not a number, rows are invalid or do not fit
+        the header, a quote in a text file is not closed, the file states another unit, or no row is
+        left.
 
     Warns
     -----
@@ -207,6 +276,7 @@ def load_log(
 
     See Also
     --------
+    Log.from_frame : The same from a data frame.
     check_log : Possible errors of a log, with advice.
 
     Examples
@@ -220,80 +290,24 @@ def load_log(
     >>> log.x, log.q_names
     (array([[0.01, 0.02, 0.03]]), ['a', 'b', 'c'])
     """
-    table = read_table(as_path(path), delimiter)
-    q = table.names("q", q)
-    x = table.names("x", x)
-    if len(x) % 3:
-        raise ValueError(
-            f"`x` must name 3 columns, or 3 for each of several markers, got {len(x)}: {x}."
-        )
-    factor = _checked_factor(len(q), q_unit, x_unit, q_sign)
-    names = [*q, *x]
-    if time is not None:
-        names.append(time)
-    values = table.values(names, time)
-    labelled = {}
-    for argument, column in {"groups": groups, "runs": runs}.items():
-        if column is not None:
-            labelled[argument] = table.labels(argument, column, len(values))
-    commands = values[:, : len(q)]
-    tips = values[:, len(q) : len(names) - (time is not None)]
-    complete = countable(tips).reshape(len(tips), -1, 3).all(axis=2)
-    tips = np.where(complete.repeat(3, axis=1), tips, np.nan)
-    valid = countable(commands).all(axis=1) & complete.any(axis=1)
-    if time is not None:
-        valid &= countable(values[:, -1])
-    for labels_of_rows in labelled.values():
-        valid &= ~np.isin(labels_of_rows, _UNNAMED)
-    kind = "line"
-    places = table.lines
-    if places is None:
-        kind = "row"
-        places = np.arange(len(values))
-    if not valid.any() or not (drop_invalid or valid.all()):
-        raise ValueError(
-            f"{(~valid).sum()} of {len(values)} rows of {str(path)!r} have a missing, NaN or "
-            f"infinite value, or no motion ({named_rows(places[~valid], kind)}); correct them, or "
-            "leave them out with drop_invalid=True if others are left."
-        )
-    commands = commands[valid]
-    tips = tips[valid]
-    for name, unit, column in (("q", q_unit, commands), ("x", x_unit, tips)):
-        span = (np.nanmax(column, axis=0) - np.nanmin(column, axis=0)).max()
-        middle = np.nanmedian(np.abs(column))
-        if unit == "m" and (middle > 10 or span > 5):
-            warnings.warn(
-                f"The `{name}` columns span {span:.4g} m around {middle:.4g} m; if the file has "
-                f"millimetres, give {name}_unit='mm' (centimetres: 'cm').",
-                stacklevel=2,
-            )
-    si_unit = q_unit if q_unit == "1" else "rad"
-    if q_unit in METRES:
-        si_unit = "m"
-    return Log(
-        commands * factor,
-        tips * METRES[x_unit],
-        time=None if time is None else values[valid, -1],
-        line=places[valid],
-        invalid_lines=places[~valid],
-        q_names=q,
-        x_names=x,
-        q_sign=q_sign,
-        units={"q": si_unit, "x": "m"},
-        file_units={"q": q_unit, "x": x_unit},
-        source=str(path),
-        **{argument: names[valid] for argument, names in labelled.items()},
-    )
+    table = read_table(as_path(path), TextForm(delimiter, header_line, decimal))
+    columns = _Columns.of(table, q, x, time, {"groups": groups, "runs": runs})
+    conversion = _Conversion(q_unit, x_unit, q_sign, missing)
+    return _converted(table, columns, conversion, drop_invalid)
 
 
 def log_columns(
-    path: str | os.PathLike[str], delimiter: str | None = None
+    path: str | os.PathLike[str],
+    delimiter: str | None = None,
+    *,
+    header_line: int | None = None,
+    decimal: str = ".",
 ) -> list[str]:
     """Return the names of the columns of a log file.
 
     Parameters
     ----------
-    path, delimiter
+    path, delimiter, header_line, decimal
         As for `load_log`.
 
     Returns
@@ -301,7 +315,137 @@ def log_columns(
     list of str
         In the order of the file.
     """
-    return read_table(as_path(path), delimiter).header
+    return read_table(as_path(path), TextForm(delimiter, header_line, decimal)).header
+
+
+class _Columns(NamedTuple):
+    """The names of the columns of a log; of motions and runs by argument."""
+
+    q: list[str]
+    x: list[str]
+    times: list[str]  # one name, or none
+    labels: dict[str, str]
+
+    @classmethod
+    def of(
+        cls,
+        table: Table,
+        q: Sequence[str],
+        x: Sequence[str],
+        time: str | None,
+        labels: Mapping[str, str | None],
+    ) -> Self:
+        """Return the names as the table has them."""
+        of_q = table.names("q", q)
+        of_x = table.names("x", x)
+        if len(of_x) % 3:
+            raise ValueError(
+                "`x` must name 3 columns, or 3 for each of several markers, got "
+                f"{len(of_x)}: {of_x}."
+            )
+        given = {
+            argument: name for argument, name in labels.items() if name is not None
+        }
+        times = [] if time is None else [time]
+        return cls(of_q, of_x, times, given)
+
+
+class _Conversion(NamedTuple):
+    """The units and signs of columns, and the numbers that stand for missing values."""
+
+    q_unit: str
+    x_unit: str
+    q_sign: ArrayLike
+    missing: ArrayLike
+
+    @property
+    def unit_of_q(self) -> str:
+        """The unit of the actuator columns."""
+        return "1" if self.q_unit == "counts" else self.q_unit
+
+    def without_missing(self, commands: NDArray, tips: NDArray) -> None:
+        """Set the missing values among commands (N, n) and tips (N, 3 K) to NaN, in place.
+
+        Zeros are missing only where all three coordinates of a marker are zero.
+        """
+        missing = real_array(self.missing, "missing").ravel()
+        values = missing[missing != 0.0]
+        commands[np.isin(commands, values)] = np.nan
+        tips[np.isin(tips, values)] = np.nan
+        if len(values) < len(missing):
+            markers = tips.reshape(len(tips), -1, 3)
+            markers[(markers == 0.0).all(axis=2)] = np.nan
+
+
+def _converted(
+    table: Table, columns: _Columns, conversion: _Conversion, drop_invalid: bool
+) -> Log:
+    """Return a log in SI units, without its invalid rows."""
+    q_unit = conversion.unit_of_q
+    x_unit = conversion.x_unit
+    n = len(columns.q)
+    factor = _checked_factor(n, q_unit, x_unit, conversion.q_sign)
+    table.check_unit("q", columns.q, q_unit)
+    table.check_unit("x", columns.x, x_unit)
+    values = table.values([*columns.q, *columns.x, *columns.times], columns.times)
+    labelled = {
+        argument: table.labels(argument, name, len(values))
+        for argument, name in columns.labels.items()
+    }
+    commands = values[:, :n]
+    tips = values[:, n : n + len(columns.x)]
+    times = values[:, n + len(columns.x) :]
+    conversion.without_missing(commands, tips)
+    complete = countable(tips).reshape(len(tips), -1, 3).all(axis=2)
+    tips = np.where(complete.repeat(3, axis=1), tips, np.nan)
+    valid = countable(commands).all(axis=1) & complete.any(axis=1)
+    valid &= countable(times).all(axis=1)
+    for labels_of_rows in labelled.values():
+        valid &= ~np.isin(labels_of_rows, UNNAMED)
+    kind = "line"
+    places = table.lines
+    if places is None:
+        kind = "row"
+        places = np.arange(len(values))
+    if not valid.any() or not (drop_invalid or valid.all()):
+        raise ValueError(
+            f"{(~valid).sum()} of {len(values)} rows of {str(table.source)!r} have a missing, NaN "
+            f"or infinite value, or no motion ({named_rows(places[~valid], kind)}); correct them, "
+            "or leave them out with drop_invalid=True if others are left."
+        )
+    commands = commands[valid]
+    tips = tips[valid]
+    _warn_of_millimetres("q", commands, q_unit)
+    _warn_of_millimetres("x", tips, x_unit)
+    si_unit = q_unit if q_unit == "1" else "rad"
+    if q_unit in METRES:
+        si_unit = "m"
+    return Log(
+        commands * factor,
+        tips * METRES[x_unit],
+        time=times[valid, 0] if columns.times else None,
+        line=places[valid],
+        invalid_lines=places[~valid],
+        q_names=columns.q,
+        x_names=columns.x,
+        q_sign=conversion.q_sign,
+        units={"q": si_unit, "x": "m"},
+        file_units={"q": q_unit, "x": x_unit},
+        source=str(table.source),
+        **{argument: names[valid] for argument, names in labelled.items()},
+    )
+
+
+def _warn_of_millimetres(name: str, column: NDArray, unit: str) -> None:
+    """Warn if metres are declared but values (N, k) look like millimetres."""
+    span = (np.nanmax(column, axis=0) - np.nanmin(column, axis=0)).max()
+    middle = np.nanmedian(np.abs(column))
+    if unit == "m" and (middle > 10 or span > 5):
+        warnings.warn(
+            f"The `{name}` columns span {span:.4g} m around {middle:.4g} m; if the file has "
+            f"millimetres, give {name}_unit='mm' (centimetres: 'cm').",
+            stacklevel=4,
+        )
 
 
 def _checked_factor(n: int, q_unit: str, x_unit: str, q_sign: ArrayLike) -> NDArray:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from hybridkin._core.text_rows import TextForm
+from hybridkin.datasets._frames import frame_table
 from hybridkin.datasets._npz import arrays_of, check_expansion
 from hybridkin.datasets._tables import Table
 from hybridkin.datasets._text_files import text_table
@@ -11,7 +13,8 @@ from hybridkin.datasets._text_files import text_table
 _MOST_COLUMNS = 10_000  # of an array
 
 
-def read_table(path: Path, delimiter: str | None) -> Table:
+def read_table(path: Path, form: TextForm) -> Table:
+    """Return the table in a file; `form` is that of a text file."""
     if not path.is_file():
         raise FileNotFoundError(
             f"`path` must be a log file, there is none at {str(path)!r}."
@@ -20,7 +23,7 @@ def read_table(path: Path, delimiter: str | None) -> Table:
         return _read_npz(path)
     if path.suffix.lower() in (".parquet", ".pq"):
         return _read_parquet(path)
-    return text_table(path, delimiter)
+    return text_table(path, form)
 
 
 def _read_npz(path: Path) -> Table:
@@ -44,8 +47,6 @@ def _read_parquet(path: Path) -> Table:
 
         _check_rows(path)
         frame = pd.read_parquet(path)
-        for name in frame.select_dtypes("datetimetz"):
-            frame[name] = frame[name].dt.tz_convert(None)  # to UTC
     except ImportError as error:
         raise ImportError(
             f"Reading {str(path)!r} needs pandas and pyarrow (pip install pandas pyarrow); or "
@@ -55,9 +56,7 @@ def _read_parquet(path: Path) -> Table:
         raise ValueError(
             f"{str(path)!r} is not a parquet file: {error!s:.200}."
         ) from error
-    return Table(
-        path, [*map(str, frame.columns)], [frame[c].to_numpy() for c in frame.columns]
-    )
+    return frame_table(frame, path)
 
 
 def _check_rows(path: Path) -> None:

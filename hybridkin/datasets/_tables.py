@@ -4,25 +4,36 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridkin._core.text_rows import cell_advice, number_of
 from hybridkin._core.texts import csv_cell
+
+UNNAMED = ("", "nan", "NaN", "NaT", "None", "<NA>")
+"""A missing motion or value, as text."""
 
 _LONGEST = 256  # characters of a motion's name
 
 
 class Table(NamedTuple):
-    """The unconverted columns of a file; for text also the line of every row."""
+    """The unconverted columns of a file or data frame; for text also the line of every row.
 
-    path: Path
+    `units` are the units of length of columns that a file states, and `statement` says where.
+    """
+
+    source: str | Path
     header: list[str]
-    columns: Sequence[NDArray | Sequence[str]]
+    columns: Sequence[Any]  # each a Sequence or array
     lines: NDArray | None = None
+    decimal: str = "."
+    units: Mapping[str, str] = MappingProxyType({})
+    statement: str = ""
 
     def names(self, argument: str, names: Sequence[str]) -> list[str]:
         """Return names of columns; the name of an array (N, k) becomes those of its columns."""
@@ -41,7 +52,7 @@ class Table(NamedTuple):
                 columns.append(name)
         return columns
 
-    def column(self, name: str) -> NDArray | Sequence[str]:
+    def column(self, name: str) -> Any:
         """Return the column of that name."""
         if not isinstance(name, str):
             raise TypeError(
@@ -51,10 +62,10 @@ class Table(NamedTuple):
         if name not in self.header and written in self.header:
             name = written
         count = self.header.count(name)
-        path = str(self.path)
+        source = str(self.source)
         if count > 1:
             raise ValueError(
-                f"Column {name!r} occurs {count} times in {path!r}; rename it."
+                f"Column {name!r} occurs {count} times in {source!r}; rename it."
             )
         if count:
             return self.columns[self.header.index(name)]
@@ -64,18 +75,18 @@ class Table(NamedTuple):
         if len(self.header) == 1:
             hint = "it has only one column, check `delimiter`. Its"
         raise ValueError(
-            f"There is no column {name!r} in {path!r}; {hint:.400} columns: {self.header!s:.1000}."
+            f"There is no column {name!r} in {source!r}; {hint:.400} columns: "
+            f"{self.header!s:.1000}."
         )
 
     def numbers(self, name: str, as_time: bool) -> NDArray:
         """Return the column of that name as numbers, NaN for empty cells; times in seconds."""
         column = self.column(name)
         if self.lines is not None:
-            numbers = []
-            for cell, line in zip(column, self.lines, strict=True):
-                numbers.append(number_of(str(cell), name, line, self.path))
-            return np.array(numbers)
+            return self._numbers_of_text(name, column, self.lines)
         values = np.asarray(column)
+        if values.dtype == object:
+            values = _of_objects(values)
         kind = values.dtype
         if as_time and kind.kind in "mM":
             return (values - kind.type(0, "s")) / np.timedelta64(1, "s")
@@ -86,12 +97,44 @@ class Table(NamedTuple):
         except (TypeError, ValueError, OverflowError):
             pass
         raise ValueError(
-            f"Column {name!r} of {str(self.path)!r} must hold numbers, got {kind}."
+            f"Column {name!r} of {str(self.source)!r} must hold numbers, got {kind}."
         )
 
-    def values(self, names: list[str], time: str | None) -> NDArray:
-        """Return columns as numbers (N, k), that of the time in seconds."""
-        columns = {name: self.numbers(name, name == time) for name in names}
+    def _numbers_of_text(
+        self, name: str, cells: Sequence[str], lines: NDArray
+    ) -> NDArray:
+        """Return the numbers in cells (N,) of text, NaN for missing ones."""
+        if self.decimal == ".":
+            try:
+                return np.array([*map(float, cells)])
+            except ValueError:
+                pass  # empty cells, or no numbers
+        numbers = np.empty(len(cells))
+        for k, cell in enumerate(cells):
+            try:
+                numbers[k] = number_of(str(cell), self.decimal)
+            except ValueError:
+                advice = cell_advice(str(cell), self.decimal)
+                raise ValueError(
+                    f"Line {lines[k]} of {str(self.source)!r}, column {name!r}: a number is "
+                    f"needed, got {str(cell).strip()!r:.60}; {advice}."
+                ) from None
+        return numbers
+
+    def check_unit(self, argument: str, names: Sequence[str], unit: str) -> None:
+        """Raise if the file states another unit of columns than the declared one."""
+        for name in names:
+            stated = self.units.get(name, unit)
+            if stated != unit:
+                raise ValueError(
+                    f"`{argument}_unit` must be {stated!r} for column {name!r}, as "
+                    f"{self.statement} in {str(self.source)!r}, got {unit!r}; give "
+                    f"{argument}_unit={stated!r} (--{argument}-unit {stated})."
+                )
+
+    def values(self, names: list[str], times: Sequence[str]) -> NDArray:
+        """Return columns as numbers (N, k), those of times in seconds."""
+        columns = {name: self.numbers(name, name in times) for name in names}
         if len(columns) < len(names):
             raise ValueError(
                 f"`q`, `x` and `time` must name a column once, got {names}."
@@ -99,11 +142,11 @@ class Table(NamedTuple):
         sizes = {name: len(column) for name, column in columns.items()}
         if len({*sizes.values()}) > 1:
             raise ValueError(
-                f"The columns of {str(self.path)!r} must be equally long, got {sizes}."
+                f"The columns of {str(self.source)!r} must be equally long, got {sizes}."
             )
         if not all(sizes.values()):
             header = "no" if self.lines is None else "a header but no"
-            raise ValueError(f"{str(self.path)!r} has {header} rows.")
+            raise ValueError(f"{str(self.source)!r} has {header} rows.")
         return np.column_stack([*columns.values()])
 
     def labels(self, argument: str, name: str, n_rows: int) -> NDArray:
@@ -113,21 +156,20 @@ class Table(NamedTuple):
         if len(labels) != n_rows or longest > _LONGEST:
             raise ValueError(
                 f"`{argument}` must name each of {n_rows} rows in at most {_LONGEST} characters, "
-                f"but column {name!r} of {str(self.path)!r} has {len(labels)} rows of up to "
+                f"but column {name!r} of {str(self.source)!r} has {len(labels)} rows of up to "
                 f"{longest} characters; check the file."
             )
         return np.array(labels)
 
 
-def number_of(cell: str, name: str, line: int, path: Path) -> float:
-    text = cell.strip()
-    if not text:
-        return np.nan
-    try:
-        return float(text)
-    except ValueError:
-        raise ValueError(
-            f"Line {line} of {str(path)!r}, column {name!r}: a number is needed, got {text!r:.60}; "
-            "correct the cell (an empty cell is a missing value, see `drop_invalid`; decimals "
-            "need a point)."
-        ) from None
+def _of_objects(values: NDArray) -> NDArray:
+    """Return objects as numbers or dates, NaN or NaT for those that are missing."""
+    present = [str(value) not in UNNAMED for value in values]
+    dates = [value for value in values if hasattr(value, "timestamp")]
+    if dates:  # with a time zone
+        seconds = np.full(len(values), np.nan)
+        seconds[present] = [value.timestamp() for value in values[present]]
+        return (1e9 * seconds).astype("M8[ns]")
+    filled = values.copy()
+    filled[~np.array(present, dtype=bool)] = np.nan
+    return filled
