@@ -192,7 +192,6 @@ def likely_header(lines: Sequence[str]) -> int:
             if len(names) > most_cells and _above_numbers(rows, k):
                 best = row.line
                 most_cells = len(names)
-                break
     return best
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -21,6 +22,8 @@ _LENGTHS = {  # as Motive writes them
     "inches": "in",
 }
 _AXES = ("X", "Y", "Z", "W")
+_AXIS = re.compile("([RT]?)([XYZW]'*)")  # of Vicon; X' is a speed
+_OF_BODIES = {"R": "rot "}
 
 
 @dataclass(frozen=True)
@@ -144,11 +147,12 @@ class Vicon(HeaderBlock):
         marker = ""
         for k, cell in enumerate(axes.cells):
             marker = _cell(rows[place - 1], k).rpartition(") ")[2] or marker
-            axis = cell.strip()
-            if len(axis) == 2 and axis[0] in "RT" and axis[1] in _AXES:
-                axis = f"rot {axis[1]}" if axis[0] == "R" else axis[1]
-            names.append(f"{marker} {axis}" if k > 1 and axis else axis)
             unit = _cell(rows[place + 1], k)
+            axis = cell.strip()
+            is_axis = _AXIS.fullmatch(axis)
+            if is_axis:
+                axis = _OF_BODIES.get(is_axis[1], "") + is_axis[2]
+            names.append(f"{marker} {axis}" if k > 1 and (is_axis or unit) else axis)
             if unit in METRES:
                 units[names[-1]] = unit
         first = place + 1 + (not _starts_with_number(rows[place + 1]))

@@ -105,16 +105,13 @@ class _Rows:
         last row that is too short was cut off while it was written: all its cells are missing.
         """
         names = self.header.names
-        n = len(names)
-        n_named = n
+        n_named = len(names)
         while n_named and not names[n_named - 1]:
             n_named -= 1
         cells = []
         for row in self.rows:
             n_cells = len(row.cells)
-            if n_named <= n_cells <= n and not any(row.cells[n_named:]):
-                cells.append(row.cells[:n_named])
-            elif n_cells > n and not any(map(str.strip, row.cells[n_named:])):
+            if n_cells >= n_named and not any(map(str.strip, row.cells[n_named:])):
                 cells.append(row.cells[:n_named])
             elif n_cells < n_named and row is self.rows[-1] and len(self.rows) > 1:
                 cells.append([""] * n_named)

@@ -336,7 +336,7 @@ def _rows_of(path: Path) -> list[list[str]]:
     """
     file = TextFile.of(path)
     lines = [line for line in file.head() if line.strip() and line.strip()[0] != "#"]
-    delimiter = TextForm().separator(lines[-1:])
+    delimiter = TextForm(decimal=",").separator(lines[-1:])
     rows = []
     for row in file.rows(delimiter):
         cells = [cell.strip() for cell in row.cells]
