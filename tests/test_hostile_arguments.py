@@ -132,7 +132,10 @@ CALIBRATE = {
 }
 
 
-READ = {"q_unit": "m", "x_unit": "m", "q_sign": 1, "delimiter": None, "drop_invalid": False}
+READ = {
+    **{"q_unit": "m", "x_unit": "m", "q_sign": 1, "delimiter": None, "drop_invalid": False},
+    **{"header_line": None, "decimal": ".", "missing": ()},
+}
 
 
 SETTINGS = {"n_folds": 2, "auto": False, "loss": "linear", "coverage": None}

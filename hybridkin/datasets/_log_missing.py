@@ -77,6 +77,8 @@ def _far_and_repeated(column: NDArray) -> list[float]:
 
 def _is_far(values: NDArray, counts: NDArray, end: int) -> bool:
     """Return whether the first or last of sorted values is no measurement."""
+    if values[end] == 0.0:  # see _lost_markers
+        return False
     others = np.delete(values, end)
     gap = abs(values[end] - others[end])
     many = counts[end] > _MOST * counts.sum()

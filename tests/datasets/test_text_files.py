@@ -221,7 +221,7 @@ def test_the_line_that_looks_like_the_header_is_named(tmp_path, separator):
 
 def test_a_header_line_that_is_not_there(tmp_path):
     path = write(tmp_path, vicon())
-    with pytest.raises(ValueError, match="`header_line` must be a line of .* got 90"):
+    with pytest.raises(ValueError, match=r"`header_line` must be a line of .* got 90"):
         log_columns(path, header_line=90)
     for wrong in (0, -1, True, 1.5, "2"):
         with pytest.raises(ValueError, match="`header_line` must be the number of a line"):
