@@ -100,9 +100,7 @@ class TextFile(NamedTuple):
         for encoding in encodings or _WITHOUT_MARK:
             if _is_text(path, encoding):
                 return cls(path, encoding)
-        raise ValueError(
-            f"{str(path)!r} is not a text file; save the log as CSV, npz or parquet."
-        )
+        raise ValueError(f"{str(path)!r} is not a text file; save it as CSV.")
 
     def open(self) -> TextIO:
         """Return the opened file, with the ends of its lines."""

@@ -196,7 +196,7 @@ def _proposed(answers: _Answers, given: _Answers) -> _Answers:
     n = answers["segments"] * answers["actuators"]
     if answers["log"] is None:
         return {"q": [f"q{i + 1}" for i in range(n)], "x": ["x", "y", "z"]}
-    from hybridkin.datasets._table_files import read_table  # loads torch
+    from hybridkin.datasets.table_files import read_table  # loads torch
 
     form = TextForm(given["delimiter"], given["header_line"], given["decimal"] or ".")
     table = read_table(answers["log"], form)

@@ -25,8 +25,8 @@ from hybridkin._core.text_rows import TextForm
 from hybridkin._core.units import METRES, UNITS
 from hybridkin.datasets._frames import frame_table
 from hybridkin.datasets._log_report import named_rows
-from hybridkin.datasets._table_files import read_table
 from hybridkin.datasets._tables import UNNAMED, Table
+from hybridkin.datasets.table_files import read_table
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -245,7 +245,7 @@ def load_log(
         that it states must be `x_unit`.
     decimal : {".", ","}, default="."
         Decimal sign of a text file.
-    missing : array-like of float, default=()
+    missing : sequence of float, default=()
         Numbers in q and x that stand for missing values, such as 9999.999, in the unit of the
         file. Zero means the 0, 0, 0 of a lost marker, not zeros elsewhere.
     drop_invalid : bool, default=False
