@@ -142,7 +142,10 @@ np.savetxt(
 )
 
 
-READ = {"q_unit": "m", "x_unit": "m", "q_sign": 1, "delimiter": None, "drop_invalid": False}
+READ = {
+    **{"q_unit": "m", "x_unit": "m", "q_sign": 1, "delimiter": None, "drop_invalid": False},
+    **{"header_line": None, "decimal": ".", "missing": (), "unwrap": False},
+}
 
 
 SETTINGS = {"n_folds": 2, "auto": False, "loss": "linear", "coverage": None}
@@ -292,7 +295,7 @@ ENTRIES = {
                 "unit": "mm",
                 "sign": [1, 1, -1],
             },
-            **{"groups": "g", "delimiter": None},
+            **{"groups": "g", "delimiter": None, "header_line": None, "decimal": "."},
         },
     ),
     "datasets.merge_logs": (

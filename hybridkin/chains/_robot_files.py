@@ -16,6 +16,7 @@ import torch
 
 from hybridkin._core.arrays import shaped
 from hybridkin._core.rotations import rotation
+from hybridkin._core.text_rows import DECIMALS
 from hybridkin._core.units import METRES, UNITS
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
@@ -150,6 +151,9 @@ _ROWS: list[tuple[str, str, str, _Test]] = [
     ),
     ("log", "group_suffix", "be text", lambda value: isinstance(value, str)),
     ("log", "x_unit", *_among(*METRES)),
+    ("log", "header_line", *_WHOLE),
+    ("log", "decimal", *_among(*DECIMALS)),
+    ("log", "missing", "hold numbers", _many(_is_number)),
     ("log", "q_sign", "be 1 or -1, or a list of them", _one_or_many(_among(1, -1)[1])),
     (
         "limits",

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from importlib.resources import files
 from typing import Any, NamedTuple
 
-import hybridkin
+from hybridkin._core.text_rows import TextForm
 from hybridkin._core.texts import toml_value, visible
 from hybridkin._core.units import METRES
 from hybridkin.cli._terminal import write
@@ -108,6 +108,7 @@ def answered(given: _Answers, ask: bool) -> tuple[_Answers, list[str]]:
     defaults of columns come from the header of the log.
     """
     answers: _Answers = {"q_sign": 1}
+    answers |= {name: given[name] for name in ("header_line", "decimal", "missing")}
     missing = []
     columns = {}
     for question in QUESTIONS:
@@ -118,11 +119,11 @@ def answered(given: _Answers, ask: bool) -> tuple[_Answers, list[str]]:
             raise ValueError(f"{_option(name)} has no use: {needless}; leave it out.")
         if needless or (name == "q_sign" and value is None and _has_chambers(answers)):
             continue
-        if name == "q":
+        if name == "x_unit":
             if missing:
-                columns = {"q": (), "x": ()}
+                columns = {"q": (), "x": (), "x_unit": "mm"}
             else:
-                columns = _proposed(answers, given["delimiter"])
+                columns = _proposed(answers, given)
         question = question._replace(default=columns.get(name, question.default))
         if value is None:
             value = _asked(_worded(question, answers)) if ask else question.default
@@ -190,16 +191,21 @@ def _asked(question: _Question) -> Any:
             write(f"  {error if clear else 'must be a number'}", sys.stderr)
 
 
-def _proposed(answers: _Answers, delimiter: str | None) -> _Answers:
-    """Return the columns whose names look like actuators, tip, motion and time."""
+def _proposed(answers: _Answers, given: _Answers) -> _Answers:
+    """Return the columns whose names look like actuators, tip, motion and time, and their unit."""
     n = answers["segments"] * answers["actuators"]
     if answers["log"] is None:
         return {"q": [f"q{i + 1}" for i in range(n)], "x": ["x", "y", "z"]}
-    header = hybridkin.datasets.log_columns(answers["log"], delimiter)
+    from hybridkin.datasets.table_files import read_table  # loads torch
+
+    form = TextForm(given["delimiter"], given["header_line"], given["decimal"] or ".")
+    table = read_table(answers["log"], form)
+    header = table.header
     proposed: _Answers = {}
     tips = [*filter(_is_tip, zip(header, header[1:], header[2:], strict=False))]
     if tips:
-        proposed["x"] = max(tips, key=lambda three: "tip" in three[0].lower())
+        proposed["x"] = max(tips, key=_likeness_to_tip)
+        proposed["x_unit"] = table.units.get(proposed["x"][0], "mm")
     families: dict[str, list[str]] = {}  # names that differ in numbers only
     for name in header:
         if name not in proposed.get("x", ()) and re.search(r"\d", name):
@@ -212,6 +218,12 @@ def _proposed(answers: _Answers, delimiter: str | None) -> _Answers:
             if re.match(rf"({words})(?![a-z\d])", name.lower()):
                 proposed.setdefault(key, name)
     return proposed
+
+
+def _likeness_to_tip(three: Sequence[str]) -> tuple[bool, bool]:
+    """Return whether three columns are called tip, and whether they are no rotations."""
+    name = three[0].lower()
+    return "tip" in name, "rot " not in name
 
 
 def _is_tip(three: Sequence[str]) -> bool:

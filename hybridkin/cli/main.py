@@ -533,13 +533,16 @@ def _read(
     )
 
 
+_COLUMNS = ("q", "x", "q_unit", "x_unit", "q_sign", "groups", "runs", "time")
+_FORM = ("header_line", "decimal", "missing", "unwrap")
+
+
 def _log_format(
     arguments: argparse.Namespace, described: LogFormat | None, source: Path
 ) -> LogFormat:
     """Return how the log is written: as described, with what the options say instead."""
     entries = {}
-    names = ("q", "x", "q_unit", "x_unit", "q_sign", "groups", "runs", "time", "unwrap")
-    for name in names:
+    for name in (*_COLUMNS, *_FORM):
         value = vars(arguments)[name]
         if value is not None:
             entries[name] = None if value == "none" else value

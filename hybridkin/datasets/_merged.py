@@ -20,10 +20,12 @@ from hybridkin._core.arrays import (
     one_of,
     real_array,
 )
+from hybridkin._core.text_rows import TextForm
 from hybridkin._core.units import METRES, UNITS
 from hybridkin.datasets._encoders import _features as rough_features
 from hybridkin.datasets._log_report import named_rows
-from hybridkin.datasets._logs import Log, _read
+from hybridkin.datasets._logs import Log
+from hybridkin.datasets.table_files import read_table
 
 _GAP = 5.0  # usual periods of the motor rows: longer ones are gaps
 _CELLS = 2**14  # of the coarse search, at most
@@ -106,6 +108,8 @@ def read_columns(
     sign: ArrayLike = 1,
     groups: str | None = None,
     delimiter: str | None = None,
+    header_line: int | None = None,
+    decimal: str = ".",
 ) -> TimedColumns:
     r"""Return columns of a recording that holds only commands, or only tips, with their times.
 
@@ -123,7 +127,7 @@ def read_columns(
         Factor on the columns, as `q_sign` of `load_log`.
     groups : str or None, default=None
         Column that names the motion of a row.
-    delimiter : str or None, default=None
+    delimiter, header_line, decimal
         As for `load_log`.
 
     Returns
@@ -148,9 +152,10 @@ def read_columns(
     """
     one_of(unit, "unit", UNITS)
     factor = np.multiply(real_array(sign, "sign"), UNITS[unit])
-    table = _read(as_path(path), delimiter)
+    table = read_table(as_path(path), TextForm(delimiter, header_line, decimal))
     columns = table.names("names", names)
-    values = table.values([*columns, time], time)
+    table.check_unit("unit", columns, unit)
+    values = table.values([*columns, time], [time])
     timed = countable(values[:, -1])
     motions = None
     if groups is not None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -18,7 +17,7 @@ import hybridkin
 from hybridkin._core.units import METRES
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.robots import LogFormat
-from hybridkin.datasets import Log, load_log
+from hybridkin.datasets import Log, load_log, log_columns
 from hybridkin.ik import trajectories
 from hybridkin.ik.results import IKStatus, Track, score, statuses
 from hybridkin.ik.trajectories import Trajectory
@@ -578,15 +577,16 @@ def read_track(path: str | Path, log_format: LogFormat) -> Log:
         raise FileNotFoundError(
             f"`track` must be a file of commands, there is none at {file}."
         )
-    with open(file, encoding="utf-8-sig", newline="") as lines:
-        header = [name.strip() for name in next(csv.reader(lines), [])]
+    header = log_columns(
+        file, header_line=log_format.header_line, decimal=log_format.decimal
+    )
     time = None
     for name in (TIME, log_format.time):
         if time is None and name in header:
             time = name
     columns = replace(log_format, groups=None, time=time)
     if {*TARGET} <= {*header}:
-        columns = replace(columns, x=TARGET, groups="status")
+        columns = columns.of_tracks(TARGET)
     return load_log(file, **columns.reading)
 
 
