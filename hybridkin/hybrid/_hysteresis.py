@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridkin._core.model import as_forward_model
-from hybridkin.calibration.hysteresis_fit import HysteresisLog, which_count
+from hybridkin.calibration.hysteresis_log import HysteresisLog, which_count
 from hybridkin.calibration.hysteresis_search import find_hysteresis
 from hybridkin.chains.hysteresis import HysteresisOperator
 from hybridkin.chains.play import PlayOperator
@@ -44,7 +44,8 @@ def play_of(spec: Spec, rows: Rows) -> tuple[HysteresisOperator | None, list[str
         return None, []
     ranges = np.ptp(rows.X, axis=0)
     if isinstance(play, str):
-        chosen = choose_hysteresis(spec.calibrated(replace(rows, groups=None)), rows)
+        measured = replace(rows, groups=None).take(rows.counted)
+        chosen = choose_hysteresis(spec.calibrated(measured), rows)
         single = isinstance(chosen, PlayOperator)
         if not single or chosen.width < 0.95 * ranges.max():
             return chosen, []
@@ -119,7 +120,7 @@ def moved_without(spec: Spec, log: Rows, held_out: NDArray) -> Rows:
     held_out : ndarray of int
         Places of measured rows that do not count.
     """
-    measured = np.flatnonzero(log.counts > 0.0)
+    measured = log.counted
     weights = log.counts.copy()
     weights[measured[held_out]] = 0.0
     operator, _ = play_of(spec, replace(log, weights=weights).in_runs())
