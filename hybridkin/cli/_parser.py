@@ -263,7 +263,7 @@ def _fit(command: argparse.ArgumentParser) -> None:
         help='backlash (play) of the actuators in the "auto" hybrid: its total width in the unit '
         "of q; auto: backlash, friction and creep, found in every fold (auto if the log shows any)",
     )
-    few = "use at most N rows, every k-th of a longer log; 0: all rows (2000)"
+    few = "use the tips of at most N rows, spread over motions; 0: of all rows (2000)"
     number = between(-1, float("inf"), int)
     add("--max-rows", type=number, default=2000, metavar="N", help=few)
     add(
