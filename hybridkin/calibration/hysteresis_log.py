@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from hybridkin._core.model import ForwardModel
 from hybridkin._core.runs import RunOrder
 from hybridkin.calibration.measured import folds, thinned
-from hybridkin.chains.play import PlayOperator
-from hybridkin.chains.reversals import reversals
+from hybridkin.chains.reversals import behind, reversals
 
 _MOST_COUNTED = 10_000  # rows whose errors are computed
 _MOST_FOLLOWED = 20_000  # rows that the operators follow, if few enough reverse
@@ -135,16 +134,17 @@ class HysteresisLog:
 
     def _followed(self, size: float) -> NDArray:
         """Return the rows that count, and those that show reversals of a relative size."""
-        order = self.order.order
-        in_order = self.q[order]
-        widths = size * self.ranges
-        moved = PlayOperator(widths).apply_by_group(self.q, self.runs)[order]
-        way = np.abs(np.diff(moved, axis=0, prepend=moved[:1])) / self.ranges
-        parts = np.floor(np.cumsum(way.max(axis=1)) / (_WAY * size))
-        kept = self.order.first | reversals(in_order, self.order, widths).any(axis=1)
+        order = self.order
+        moved = behind(self.q[order.order], order, size * self.ranges)
+        kept = order.first | reversals(moved, order).any(axis=1)
+        way = np.abs(np.diff(moved / self.ranges, axis=0, prepend=0.0)).max(axis=1)
+        way[order.first] = 0.0
+        parts = np.floor(np.cumsum(way) / (_WAY * size))
         kept |= np.diff(parts, prepend=0.0) > 0.0
-        kept[np.isin(order, self.rows)] = True
-        return order[kept]
+        needed = np.zeros(len(self.q), dtype=bool)
+        needed[order.order] = kept
+        needed[self.rows] = True
+        return np.flatnonzero(needed)
 
     def _take(self, rows: NDArray) -> HysteresisLog:
         """Return some of the rows, in order; the steps between them span those left out."""

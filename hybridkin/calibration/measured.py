@@ -11,12 +11,12 @@ from sklearn.model_selection import GroupKFold, KFold
 from hybridkin._core.arrays import countable
 from hybridkin._core.directions import moved_directions
 from hybridkin._core.runs import RunOrder
+from hybridkin._core.spread import spread
 from hybridkin._core.turns import TURNS
 
 # fractions of rows by distance: end of the inner, start of the outer
 _INNER = 0.4
 _BEYOND = 0.65
-_GOLDEN = 0.5 * (5.0**0.5 - 1.0)  # its multiples, modulo 1, are evenly spread
 _ROWS_OF_MOTION = 10  # of a thinned log, if it has motions enough
 
 
@@ -123,17 +123,6 @@ def folds(
 def evenly_spaced(n: int, most: int) -> NDArray[np.intp]:
     """Return the places of at most `most` of n rows, evenly spaced."""
     return np.linspace(0, n - 1, min(most, n)).astype(np.intp)
-
-
-def spread(n: int, most: int, first: int = 0) -> NDArray[np.intp]:
-    """Return the places of at most `most` of n rows, one in each of equal parts.
-
-    Steps between them differ, so that they do not repeat with a periodic motion. Other numbers
-    `first` give other places.
-    """
-    parts = np.arange(min(most, n) + 1) * n // max(1, min(most, n))
-    within = (first + np.arange(1, len(parts))) * _GOLDEN % 1.0
-    return parts[:-1] + (within * np.diff(parts)).astype(np.intp)
 
 
 def thinned(motions: NDArray, most: int) -> NDArray[np.intp]:

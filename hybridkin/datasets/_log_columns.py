@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybridkin._core.directions import in_terms, moved_directions
 from hybridkin._core.distinct import distinct_rows
+from hybridkin.chains.reversals import Coarseness
 from hybridkin.datasets._log_report import LogFinding, named_rows
 from hybridkin.datasets._logs import Log, column_names
 
@@ -302,6 +303,27 @@ def times(rows: LogRows) -> Iterator[LogFinding]:
         yield rows.finding("time", message, advice, gaps)
 
 
+def reversals(rows: LogRows) -> Iterator[LogFinding]:
+    """Yield a finding if actuators reverse at more than a third of the rows of a run."""
+    log = rows.log
+    runs = log.groups if log.runs is None else log.runs
+    if runs is None:
+        return
+    coarse = Coarseness.of(log.q, runs)
+    if coarse.shows_reversals:
+        return
+    name, _ = rows.columns("q")[int(coarse.share.argmax())]
+    message = (
+        f"actuator {name!r} reverses at {100.0 * coarse.share.max():.0f} % of the rows within "
+        "runs: what the actuators do between the rows is not in the log."
+    )
+    advice = (
+        "this is right for postures at rest; to find backlash, friction or creep, record rows "
+        "closer in time, also those without a measured tip."
+    )
+    yield rows.finding("reversals", message, advice, severity="note")
+
+
 def few_rows(rows: LogRows) -> Iterator[LogFinding]:
     """Yield a finding if there are too few rows."""
     n_rows = len(rows.log.q)
@@ -340,6 +362,7 @@ COLUMN_CHECKS: tuple[Callable[[LogRows], Iterator[LogFinding]], ...] = (
     same_commands,
     jumps,
     times,
+    reversals,
     few_rows,
     motions,
 )

@@ -102,7 +102,7 @@ def fit_log(
     measured = rows.measured
     progress("calibration", 0, 1)
     mechanical = Mechanical.of(robot, measured, settings.loss)
-    messages = [*mechanical.messages, *_suspicions(complete, mechanical)]
+    messages = [*mechanical.messages, *_suspicions(measured, mechanical)]
     for message in messages:
         warnings.warn(message, stacklevel=2)
     settings = with_play_detected(settings, rows, mechanical)
