@@ -74,7 +74,11 @@ class LogFormat:
     group_suffix : str
         A motion whose name ends in this suffix belongs to the motion named without it.
     groups, runs, time : str or None
-        Columns of the motion of each row, of its run (see `Commands`), and of its time stamp [s].
+        Columns of the motion of each row, of its run (see `Commands`), and of its time stamp.
+    time_unit : {"s", "ms", "us", "ns", "frames"}
+        Unit of the time stamps.
+    rate : float or None
+        Frames per second, if `time_unit` is "frames" [1/s].
     """
 
     q: tuple[str, ...]
@@ -86,6 +90,8 @@ class LogFormat:
     groups: str | None = None
     time: str | None = None
     runs: str | None = None
+    time_unit: str = "s"
+    rate: float | None = None
 
     @property
     def q_factor(self) -> NDArray:

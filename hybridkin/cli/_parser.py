@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import hybridkin
-from hybridkin._core.units import METRES, UNITS
+from hybridkin._core.units import FRAMES, METRES, SECONDS, UNITS
 from hybridkin.cli._init import QUESTIONS
 from hybridkin.cli._terminal import write
 from hybridkin.cli._values import (
@@ -635,7 +635,10 @@ def _add_log(command: argparse.ArgumentParser) -> None:
     )
     text = "column that names the run, motions without a break between them; or none"
     add("--runs", metavar="COLUMN", help=text)
-    add("--time", metavar="COLUMN", help="column of the time [s]; or none")
+    add("--time", metavar="COLUMN", help="column of the time; or none")
+    add("--time-unit", choices=(*SECONDS, FRAMES), help="unit of the time (s)")
+    text = "frames per second, for --time-unit frames"
+    add("--rate", type=positive, metavar="HZ", help=text)
     add("--delimiter", metavar="CHAR", help=_DELIMITER)
     text = "leave out motions by name, such as '*tendon*'; may be repeated"
     add("--exclude", action="append", default=[], metavar="PATTERN", help=text)

@@ -25,7 +25,7 @@ import hybridkin  # its folders are opened when used: help comes at once
 from hybridkin._core.files import check_outputs, write_file
 from hybridkin._core.texts import visible
 from hybridkin._core.turns import one_thread
-from hybridkin._core.units import METRES
+from hybridkin._core.units import FRAMES, METRES
 from hybridkin.cli import _demo as demo
 from hybridkin.cli._init import answered, description
 from hybridkin.cli._parser import failed, parser
@@ -533,12 +533,18 @@ def _read(
     )
 
 
+_LOG_OPTIONS = ("q", "x", "q_unit", "x_unit", "q_sign", "groups", "runs", "time")
+_LOG_OPTIONS += ("time_unit", "rate")
+
+
 def _log_format(
     arguments: argparse.Namespace, described: LogFormat | None, source: Path
 ) -> LogFormat:
     """Return how the log is written: as described, with what the options say instead."""
     entries = {}
-    for name in ("q", "x", "q_unit", "x_unit", "q_sign", "groups", "runs", "time"):
+    if arguments.time_unit not in (None, FRAMES):
+        entries["rate"] = None  # that of the description is one of frames
+    for name in _LOG_OPTIONS:
         value = vars(arguments)[name]
         if value is not None:
             entries[name] = None if value == "none" else value

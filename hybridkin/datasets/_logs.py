@@ -27,9 +27,10 @@ from hybridkin._core.arrays import (
 )
 from hybridkin._core.commands import Commands
 from hybridkin._core.texts import csv_cell
-from hybridkin._core.units import METRES, UNITS
+from hybridkin._core.units import METRES, UNITS, duration_in_words
 from hybridkin.datasets._log_report import named_rows
 from hybridkin.datasets._npz import arrays_of, check_expansion
+from hybridkin.datasets._time import seconds_per_unit
 
 _DELIMITERS = (",", ";", "\t")
 _UNNAMED = ("", "nan", "NaN", "NaT", "None", "<NA>")  # a missing motion, as text
@@ -119,7 +120,8 @@ class Log:
             f"tips within {span} {self.units['x']}",
         ]
         if self.time is not None:
-            lines.append(f"time from {self.time[0]:.6g} to {self.time[-1]:.6g} s")
+            duration = duration_in_words(float(np.ptp(self.time)))
+            lines.append(f"time from {self.time[0]:.6g} s, {duration} long")
         return "\n  ".join(lines)
 
     @property
@@ -153,6 +155,8 @@ def load_log(
     *,
     runs: str | None = None,
     time: str | None = None,
+    time_unit: str = "s",
+    rate: float | None = None,
     q_unit: str = "m",
     x_unit: str = "m",
     q_sign: ArrayLike = 1,
@@ -178,8 +182,12 @@ def load_log(
         Column that names the run of a row, for models with hysteresis, see `Commands`. Default:
         every motion is a run.
     time : str or None, default=None
-        Column of the time stamp [s]. In npz and parquet files also dates, which become seconds
-        since 1970 (UTC), and durations.
+        Column of the time stamp. In npz and parquet files also dates, which become seconds since
+        1970 (UTC), and durations.
+    time_unit : {"s", "ms", "us", "ns", "frames"}, default="s"
+        Unit of the time stamps in the file; dates and durations have their own.
+    rate : float or None, default=None
+        Frames per second, for ``time_unit="frames"`` [1/s].
     q_unit : {"m", "cm", "mm", "um", "in", "rad", "deg", "1"}, default="m"
         Unit of the actuator columns in the file; lengths become metres and angles radians. "1" is
         not converted: counts or pressures, for a chain with `gains`.
@@ -239,8 +247,11 @@ def load_log(
         )
     factor = _checked_factor(len(q), q_unit, x_unit, q_sign)
     names = [*q, *x]
+    stamps = ()
     if time is not None:
         names.append(time)
+        stamps = table.column(time)
+    seconds = seconds_per_unit(stamps, time_unit, rate)
     values = table.values(names, time)
     labelled = {}
     for argument, column in {"groups": groups, "runs": runs}.items():
@@ -283,7 +294,7 @@ def load_log(
     return Log(
         commands * factor,
         tips * METRES[x_unit],
-        time=None if time is None else values[valid, -1],
+        time=None if time is None else seconds * values[valid, -1],
         line=places[valid],
         invalid_lines=places[~valid],
         q_names=q,
