@@ -16,6 +16,7 @@ from sklearn.pipeline import Pipeline, make_pipeline
 from sklearn.preprocessing import MinMaxScaler, PolynomialFeatures
 
 from hybridkin._core.arrays import whole
+from hybridkin._core.commands import Commands
 from hybridkin._core.model import ForwardModel
 from hybridkin._core.turns import one_thread
 from hybridkin.calibration.calibrate import CalibrationResult, fit_geometry
@@ -23,8 +24,6 @@ from hybridkin.calibration.choice import GeometryChoice, choose_geometry
 from hybridkin.calibration.measured import distances, folds
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.robots import RobotDescription
-from hybridkin.hybrid._rows import Rows
-from hybridkin.hybrid._spec import Spec
 from hybridkin.hybrid.estimator import HybridForwardModel, prepared, with_fit
 from hybridkin.hybrid.held_out import HeldOut, Predictions, chosen_blend
 from hybridkin.hybrid.log_distance import held_out_distances
@@ -272,19 +271,21 @@ def with_play_detected(
     in_order = rows.named and not rows.n_late
     if mechanical.start is not None and settings.auto and in_order:
         model = HybridForwardModel(mechanical.model, "drop", play="auto")
-        fitted = fit_to_log(*fit_arguments(model, rows))
+        fitted = fit_to_log(*prepared(model, *columns_to_fit(model, rows)))
         play = None if fitted.play is None else "auto"
     return replace(settings, play=play)
 
 
-def fit_arguments(model: HybridForwardModel, rows: MeasuredLog) -> tuple[Spec, Rows]:
-    """Return the settings of a model and the rows of a log, for `fit_to_log`.
+def columns_to_fit(
+    model: HybridForwardModel, rows: MeasuredLog
+) -> tuple[Commands, NDArray, NDArray, NDArray]:
+    """Return commands, tips, motions and counts of the rows of a log that a model needs.
 
     Rows that do not count move the actuators; a model without hysteresis does not need them.
     """
     if model.play is None:
         rows = rows.measured
-    return prepared(model, rows.commands, rows.x, rows.motions, rows.counts)
+    return rows.commands, rows.x, rows.motions, rows.counts
 
 
 class FittedModels(NamedTuple):
@@ -320,7 +321,7 @@ def fit_to_all(
         progress_of_fit(0, 1)
         if name == AUTO:  # it will be saved
             model.set_params(coverage=settings.coverage)
-        spec, log = fit_arguments(model, rows)
+        spec, log = prepared(model, *columns_to_fit(model, rows))
         spec = replace(spec, progress=progress_of_fit, compared=True)
         fits[name] = fit_to_log(spec, log, mechanical.geometry)
     return FittedModels(mechanical, models, fits)
@@ -456,7 +457,7 @@ def _one_fold(
     choices = {}
     auto = None
     for name, model in models_to_save(robot, mechanical, settings).items():
-        spec, log = fit_arguments(model, train)
+        spec, log = prepared(model, *columns_to_fit(model, train))
         spec = spec.starting_at(starts[name])
         fitted = fit_to_log(spec, log, mechanical.geometry)
         model = with_fit(model, fitted)

@@ -12,7 +12,7 @@ import numpy as np
 
 from hybridkin.chains.robots import RobotDescription
 from hybridkin.datasets import Log
-from hybridkin.hybrid.estimator import HybridForwardModel, with_fit
+from hybridkin.hybrid.estimator import HybridForwardModel, prepared, with_fit
 from hybridkin.hybrid.log_fit import fit_to_log
 from hybridkin.saving.saved_model import save_model
 from hybridkin.workflow.calibrated import Calibration, deviations
@@ -25,8 +25,8 @@ from hybridkin.workflow.compare import (
     Comparison,
     FitSettings,
     Mechanical,
+    columns_to_fit,
     compare_by_group,
-    fit_arguments,
     fit_to_all,
     with_play_detected,
 )
@@ -117,7 +117,7 @@ def fit_log(
     fit = fitted.fits[saved]
     if settings.coverage is not None and not settings.auto:
         model.set_params(coverage=settings.coverage)
-        fit = fit_to_log(*fit_arguments(model, measured))
+        fit = fit_to_log(*prepared(model, *columns_to_fit(model, measured)))
     fit = fit.of_all_rows(complete.q, complete.x)
     model = with_fit(model, fit.expecting(float(compared.errors[saved].mean())))
     progress("writing the report", 0, 1)

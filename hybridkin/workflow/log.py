@@ -56,7 +56,7 @@ class MeasuredLog(Log):
     named : bool
         Whether the log names its motions; else they are ten parts of it.
     counts : ndarray of shape (N,)
-        1 where the measurement of a row counts; 0 where a row only moves the actuators.
+        1 where the measurement of a row counts; 0 where a row only moves the actuators [1].
     excluded : tuple of str
         Patterns of the motions that were left out.
     """
