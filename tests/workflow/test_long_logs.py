@@ -102,13 +102,13 @@ def test_more_motions_do_not_make_the_model_worse(tmp_path):
 def test_a_log_that_is_too_coarse_for_its_reversals_says_so():
     log = log_of(12)
 
-    def words(step):
+    def words(step, operator=PLAY):
         rows = log.rows(np.arange(0, len(log.q), step))
-        return coarse_in_words(PLAY, Rows(rows.q, rows.x, groups=rows.groups))
+        return coarse_in_words(operator, Rows(rows.q, rows.x, groups=rows.groups))
 
     assert not [f for f in check_log(log).findings if f.kind == "reversals"]
     assert words(1) == []
-    assert "reverses about" in words(6)[0]
+    assert "reverses about" in words(2, PlayOperator(0.001))[0]
     coarse = log.rows(np.arange(0, len(log.q), 12))
     (finding,) = (f for f in check_log(coarse).findings if f.kind == "reversals")
     assert "% of the rows" in finding.message
