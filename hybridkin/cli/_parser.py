@@ -16,7 +16,7 @@ from typing import Any, NoReturn
 
 import hybridkin
 from hybridkin._core.text_rows import DECIMALS
-from hybridkin._core.units import METRES, UNITS
+from hybridkin._core.units import FRAMES, METRES, SECONDS, UNITS
 from hybridkin.cli._init import QUESTIONS
 from hybridkin.cli._terminal import write
 from hybridkin.cli._values import (
@@ -265,7 +265,7 @@ def _fit(command: argparse.ArgumentParser) -> None:
         help='backlash (play) of the actuators in the "auto" hybrid: its total width in the unit '
         "of q; auto: backlash, friction and creep, found in every fold (auto if the log shows any)",
     )
-    few = "use at most N rows, every k-th of a longer log; 0: all rows (2000)"
+    few = "use the tips of at most N rows, spread over motions; 0: of all rows (2000)"
     number = between(-1, float("inf"), int)
     add("--max-rows", type=number, default=2000, metavar="N", help=few)
     add(
@@ -650,7 +650,10 @@ def _add_log(command: argparse.ArgumentParser) -> None:
     )
     text = "column that names the run, motions without a break between them; or none"
     add("--runs", metavar="COLUMN", help=text)
-    add("--time", metavar="COLUMN", help="column of the time [s]; or none")
+    add("--time", metavar="COLUMN", help="column of the time; or none")
+    add("--time-unit", choices=(*SECONDS, FRAMES), help="unit of the time (s)")
+    text = "frames per second, for --time-unit frames"
+    add("--rate", type=positive, metavar="HZ", help=text)
     _add_text_form(log)
     text = "leave out motions by name, such as '*tendon*'; may be repeated"
     add("--exclude", action="append", default=[], metavar="PATTERN", help=text)

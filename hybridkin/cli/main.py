@@ -25,7 +25,7 @@ import hybridkin  # its folders are opened when used: help comes at once
 from hybridkin._core.files import check_outputs, write_file
 from hybridkin._core.texts import visible
 from hybridkin._core.turns import one_thread
-from hybridkin._core.units import METRES
+from hybridkin._core.units import FRAMES, METRES
 from hybridkin.cli import _demo as demo
 from hybridkin.cli._init import answered, description
 from hybridkin.cli._parser import failed, parser
@@ -535,6 +535,7 @@ def _read(
 
 _COLUMNS = ("q", "x", "q_unit", "x_unit", "q_sign", "groups", "runs", "time")
 _FORM = ("header_line", "decimal", "missing", "unwrap")
+_TIME = ("time_unit", "rate")
 
 
 def _log_format(
@@ -542,7 +543,9 @@ def _log_format(
 ) -> LogFormat:
     """Return how the log is written: as described, with what the options say instead."""
     entries = {}
-    for name in (*_COLUMNS, *_FORM):
+    if arguments.time_unit not in (None, FRAMES):
+        entries["rate"] = None  # that of the description is one of frames
+    for name in (*_COLUMNS, *_TIME, *_FORM):
         value = vars(arguments)[name]
         if value is not None:
             entries[name] = None if value == "none" else value

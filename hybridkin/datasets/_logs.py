@@ -22,11 +22,12 @@ from hybridkin._core.arrays import (
 )
 from hybridkin._core.commands import Commands
 from hybridkin._core.text_rows import TextForm
-from hybridkin._core.units import METRES, UNITS
+from hybridkin._core.units import METRES, UNITS, duration_in_words
 from hybridkin.datasets._encoders import given_periods, unwrapped
 from hybridkin.datasets._frames import frame_table
 from hybridkin.datasets._log_report import named_rows
 from hybridkin.datasets._tables import UNNAMED, Table
+from hybridkin.datasets._time import seconds_per_unit
 from hybridkin.datasets.table_files import read_table
 
 
@@ -112,7 +113,8 @@ class Log:
             f"tips within {span} {self.units['x']}",
         ]
         if self.time is not None:
-            lines.append(f"time from {self.time[0]:.6g} to {self.time[-1]:.6g} s")
+            duration = duration_in_words(float(np.ptp(self.time)))
+            lines.append(f"time from {self.time[0]:.6g} s, {duration} long")
         return "\n  ".join(lines)
 
     @classmethod
@@ -125,6 +127,8 @@ class Log:
         *,
         runs: str | None = None,
         time: str | None = None,
+        time_unit: str = "s",
+        rate: float | None = None,
         q_unit: str = "m",
         x_unit: str = "m",
         q_sign: ArrayLike = 1,
@@ -138,7 +142,9 @@ class Log:
         ----------
         df : data frame
             A frame of pandas, polars, modin or narwhals, or a table of pyarrow. Null is missing.
-        q, x, groups, runs, time, q_unit, x_unit, q_sign, missing, unwrap, drop_invalid
+        q, x, groups, runs, time, time_unit, rate
+            As for `load_log`.
+        q_unit, x_unit, q_sign, missing, unwrap, drop_invalid
             As for `load_log`.
 
         Returns
@@ -164,7 +170,9 @@ class Log:
         """
         table = frame_table(df, "data frame")
         columns = _Columns.of(table, q, x, time, {"groups": groups, "runs": runs})
-        conversion = _Conversion(q_unit, x_unit, q_sign, missing, unwrap)
+        conversion = _Conversion(
+            q_unit, x_unit, q_sign, missing, unwrap, time_unit, rate
+        )
         return _converted(table, columns, conversion, drop_invalid)
 
     @property
@@ -198,6 +206,8 @@ def load_log(
     *,
     runs: str | None = None,
     time: str | None = None,
+    time_unit: str = "s",
+    rate: float | None = None,
     q_unit: str = "m",
     x_unit: str = "m",
     q_sign: ArrayLike = 1,
@@ -228,8 +238,12 @@ def load_log(
         Column that names the run of a row, for models with hysteresis, see `Commands`. Default:
         every motion is a run.
     time : str or None, default=None
-        Column of the time stamp [s]. In npz and parquet files also dates, which become seconds
-        since 1970 (UTC), and durations.
+        Column of the time stamp. In npz and parquet files also dates, which become seconds since
+        1970 (UTC), and durations.
+    time_unit : {"s", "ms", "us", "ns", "frames"}, default="s"
+        Unit of the time stamps in the file; dates and durations have their own.
+    rate : float or None, default=None
+        Frames per second, for ``time_unit="frames"`` [1/s].
     q_unit : {"m", "cm", "mm", "um", "in", "rad", "deg", "1", "counts"}, default="m"
         Unit of the actuator columns in the file; lengths become metres and angles radians. "1" is
         not converted: counts or pressures, for a chain with `gains`. "counts" is another name of
@@ -301,7 +315,7 @@ def load_log(
     """
     table = read_table(as_path(path), TextForm(delimiter, header_line, decimal))
     columns = _Columns.of(table, q, x, time, {"groups": groups, "runs": runs})
-    conversion = _Conversion(q_unit, x_unit, q_sign, missing, unwrap)
+    conversion = _Conversion(q_unit, x_unit, q_sign, missing, unwrap, time_unit, rate)
     return _converted(table, columns, conversion, drop_invalid)
 
 
@@ -367,6 +381,8 @@ class _Conversion(NamedTuple):
     q_sign: ArrayLike
     missing: ArrayLike
     unwrap: bool | float | Mapping[str, float]
+    time_unit: str
+    rate: float | None
 
     @property
     def unit_of_q(self) -> str:
@@ -397,6 +413,8 @@ def _converted(
     factor = _checked_factor(n, q_unit, x_unit, conversion.q_sign)
     table.check_unit("q_unit", columns.q, q_unit)
     table.check_unit("x_unit", columns.x, x_unit)
+    stamps = table.column(columns.times[0]) if columns.times else ()
+    seconds = seconds_per_unit(stamps, conversion.time_unit, conversion.rate)
     values = table.values([*columns.q, *columns.x, *columns.times], columns.times)
     labelled = {
         argument: table.labels(argument, name, len(values))
@@ -442,7 +460,7 @@ def _converted(
     return Log(
         commands * factor,
         tips * METRES[x_unit],
-        time=times[valid, 0] if columns.times else None,
+        time=seconds * times[valid, 0] if columns.times else None,
         line=places[valid],
         invalid_lines=places[~valid],
         q_names=columns.q,

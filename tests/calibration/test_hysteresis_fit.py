@@ -9,7 +9,8 @@ from hybridkin import (
     as_forward_model,
     robots,
 )
-from hybridkin.calibration.hysteresis_fit import HysteresisLog, HysteresisProblem
+from hybridkin.calibration.hysteresis_fit import HysteresisProblem
+from hybridkin.calibration.hysteresis_log import HysteresisLog
 from hybridkin.calibration.hysteresis_search import Candidate, find_hysteresis, gain
 
 TRUNK = robots.bionic_handling_assistant()
