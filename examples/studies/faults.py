@@ -1,0 +1,306 @@
+"""Faults whose cause is known, and the cause that `verify_track` names.
+
+The table of the docs page "Motors from end to end", section "What went wrong"::
+
+    python examples/studies/faults.py --out results/faults
+
+Three robots (`fault_robots`) with five seeds each; a hybrid is fitted to a log of 24 motions and
+promises the errors of held-out motions. The robot then runs a new motion of 300 rows, once as it
+was and once with each of 14 faults. A fault is
+
+- *first* if it is the cause that `verify_track` names;
+- *named* if it is that cause or one of those that explain as much on this path;
+- *wrongly blamed* if another cause is named, and the fault is not among the others.
+
+With ``--old`` an earlier version is judged, which names one cause and says what share each explains:
+there a fault is *named* if its share is above a half.
+"""
+
+from __future__ import annotations
+
+import argparse
+import pickle
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from csv_tables import add_csv
+from fault_robots import PERIOD, ROBOTS, FaultRobot
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from sklearn.model_selection import GroupKFold
+
+from hybridkin import (
+    Commands,
+    CreepOperator,
+    HybridForwardModel,
+    PlayOperator,
+    save_model,
+    workflow,
+)
+from hybridkin.datasets import Log
+from hybridkin.hybrid.log_distance import held_out_distances
+from hybridkin.workflow.errors import Promise
+from hybridkin.workflow.report import Report
+
+N_MOTIONS, N_ROWS = 24, 80  # of the log
+N_TRACK = 300  # rows
+LOADS = {"trunk": 0.5, "tendons": 0.02, "bellows": 0.4}  # [kg]
+CLEAN = "nothing wrong"
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A robot that runs commands, and the randomness of a fault."""
+
+    robot: FaultRobot
+    q: NDArray
+    rng: np.random.Generator
+
+    @property
+    def actuator(self) -> int:
+        """An actuator that moves, chosen at random."""
+        return int(self.rng.integers(self.q.shape[1]))
+
+    @property
+    def middle(self) -> int:
+        """A row in the middle half, chosen at random."""
+        return int(self.rng.integers(len(self.q) // 4, 3 * len(self.q) // 4))
+
+    def motion(self) -> tuple[NDArray, NDArray]:
+        """Return a rotation (3, 3) and a shift (3,) of the base [m]."""
+        turn = self.rng.standard_normal(3)
+        turn *= np.radians(2.5) / np.linalg.norm(turn)
+        shift = self.rng.standard_normal(3)
+        shift *= 0.03 * self.robot.size / np.linalg.norm(shift)
+        return Rotation.from_rotvec(turn).as_matrix(), shift
+
+
+def _with_column(run: Run, change: Callable[[NDArray], NDArray]) -> NDArray:
+    """Return the true tips (N, 3) if one actuator does something else."""
+    q = run.q.copy()
+    i = run.actuator
+    q[:, i] = change(q[:, i])
+    return run.robot.tips(q)
+
+
+def _clean(run: Run) -> NDArray:
+    return run.robot.tips(run.q)
+
+
+def _unit(run: Run) -> NDArray:
+    return 10.0 * run.robot.tips(run.q)
+
+
+def _swapped(run: Run) -> NDArray:
+    return run.robot.tips(run.q)[:, [1, 0, 2]]
+
+
+def _mirrored(run: Run) -> NDArray:
+    sign = np.ones(3)
+    sign[run.rng.integers(3)] = -1.0
+    return sign * run.robot.tips(run.q)
+
+
+def _late(run: Run) -> NDArray:
+    x = run.robot.tips(run.q)
+    return np.concatenate([np.repeat(x[:1], 4, axis=0), x[:-4]])
+
+
+def _moved(run: Run) -> NDArray:
+    turn, shift = run.motion()
+    return run.robot.tips(run.q) @ turn.T + shift
+
+
+def _bump(run: Run) -> NDArray:
+    x = run.robot.tips(run.q)
+    turn, shift = run.motion()
+    after = np.arange(len(x)) >= run.middle
+    return np.where(after[:, None], x @ turn.T + shift, x)
+
+
+def _zero(run: Run) -> NDArray:
+    way = run.rng.choice([-1.0, 1.0])
+    return _with_column(run, lambda column: column + 0.12 * way * np.ptp(column))
+
+
+def _slip(run: Run) -> NDArray:
+    way = run.rng.choice([-1.0, 1.0])
+    after = np.arange(len(run.q)) >= run.middle
+    return _with_column(run, lambda column: column + 0.15 * way * np.ptp(column) * after)
+
+
+def _gain(run: Run) -> NDArray:
+    rest = run.robot.chain.actuator_layout.rest if hasattr(run.robot.chain, "actuator_layout") else 0 * run.q[0]
+    i = run.actuator
+    q = run.q.copy()
+    q[:, i] = rest[i] + 0.75 * (q[:, i] - rest[i])
+    return run.robot.tips(q)
+
+
+def _dead(run: Run) -> NDArray:
+    return _with_column(run, lambda column: np.full_like(column, column[0]))
+
+
+def _payload(run: Run) -> NDArray:
+    return run.robot.tips(run.q, LOADS[run.robot.name])
+
+
+def _backlash(run: Run) -> NDArray:
+    width = 0.06 * np.ptp(run.q, axis=0).max()
+    return run.robot.tips(PlayOperator(width).apply(run.q)[0])
+
+
+def _creep(run: Run) -> NDArray:
+    steps = np.full(len(run.q), PERIOD)
+    return run.robot.tips(CreepOperator([0.3], [1.0]).apply(run.q, dt=steps)[0])
+
+
+def _misread(run: Run) -> NDArray:
+    x = run.robot.tips(run.q)
+    first = run.middle
+    far = run.rng.standard_normal(3)
+    x[first : first + 25] += 0.2 * run.robot.size * far / np.linalg.norm(far)
+    return x
+
+
+FAULTS: dict[str, tuple[Callable[[Run], NDArray], str]] = {
+    CLEAN: (_clean, ""),
+    "tips in centimetres": (_unit, "unit of the tips"),
+    "x and y swapped": (_swapped, "axes of the tips"),
+    "one axis mirrored": (_mirrored, "axes of the tips"),
+    "camera four rows late": (_late, "lag"),
+    "moved base": (_moved, "moved base"),
+    "bump half-way": (_bump, "bump"),
+    "zero of one actuator": (_zero, "zero of one actuator"),
+    "slip half-way": (_slip, "slip of one actuator"),
+    "gain of one actuator": (_gain, "gain of one actuator"),
+    "dead actuator": (_dead, "dead actuator"),
+    "payload": (_payload, "payload"),
+    "backlash": (_backlash, "backlash"),
+    "creep": (_creep, "creep"),
+    "25 rows misread": (_misread, "misread rows"),
+}
+"""What is done to a run, and the name of its cause."""
+
+
+def fitted(robot: FaultRobot, seed: int, folder: Path) -> workflow.LoadedModel:
+    """Return a hybrid that is fitted to a log of a robot and promises errors; it is kept."""
+    path = folder / f"{robot.name}_{seed}.safetensors"
+    if path.is_file():
+        return workflow.open_model(path)
+    rng = np.random.default_rng([seed, 1])
+    q = np.concatenate([robot.motion(rng, N_ROWS) for _ in range(N_MOTIONS)])
+    groups = np.repeat(np.arange(N_MOTIONS), N_ROWS)
+    x = robot.tips(q)
+    x += robot.noise * rng.standard_normal(x.shape)
+    model = HybridForwardModel(robot.chain, random_state=0, **robot.settings)
+    errors = np.empty(len(q))
+    far = np.empty(len(q))
+    for train, test in GroupKFold(3).split(q, groups=groups):
+        model.fit(q[train], x[train], groups=groups[train])
+        predicted = model.predict(Commands(q[test], groups[test]))
+        errors[test] = np.linalg.norm(predicted - x[test], axis=1)
+        far[test] = held_out_distances(q[train], groups[train], q[test])
+    model.fit(q, x, groups=groups)
+    held_out = {"mean": float(errors.mean()), "p95": float(np.quantile(errors, 0.95))}
+    training: dict[str, Any] = {"saved": "hybrid", "held_out": {"hybrid": held_out}}
+    training["promise"] = vars(Promise.of(errors, far))
+    save_model(model, path, training=training)
+    return workflow.open_model(path)
+
+
+def _write_track(path: Path, q: NDArray, x: NDArray) -> None:
+    n = q.shape[1]
+    head = ["t", *(f"q{i + 1}" for i in range(n)), *"xyz"]
+    head += ["target_x", "target_y", "target_z", "status"]
+    t = PERIOD * np.arange(len(q))
+    lines = [",".join(head)]
+    for row in np.column_stack([t, q, x, x]):
+        lines.append(",".join([*map(repr, map(float, row)), "CONVERGED"]))
+    path.write_text("\n".join(lines), encoding="utf-8")
+
+
+def verified(
+    loaded: workflow.LoadedModel, robot: FaultRobot, seed: int, fault: str, folder: Path
+) -> dict[str, Any]:
+    """Return what `verify_track` says of a run with a fault."""
+    rng = np.random.default_rng([seed, 2])
+    q = robot.motion(rng, N_TRACK)
+    run = Run(robot, q, np.random.default_rng([seed, list(FAULTS).index(fault)]))
+    x = FAULTS[fault][0](run)
+    x = x + robot.noise * rng.standard_normal(x.shape)
+    track = folder / "track.csv"
+    _write_track(track, q, loaded.tips(q))
+    began = time.process_time()
+    record = workflow.verify_track(loaded, track, Log(q, x)).record
+    others = getattr(record, "also", [])
+    if not hasattr(record, "also"):
+        others = [name for name, share in record.causes.items() if share > 0.5]
+    path = record.parts["path"]
+    return {
+        "cause": record.cause,
+        "also": others,
+        "amount": getattr(record, "amount", ""),
+        "separate": getattr(record, "separate", ""),
+        "shares": dict(record.causes),
+        "kept": record.kept,
+        "mean": path.mean,
+        "promised": path.promised,
+        "seconds": time.process_time() - began,
+    }
+
+
+def study(seeds: Sequence[int], folder: Path, faults: Sequence[str]) -> list[dict]:
+    """Return one record for each robot, seed and fault."""
+    folder.mkdir(parents=True, exist_ok=True)
+    records = []
+    for kind in ROBOTS:
+        for seed in seeds:
+            robot = kind(seed)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                loaded = fitted(robot, seed, folder)
+                for fault in faults:
+                    found = verified(loaded, robot, seed, fault, folder)
+                    found |= {"robot": robot.name, "seed": seed, "fault": fault}
+                    records.append(found)
+    return records
+
+
+def main() -> None:
+    """Run the study and print its table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, default=Path("results/faults"))
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
+    parser.add_argument("--faults", nargs="+", default=[*FAULTS])
+    parser.add_argument("-v", action="store_true")
+    options = parser.parse_args()
+    records = study(options.seeds, options.out, options.faults)
+    rows = []
+    for fault in options.faults:
+        mine = [r for r in records if r["fault"] == fault]
+        truth = FAULTS[fault][1]
+        first = sum(r["cause"] == truth for r in mine)
+        named = sum(truth == r["cause"] or truth in r["also"] for r in mine)
+        wrong = sum(
+            r["cause"] not in (None, truth) and truth not in r["also"] for r in mine
+        )
+        none = sum(r["cause"] is None for r in mine)
+        rows.append([fault, len(mine), first, named, wrong, none])
+        print(*rows[-1], sep="\t")
+        if options.v:
+            for r in mine:
+                shares = sorted(r["shares"].items(), key=lambda e: -e[1])[:5]
+                words = ", ".join(f"{n} {100 * s:.1f}" for n, s in shares)
+                right = "ok" if r["cause"] == truth or (not truth and r["cause"] is None) else "--"
+                print(f"   {right} {r['robot']} {r['seed']} {1e3*r['promised']:.2f}->{1e3*r['mean']:.2f} mm: {r['cause']} ({r['amount']}) also {r['also']} sep [{r['separate']}] | {words} | truth {100*r['shares'].get(truth, 0):.1f} {r['seconds']:.2f}s")
+    (options.out / "records.pkl").write_bytes(pickle.dumps(records))
+
+
+if __name__ == "__main__":
+    main()
