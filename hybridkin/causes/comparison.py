@@ -53,7 +53,7 @@ LIKELY = 0.5
 _BLOCKS = 10  # of successive rows, in which errors are alike
 _FOLDS = 5
 _SCREENED = 100  # rows of the first fits
-_ROUNDS = (3, 8, 2)  # iterations of the first fits, of the best, and in each fold
+_ROUNDS = (2, 8, 1)  # iterations of the first fits, of the best, and in each fold
 _CANDIDATES = 2  # of a kind, which are fitted to all rows
 _AS_MUCH = 0.1  # of the error: causes that differ less explain as much
 

@@ -11,6 +11,8 @@ from collections.abc import Callable, Sequence
 from importlib.resources import files
 from typing import Any, NamedTuple
 
+import numpy as np
+
 import hybridkin
 from hybridkin._core.texts import toml_value, visible
 from hybridkin._core.units import METRES
@@ -42,7 +44,9 @@ class _Question(NamedTuple):
 
 
 _KINDS = "tendons, elastic-tendons (they can go slack) or chambers (of measured length)"
-_SIZES = ("radius", "length", "angle", "gain", "spool_radius")
+_SIZES = ("radius", "length", "angle", "gain", "spool_radius", "zeros")
+_AT_ZERO = 0.05  # of the range: first values this near to zero are zero
+_ALIKE = 0.05  # of the range: first values of motions that differ by less are one posture
 _EACH = "[mm]; one value, or one for each segment"
 _LENGTHS = ", ".join(METRES)
 _UNIT = f"unit of the actuators: {_LENGTHS}; deg or rad of motors; another name, such as counts"
@@ -171,6 +175,51 @@ def _is_tip(three: Sequence[str]) -> bool:
     """Return whether three names differ only in their last x, y and z."""
     axes = zip(three, "xyz", strict=True)
     return len({"#".join(name.lower().rsplit(axis, 1)) for name, axis in axes}) == 1
+
+
+def with_zeros(answers: _Answers, delimiter: str | None) -> tuple[_Answers, str]:
+    """Return the answers with the zeros of tendons from the first rows of a log, and words for it.
+
+    They are the median of the first rows of all motions, if these are alike.
+    """
+    if answers["log"] is None or answers["kind"] == "chambers":
+        return answers, ""
+    log = hybridkin.datasets.load_log(
+        answers["log"],
+        answers["q"],
+        answers["x"],
+        answers["groups"],
+        q_unit="1",
+        x_unit=answers["x_unit"],
+        q_sign=answers["q_sign"],
+        delimiter=delimiter,
+        drop_invalid=True,
+    )
+    span = np.ptp(log.q, axis=0)
+    first = np.zeros(1, dtype=int)
+    if log.groups is not None:
+        _, first = np.unique(log.groups, return_index=True)
+    starts = log.q[first]
+    zeros = np.median(starts, axis=0)
+    if (np.abs(zeros) <= _AT_ZERO * span).all():
+        return answers, ""
+    if (np.median(np.abs(starts - zeros), axis=0) > _ALIKE * span).any():
+        words = (
+            "The actuators do not start at 0, and the motions do not start alike: set `zeros` in "
+            "every [[segment]] to their values at the straight robot."
+        )
+        return answers, words
+    if answers["q_unit"] in METRES:
+        zeros = METRES[answers["q_unit"]] * zeros  # lengths are in metres there
+    rounded = [float(f"{zero:.6g}") for zero in zeros]
+    n = answers["actuators"]
+    segments = [rounded[k : k + n] for k in range(0, len(rounded), n)]
+    words = (
+        f"The actuators do not start at 0: `zeros` are the values of the first row of "
+        f"{len(first)} motion{'s' if len(first) > 1 else ''}. Check that the robot is straight "
+        "there."
+    )
+    return {**answers, "zeros": segments}, words
 
 
 def description(answers: _Answers, name: str) -> str:

@@ -450,12 +450,14 @@ def _reversed_tendons(comparison: _Comparison) -> Iterator[LogFinding]:
     signs = balanced[int(np.argmin(errors))]
     names = comparison.q_names
     layout = comparison.chain.actuator_layout
-    log_moves = in_terms(signs[:, None] * layout.balance, names)
-    wanted = in_terms(layout.balance, names)
+    never = in_terms(signs[:, None] * layout.balance, names).split("; ")
+    wanted = in_terms(layout.balance, names).split("; ")
+    of_log = "; ".join(term for term in never if term not in wanted)
+    of_tendons = "; ".join(term for term in wanted if term not in never)
     flipped = ", ".join(repr(names[i]) for i in np.flatnonzero(signs < 0))
     message = (
-        f"the log has no motion along {log_moves}, but tendons that do not pull against each other "
-        f"have none along {wanted}: the sign of {flipped} is reversed."
+        f"the log has no motion along {of_log}, but tendons that do not pull against each other "
+        f"have none along {of_tendons}: the sign of {flipped} is reversed."
     )
     yield LogFinding("sign", "warning", message, _sign_advice(comparison.log, np.diag(signs)))
 

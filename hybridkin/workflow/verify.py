@@ -462,16 +462,3 @@ def read_tips(
     }
     log = load_log(path, **reading, delimiter=delimiter, drop_invalid=True)
     return replace(log, q=log.q[:, :0], q_names=())
-
-
-def has_commands(
-    path: str | Path, log_format: LogFormat, delimiter: str | None = None
-) -> bool:
-    """Return whether a file has a column of the actuators of a robot's logs.
-
-    Parameters
-    ----------
-    path, log_format, delimiter
-        As for `read_tips`.
-    """
-    return bool({*log_columns(path, delimiter)} & {*log_format.q})
