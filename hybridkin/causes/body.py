@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Self
 
-from hybridkin._core.directions import moved_directions
+from hybridkin._core.directions import Directions, moved_directions
 from hybridkin.causes.cause import Cause, LinearCause
 from hybridkin.causes.evidence import Evidence
 
@@ -166,8 +166,12 @@ class Misread(Cause):
         return f"{len(self.misread)} rows from {first} to {last}"
 
 
+@dataclass(frozen=True, eq=False)
 class ModelError(Cause):
     """The model itself is wrong: an error that is a smooth function of the motion."""
+
+    directions: Directions
+    quadratic: bool
 
     name = "the model"
     remedy = "add this log to the log of the fit, and fit again"
@@ -175,21 +179,24 @@ class ModelError(Cause):
 
     @classmethod
     def members(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return the one cause of this kind."""
-        return [cls()]
+        """Return the one cause of this kind, with products of the motion if there are many rows."""
+        directions = moved_directions(evidence.motion.q)
+        n_moved = directions.moved.shape[1]
+        n_features = 1 + n_moved + n_moved * (n_moved + 1) // 2
+        n_rows = len(evidence.motion.q)
+        return [cls(directions, n_rows >= _ROWS_PER_FEATURE * n_features)]
 
     def starts(self, evidence: Evidence) -> Sequence[NDArray]:
         """Return no error."""
         return [np.zeros(3 * self._features(evidence).shape[1])]
 
     def _features(self, evidence: Evidence) -> NDArray:
-        """Return 1, the moved directions of q and, if there are many rows, their products."""
-        directions = moved_directions(evidence.motion.q)
-        scaled = (evidence.q - directions.mean) / directions.scale
-        z = scaled @ directions.moved
-        first, second = np.triu_indices(z.shape[1])
+        """Return 1, the moved directions of q and, if it is quadratic, their products."""
+        directions = self.directions
+        z = (evidence.q - directions.mean) / directions.scale @ directions.moved
         columns = [np.ones((len(z), 1)), z]
-        if len(evidence.motion.q) >= _ROWS_PER_FEATURE * (1 + z.shape[1] + len(first)):
+        if self.quadratic:
+            first, second = np.triu_indices(z.shape[1])
             columns.append(z[:, first] * z[:, second])
         return np.hstack(columns)
 

@@ -44,11 +44,14 @@ class Cause(ABC):
         What to do.
     n_parameters : int
         Number of fitted numbers: of two causes that explain as much, the one with fewer is named.
+    moves_actuators : bool
+        Whether the actuators do something else, which the mechanical model turns into tips.
     """
 
     name: ClassVar[str]
     remedy: ClassVar[str]
     n_parameters: ClassVar[int] = 0
+    moves_actuators: ClassVar[bool] = False
 
     @classmethod
     @abstractmethod

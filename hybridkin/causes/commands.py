@@ -32,6 +32,8 @@ def _moved_actuators(evidence: Evidence) -> list[int]:
 class ActuatorCause(Cause):
     """A cause that changes what the actuators did."""
 
+    moves_actuators = True
+
     @abstractmethod
     def changed(self, evidence: Evidence, parameters: NDArray) -> NDArray:
         """Return what the actuators did (N, n) with these parameters (P,) [unit of q]."""

@@ -70,14 +70,18 @@ class Explanation:
         Its parameters, from all rows.
     errors : ndarray of shape (N,)
         Distances of the measured tips on held-out rows [m].
-    tips : ndarray of shape (N, 3)
-        Its tips, from all rows [m].
+    body : int
+        The mechanical model that it takes, of those of the evidence.
     """
 
     cause: Cause
     parameters: NDArray
     errors: NDArray
-    tips: NDArray
+    body: int = 0
+
+    def tips(self, evidence: Evidence) -> NDArray:
+        """Return its tips (N, 3) on some evidence, which may be another motion [m]."""
+        return self.cause.tips(evidence.with_body(self.body), self.parameters)
 
     @property
     def name(self) -> str:
@@ -181,29 +185,33 @@ def compare_causes(
     few = evidence.some(chosen.astype(int))
     explanations = []
     for kind in causes:
-        members = kind.members(evidence)
-        if members:
-            explanations.append(_explained(evidence, few, members))
+        if kind.members(evidence):
+            explanations.append(_explained(evidence, few, kind))
     (nothing,) = Nothing.members(evidence)
     return CauseComparison(evidence, _judged(evidence, nothing, np.zeros(0)), explanations)
 
 
 def _explained(
-    evidence: Evidence, few: Evidence, members: Sequence[Cause]
+    evidence: Evidence, few: Evidence, kind: type[Cause]
 ) -> Explanation:
     """Return the best cause of a kind, judged on held-out rows."""
+    n_bodies = len(evidence.bodies) if kind.moves_actuators else 1
     screened = []
-    for member in members:
-        for start in member.starts(few):
-            parameters = member.fit(few, _all(few), start, _ROUNDS[0])
-            screened.append((_error(few, member, parameters), member, parameters))
+    for body in range(n_bodies):
+        whole = evidence.with_body(body)
+        part = few.with_body(body)
+        for member in kind.members(whole):
+            for start in member.starts(part):
+                parameters = member.fit(part, _all(part), start, _ROUNDS[0])
+                error = _error(part, member, parameters)
+                screened.append((error, whole, member, parameters))
     screened.sort(key=lambda entry: entry[0])  # of equal ones the first stay first
     fitted = []
-    for _, member, start in screened[:_CANDIDATES]:
-        parameters = member.fit(evidence, _all(evidence), start, _ROUNDS[1])
-        fitted.append((_error(evidence, member, parameters), member, parameters))
-    _, cause, parameters = min(fitted, key=lambda entry: entry[0])
-    return _judged(evidence, cause, parameters)
+    for _, whole, member, start in screened[:_CANDIDATES]:
+        parameters = member.fit(whole, _all(whole), start, _ROUNDS[1])
+        fitted.append((_error(whole, member, parameters), whole, member, parameters))
+    _, whole, cause, parameters = min(fitted, key=lambda entry: entry[0])
+    return _judged(whole, cause, parameters)
 
 
 def _judged(evidence: Evidence, cause: Cause, parameters: NDArray) -> Explanation:
@@ -217,9 +225,8 @@ def _judged(evidence: Evidence, cause: Cause, parameters: NDArray) -> Explanatio
             refitted = cause.fit(evidence, ~held_out, parameters, _ROUNDS[2])
             tips = cause.aligned(evidence, refitted, (~held_out).astype(float))
             errors[held_out] = distances(tips, evidence.x)[held_out]
-    tips = cause.aligned(evidence, parameters, np.ones(n_rows))
     errors = _with_excuse(errors, cause.excused(evidence), evidence.promised)
-    return Explanation(cause, parameters, errors, tips)
+    return Explanation(cause, parameters, errors, evidence.body)
 
 
 def _error(evidence: Evidence, cause: Cause, parameters: NDArray) -> float:

@@ -75,8 +75,11 @@ class Evidence:
         The measured tips [m].
     model : ForwardModel
         Motion of the actuators -> tip [m].
-    mechanical : ForwardModel
-        The mechanical part of the model, for commands far from its training rows.
+    bodies : sequence of ForwardModel
+        The mechanical part of the model, for commands far from its training rows, then robots that
+        do alike for such rows and not elsewhere.
+    body : int
+        Number of the one to use.
     actuators : Actuators
         Names, unit and rest of the actuators.
     inside : ndarray of shape (N,) of bool
@@ -95,7 +98,7 @@ class Evidence:
     rows: NDArray
     x: NDArray
     model: ForwardModel
-    mechanical: ForwardModel
+    bodies: Sequence[ForwardModel]
     actuators: Actuators
     inside: NDArray
     off_plane: NDArray
@@ -103,6 +106,12 @@ class Evidence:
     low: NDArray
     high: NDArray
     alignment: Alignment = field(default_factory=Alignment)
+    body: int = 0
+
+    @property
+    def mechanical(self) -> ForwardModel:
+        """The mechanical model for commands far from the training rows."""
+        return self.bodies[self.body]
 
     @property
     def n_actuators(self) -> int:
@@ -126,14 +135,15 @@ class Evidence:
 
     @cached_property
     def jacobian(self) -> NDArray:
-        """Derivative (N, 3, n) of the tips of the model by the motion [m / unit of q]."""
-        return evaluate(self.model, self.q, jacobian=True)[1]
+        """Derivative (N, 3, n) of the tips by the motion [m / unit of q]."""
+        model = self.mechanical if self.body > 0 else self.model
+        return evaluate(model, self.q, jacobian=True)[1]
 
     @cached_property
     def compliance(self) -> NDArray:
         """How the tip gives way to a force at it (N, 3, 3), up to a factor."""
         with torch.no_grad():
-            columns = self.mechanical.compliance_columns(torch.from_numpy(self.q))
+            columns = self.bodies[0].compliance_columns(torch.from_numpy(self.q))
         columns = columns.numpy()
         return columns @ columns.transpose(0, 2, 1)
 
@@ -152,6 +162,8 @@ class Evidence:
         Far from its training rows a learned part knows nothing: there the mechanical model says how
         the tips change.
         """
+        if self.body > 0:
+            return self.tips + evaluate(self.mechanical, q)[0] - self._mechanical_tips
         if self.model is self.mechanical:
             return evaluate(self.model, q)[0]
         tips, distance = evaluate(self.model, q, distance=True)
@@ -160,6 +172,12 @@ class Evidence:
         change = evaluate(self.mechanical, q)[0] - self._mechanical_tips
         far = np.clip((distance[:, None] - 1.0) / _FAR, 0.0, 1.0)
         return (1.0 - far) * tips + far * (self.tips + change)
+
+    def with_body(self, body: int) -> Self:
+        """Return the evidence with another mechanical model."""
+        other = replace(self, body=body)
+        vars(other)["path"] = self.path
+        return other
 
     def some(self, chosen: NDArray) -> Self:
         """Return the evidence of some of the measured tips: places or a mask (N,)."""

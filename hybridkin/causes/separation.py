@@ -52,9 +52,7 @@ def separating_motion(
     best = Separation("", 0.0)
     for words, q, period in _candidates(evidence):
         further = evidence.followed_by(q, period)
-        tips = one.cause.tips(further, one.parameters)
-        others = other.cause.tips(further, other.parameters)
-        difference = float(distances(tips, others).max())
+        difference = float(distances(one.tips(further), other.tips(further)).max())
         if difference > _CLEARLY * best.difference:
             best = Separation(words, difference)
     least = _TOLD * max(one.mean, 1e-9)

@@ -107,6 +107,10 @@ class Chain(PoseModel):
         """Rest, kind and segment of every actuator."""
         return ActuatorLayout.independent(self.n_actuators)
 
+    def softer(self) -> list[Chain]:
+        """Return the same robot with actuators that give way, where that may matter."""
+        return []
+
     def geometry(self) -> dict[str, Tensor]:
         """Return the geometry by name, as in the constructor; entries that are None are omitted."""
         entries = zip(self._entries, entries_of(self, self._entries), strict=True)

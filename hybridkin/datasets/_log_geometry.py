@@ -179,7 +179,7 @@ class _Comparison:
             rows=np.arange(n_rows),
             x=self.few_x,
             model=self.chain,
-            mechanical=self.chain,
+            bodies=[self.chain],
             actuators=Actuators(self.q_names, "mm", per_unit, layout),
             inside=np.ones(n_rows, dtype=bool),
             off_plane=np.zeros_like(q),

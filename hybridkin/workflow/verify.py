@@ -371,10 +371,11 @@ def _evidence(
     order = np.argsort(rows, kind="stable")
     rows = rows[order]
     q = motion[rows]
-    mechanical = loaded.module
+    bodies = [loaded.module]
     layout = ActuatorLayout.independent(loaded.n_actuators)
     if loaded.chain is not None:
-        mechanical = loaded.chain.tip_model
+        chain = loaded.chain.tip_model
+        bodies = [chain, *chain.softer()]
         layout = loaded.chain.actuator_layout
     off_plane = _off_plane(loaded, q)
     low = motion.min(axis=0)
@@ -389,7 +390,7 @@ def _evidence(
         rows=rows,
         x=x[order],
         model=loaded.module,
-        mechanical=mechanical,
+        bodies=bodies,
         actuators=_actuators(loaded.log_format(), layout),
         inside=loaded.domain_distance(q - off_plane) <= 1.0,
         off_plane=off_plane,
