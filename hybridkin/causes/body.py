@@ -175,6 +175,7 @@ class ModelError(Cause):
 
     name = "the model"
     remedy = "add this log to the log of the fit, and fit again"
+    is_last_resort = True
     n_parameters = 30
 
     @classmethod

@@ -46,12 +46,15 @@ class Cause(ABC):
         Number of fitted numbers: of two causes that explain as much, the one with fewer is named.
     moves_actuators : bool
         Whether the actuators do something else, which the mechanical model turns into tips.
+    is_last_resort : bool
+        Whether it can look like all others, and is named only if these leave far more.
     """
 
     name: ClassVar[str]
     remedy: ClassVar[str]
     n_parameters: ClassVar[int] = 0
     moves_actuators: ClassVar[bool] = False
+    is_last_resort: ClassVar[bool] = False
 
     @classmethod
     @abstractmethod

@@ -16,7 +16,8 @@ from hybridkin.causes.evidence import Evidence
 
 _STILL = 1e-3  # of the largest range: an actuator that moves less does not move
 _LARGER = 1.5  # least factor by which bends are of another size
-_ENDS = 0.05  # of the rows: no slip this near to an end of the log; and of a range: no way from the rest
+_LEAST_GAIN = 0.2  # an actuator that moves less is dead
+_AWAY = 0.05  # of the range: values at the first row this far from the rest are not at rest
 
 
 def _moved_actuators(evidence: Evidence) -> list[int]:
@@ -126,22 +127,17 @@ class Slip(_OneActuator):
 
     @classmethod
     def members(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return for each actuator that moves the slip at the most likely row."""
+        """Return slips of each actuator that moves at the rows where the residual changes."""
         residual = evidence.x - evidence.tips
         along = np.einsum("nij,ni->nj", evidence.jacobian, residual)
         squares = np.square(evidence.jacobian).sum(axis=1)
         after = np.cumsum(along[::-1], axis=0)[::-1]
         weight = np.cumsum(squares[::-1], axis=0)[::-1]
         gain = np.square(after) / np.maximum(weight, np.finfo(float).tiny)
-        n_rows = len(gain)
-        first = max(1, int(_ENDS * n_rows))
-        inner = gain[first : n_rows - first]
-        if not len(inner):
-            return []
-        rows = first + inner.argmax(axis=0)
-        return [
-            cls(i, int(evidence.rows[rows[i]])) for i in _moved_actuators(evidence)
-        ]
+        found = []
+        for i in _moved_actuators(evidence):
+            found += [cls(i, row) for row in evidence.sudden_rows(gain[:, i])]
+        return found
 
     def starts(self, evidence: Evidence) -> Sequence[NDArray]:
         """Return no slip."""
@@ -184,12 +180,15 @@ class Gain(_OneActuator):
     ) -> NDArray:
         """Return the scaled motion of the actuator (N,) about its rest [unit of q]."""
         rest = evidence.actuators.rest[self.actuator]
-        return rest + parameters[0] * (q - rest)
+        return rest + self._factor(parameters) * (q - rest)
+
+    def _factor(self, parameters: NDArray) -> float:
+        return float(np.clip(parameters[0], _LEAST_GAIN, 1.0 / _LEAST_GAIN))
 
     def amount(self, evidence: Evidence, parameters: NDArray) -> str:
         """Return the actuator and the factor in words."""
         name = evidence.actuators.names[self.actuator]
-        return f"{name} moves {parameters[0]:.3g} times as far"
+        return f"{name} moves {self._factor(parameters):.3g} times as far"
 
 
 class Dead(_OneActuator):
@@ -427,7 +426,7 @@ class FirstRow(ActuatorCause):
         """Return the one cause of this kind, if the actuators have zeros and start elsewhere."""
         actuators = evidence.actuators
         away = np.abs(evidence.motion.q[0] - actuators.rest)
-        if actuators.absolute.any() or (away <= _ENDS * evidence.motion.span).all():
+        if actuators.absolute.any() or (away <= _AWAY * evidence.motion.span).all():
             return []
         return [cls()]
 

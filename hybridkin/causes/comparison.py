@@ -55,6 +55,7 @@ _FOLDS = 5
 _SCREENED = 100  # rows of the first fits
 _ROUNDS = (2, 8, 1)  # iterations of the first fits, of the best, and in each fold
 _CANDIDATES = 2  # of a kind, which are fitted to all rows
+_LAST_RESORT = 1.5  # ratio of the errors that a named cause and the last resort leave
 _AS_MUCH = 0.1  # of the error: causes that differ less explain as much
 
 
@@ -126,9 +127,19 @@ class CauseComparison:
     @cached_property
     def best(self) -> Explanation:
         """The simplest cause within the noise of the best."""
-        everyone = [self.nothing, *self.explanations]
-        least = min(everyone, key=lambda e: e.mean)
-        near = [e for e in everyone if self._as_good(e, least)]
+        named = [e for e in self.explanations if not e.cause.is_last_resort]
+        best = self._simplest([self.nothing, *named])
+        others = [e for e in self.explanations if e.cause.is_last_resort]
+        for other in others:
+            far_better = other.mean * _LAST_RESORT < best.mean
+            if far_better or self.share(best) < LIKELY < self.share(other):
+                best = other
+        return best
+
+    def _simplest(self, explanations: Sequence[Explanation]) -> Explanation:
+        """Return the one with the fewest parameters within the noise of the best."""
+        least = min(explanations, key=lambda e: e.mean)
+        near = [e for e in explanations if self._as_good(e, least)]
         return min(near, key=lambda e: (e.cause.n_parameters, e.mean))
 
     @cached_property

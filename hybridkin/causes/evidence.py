@@ -18,6 +18,8 @@ from hybridkin.causes.motion import Motion
 from hybridkin.chains.chain import ActuatorLayout
 from hybridkin.native.library import evaluate
 
+_ENDS = 0.05  # of the rows: nothing changes this near to an end
+_STEPS = 3  # largest steps of the residual that are tried
 _FAR = 0.5  # domain distances beyond 1 over which the mechanical model takes over
 
 
@@ -172,6 +174,22 @@ class Evidence:
         change = evaluate(self.mechanical, q)[0] - self._mechanical_tips
         far = np.clip((distance[:, None] - 1.0) / _FAR, 0.0, 1.0)
         return (1.0 - far) * tips + far * (self.tips + change)
+
+    def sudden_rows(self, gain: NDArray) -> list[int]:
+        """Return the rows of the motion at which something may have changed for good.
+
+        They are the place of the largest gain (N,), and those of the largest steps of the residual,
+        not near an end.
+        """
+        n_rows = len(self.rows)
+        first = max(1, int(_ENDS * n_rows))
+        inner = np.arange(first, n_rows - first)
+        if not len(inner):
+            return []
+        residual = self.x - self.tips
+        steps = np.linalg.norm(residual[inner] - residual[inner - 1], axis=1)
+        places = [inner[gain[inner].argmax()], *inner[np.argsort(steps)[-_STEPS:]]]
+        return sorted({int(self.rows[place]) for place in places})
 
     def with_body(self, body: int) -> Self:
         """Return the evidence with another mechanical model."""

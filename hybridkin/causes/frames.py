@@ -15,7 +15,6 @@ from hybridkin._core.rotations import rigid_motion, rotation_vector
 from hybridkin.causes.cause import Cause, LinearCause, distances, robust_weights
 from hybridkin.causes.evidence import Evidence
 
-_ENDS = 0.05  # of the rows: no bump this near to an end of the log
 _ROUNDS = 4  # of the weights of a rigid motion
 _UNITS = {
     10.0: "centimetres and millimetres, or metres and decimetres, are mixed up",
@@ -163,18 +162,13 @@ class Bump(MovedBase):
 
     @classmethod
     def members(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return the bump at the row where the mean residual changes most."""
+        """Return a bump for each row where the residual changes suddenly."""
         residual = evidence.x - evidence.tips
-        n_rows = len(residual)
-        first = max(1, int(_ENDS * n_rows))
         weights = robust_weights(np.linalg.norm(residual, axis=1))
         after = np.cumsum((weights[:, None] * residual)[::-1], axis=0)[::-1]
         total = np.cumsum(weights[::-1])[::-1]
         gain = np.square(after).sum(axis=1) / total
-        inner = gain[first : n_rows - first]
-        if not len(inner):
-            return []
-        return [cls(int(evidence.rows[first + inner.argmax()]))]
+        return [cls(row) for row in evidence.sudden_rows(gain)]
 
     def moved(self, evidence: Evidence) -> NDArray:
         """Return the rows (N,) of bool after the bump."""
