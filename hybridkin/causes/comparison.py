@@ -56,6 +56,7 @@ _SCREENED = 100  # rows of the first fits
 _ROUNDS = (2, 8, 1)  # iterations of the first fits, of the best, and in each fold
 _CANDIDATES = 2  # of a kind, which are fitted to all rows
 _LAST_RESORT = 1.5  # ratio of the errors that a named cause and the last resort leave
+_MOST_NOISE = 0.5  # of the error: largest difference that can be noise
 _AS_MUCH = 0.1  # of the error: causes that differ less explain as much
 
 
@@ -162,8 +163,8 @@ class CauseComparison:
     def _as_good(self, one: Explanation, other: Explanation) -> bool:
         """Return whether a cause explains as much as another one, or more."""
         loss = one.errors - other.errors
-        allowed = max(self._standard_error(loss), _AS_MUCH * other.mean)
-        return bool(loss.mean() <= allowed)
+        noise = min(self._standard_error(loss), _MOST_NOISE * other.mean)
+        return bool(loss.mean() <= max(noise, _AS_MUCH * other.mean))
 
     def _standard_error(self, values: NDArray) -> float:
         """Return the standard error of the mean of values (N,), which are alike in blocks."""
@@ -196,16 +197,15 @@ def compare_causes(
     few = evidence.some(chosen.astype(int))
     explanations = []
     for kind in causes:
-        if kind.members(evidence):
-            explanations.append(_explained(evidence, few, kind))
+        explanations += _explained(evidence, few, kind)
     (nothing,) = Nothing.members(evidence)
     return CauseComparison(evidence, _judged(evidence, nothing, np.zeros(0)), explanations)
 
 
 def _explained(
     evidence: Evidence, few: Evidence, kind: type[Cause]
-) -> Explanation:
-    """Return the best cause of a kind, judged on held-out rows."""
+) -> list[Explanation]:
+    """Return the best cause of a kind, judged on held-out rows, if the evidence has any."""
     n_bodies = len(evidence.bodies) if kind.moves_actuators else 1
     screened = []
     for body in range(n_bodies):
@@ -216,13 +216,15 @@ def _explained(
                 parameters = member.fit(part, _all(part), start, _ROUNDS[0])
                 error = _error(part, member, parameters)
                 screened.append((error, whole, member, parameters))
+    if not screened:
+        return []
     screened.sort(key=lambda entry: entry[0])  # of equal ones the first stay first
     fitted = []
     for _, whole, member, start in screened[:_CANDIDATES]:
         parameters = member.fit(whole, _all(whole), start, _ROUNDS[1])
         fitted.append((_error(whole, member, parameters), whole, member, parameters))
     _, whole, cause, parameters = min(fitted, key=lambda entry: entry[0])
-    return _judged(whole, cause, parameters)
+    return [_judged(whole, cause, parameters)]
 
 
 def _judged(evidence: Evidence, cause: Cause, parameters: NDArray) -> Explanation:
