@@ -55,6 +55,11 @@ class FaultRobot(ABC):
     noise: float
     size: float
 
+    @property
+    def rest(self) -> NDArray:
+        """The q (n,) without effect [unit of q]."""
+        return np.zeros(self.chain.n_actuators)
+
     @abstractmethod
     def motion(self, rng: np.random.Generator, rows: int) -> NDArray:
         """Return smooth commands (N, n) from the rest and back [unit of q]."""
@@ -109,7 +114,9 @@ class _Sagging(FaultRobot):
         given = torch.zeros_like(bends)
         for _ in range(_ROUNDS):
             moved = (bends + given).requires_grad_()
-            (moment,) = torch.autograd.grad((self._tip(arcs, moved) @ force).sum(), moved)
+            (moment,) = torch.autograd.grad(
+                (self._tip(arcs, moved) @ force).sum(), moved
+            )
             given = 0.5 * given + 0.5 * self.softness * arcs[..., None] * moment
         tip = self._tip(arcs, bends + given).detach().numpy()
         return tip + np.cross(self.turned, tip) + self.shift
@@ -192,7 +199,9 @@ class Tendons(FaultRobot):
         rng = np.random.default_rng([seed, 30])
         robot = self.robot
         self.size = float(robot.lengths.sum())
-        gain = float((1.0 + 0.02 * rng.standard_normal()) / robot.counts_per_metre.mean())
+        gain = float(
+            (1.0 + 0.02 * rng.standard_normal()) / robot.counts_per_metre.mean()
+        )
         self.signs = -robot.signs  # a pull shortens
         self.chain = ConstantCurvatureChain(
             robot.radii * rng.uniform(0.97, 1.03, 2),
@@ -204,11 +213,18 @@ class Tendons(FaultRobot):
             actuator_zeros=self.signs * robot.zeros,
         )
 
+    @property
+    def rest(self) -> NDArray:
+        """The counts (n,) of the straight robot."""
+        return self.signs * self.robot.zeros
+
     def motion(self, rng: np.random.Generator, rows: int) -> NDArray:
         """Return smooth balanced commands (N, 6) in counts that shorten where negative."""
         n = max(1, rows // 40)
         pulls = self.robot._motion_pulls(rng, n, rows // n, 0.9, True)
-        pulls = np.concatenate([pulls, np.repeat(pulls[-1:], rows - len(pulls), axis=0)])
+        pulls = np.concatenate(
+            [pulls, np.repeat(pulls[-1:], rows - len(pulls), axis=0)]
+        )
         return self.signs * np.round(self.robot.counts(pulls))
 
     def tips(self, q: NDArray, load: float = 0.0) -> NDArray:

@@ -76,7 +76,9 @@ class OffPlane(LinearCause):
         """Return how far commands are off the plane in words."""
         actuators = evidence.actuators
         far = np.abs(evidence.off_plane / actuators.per_unit).max()
-        return f"commands are up to {far:.3g} {actuators.unit} off it".replace("  ", " ")
+        return f"commands are up to {far:.3g} {actuators.unit} off it".replace(
+            "  ", " "
+        )
 
 
 class OutsideTheLog(Cause):
@@ -129,7 +131,7 @@ class Misread(Cause):
         ratios = ordered[first:] / np.maximum(ordered[first - 1 : -1], 1e-12)
         place = first + int(ratios.argmax())
         misread = order[place:]
-        typical = ordered[: place][int(0.9 * place) :].mean()
+        typical = ordered[:place][int(0.9 * place) :].mean()
         if ordered[place] < _SHARP * typical:
             return cls._sudden(evidence, residual, far)
         return [cls(tuple(np.sort(evidence.rows[misread]).tolist()))]

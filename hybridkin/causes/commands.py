@@ -17,7 +17,9 @@ from hybridkin.causes.evidence import Evidence
 _STILL = 1e-3  # of the largest range: an actuator that moves less does not move
 _LARGER = 1.5  # least factor by which bends are of another size
 _LEAST_GAIN = 0.2  # an actuator that moves less is dead
-_AWAY = 0.05  # of the range: values at the first row this far from the rest are not at rest
+_AWAY = (
+    0.05  # of the range: values at the first row this far from the rest are not at rest
+)
 
 
 def _moved_actuators(evidence: Evidence) -> list[int]:
@@ -76,9 +78,7 @@ class _OneActuator(ActuatorCause):
         return q
 
     @abstractmethod
-    def motion(
-        self, evidence: Evidence, q: NDArray, parameters: NDArray
-    ) -> NDArray:
+    def motion(self, evidence: Evidence, q: NDArray, parameters: NDArray) -> NDArray:
         """Return what the actuator did (N,) where the model takes q (N,) [unit of q]."""
 
     def steps(self, evidence: Evidence) -> NDArray:
@@ -100,9 +100,7 @@ class Zero(_OneActuator):
         """Return the zero of the model."""
         return [np.zeros(1)]
 
-    def motion(
-        self, evidence: Evidence, q: NDArray, parameters: NDArray
-    ) -> NDArray:
+    def motion(self, evidence: Evidence, q: NDArray, parameters: NDArray) -> NDArray:
         """Return the shifted motion of the actuator (N,) [unit of q]."""
         return q + parameters[0]
 
@@ -143,9 +141,7 @@ class Slip(_OneActuator):
         """Return no slip."""
         return [np.zeros(1)]
 
-    def motion(
-        self, evidence: Evidence, q: NDArray, parameters: NDArray
-    ) -> NDArray:
+    def motion(self, evidence: Evidence, q: NDArray, parameters: NDArray) -> NDArray:
         """Return the motion of the actuator (N,), shifted after the slip [unit of q]."""
         return q + parameters[0] * (evidence.rows >= self.row)
 
@@ -162,9 +158,7 @@ class Gain(_OneActuator):
     """One actuator moves by another factor: a spool of another radius, a leak."""
 
     name = "gain of one actuator"
-    remedy = (
-        "check the radius of its spool, its driver's steps or its pressure, and fit again"
-    )
+    remedy = "check the radius of its spool, its driver's steps or its pressure, and fit again"
     n_parameters = 1
 
     def starts(self, evidence: Evidence) -> Sequence[NDArray]:
@@ -175,9 +169,7 @@ class Gain(_OneActuator):
         """Return one."""
         return np.ones(1)
 
-    def motion(
-        self, evidence: Evidence, q: NDArray, parameters: NDArray
-    ) -> NDArray:
+    def motion(self, evidence: Evidence, q: NDArray, parameters: NDArray) -> NDArray:
         """Return the scaled motion of the actuator (N,) about its rest [unit of q]."""
         rest = evidence.actuators.rest[self.actuator]
         return rest + self._factor(parameters) * (q - rest)
@@ -203,9 +195,7 @@ class Dead(_OneActuator):
         q = evidence.motion.q[:, self.actuator]
         return [q[:1], q.mean(keepdims=True)]
 
-    def motion(
-        self, evidence: Evidence, q: NDArray, parameters: NDArray
-    ) -> NDArray:
+    def motion(self, evidence: Evidence, q: NDArray, parameters: NDArray) -> NDArray:
         """Return the position at which the actuator stands (N,) [unit of q]."""
         return np.full(len(q), parameters[0])
 
@@ -230,9 +220,9 @@ class Sign(Reading):
 
     @classmethod
     def members(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return one cause for each actuator that moves and has no absolute length."""
-        absolute = evidence.actuators.absolute
-        return [cls(i) for i in _moved_actuators(evidence) if not absolute[i]]
+        """Return one cause for each actuator that moves and is no length."""
+        signed = evidence.actuators.signed
+        return [cls(i) for i in _moved_actuators(evidence) if signed[i]]
 
     def way(self, evidence: Evidence) -> NDArray:
         """Return the identity (n, n) with one sign reversed."""
@@ -308,7 +298,9 @@ class Numbering(Reading):
     """The actuators of every segment are numbered in the other direction."""
 
     name = "numbering in the other direction"
-    remedy = "set clockwise in every [[segment]], or list the columns in the other order"
+    remedy = (
+        "set clockwise in every [[segment]], or list the columns in the other order"
+    )
 
     @classmethod
     def members(cls, evidence: Evidence) -> Sequence[Self]:
@@ -375,7 +367,9 @@ class Size(ActuatorCause):
         straight = np.broadcast_to(actuators.rest, evidence.q.shape).copy()
         for columns in actuators.segments:
             if actuators.absolute[columns].all():
-                straight[:, columns] = evidence.q[:, columns].mean(axis=1, keepdims=True)
+                straight[:, columns] = evidence.q[:, columns].mean(
+                    axis=1, keepdims=True
+                )
         return straight + self._factor(parameters) * (evidence.q - straight)
 
     def _factor(self, parameters: NDArray) -> float:
@@ -398,9 +392,7 @@ class ZeroDrift(_OneActuator):
         """Return no drift."""
         return [np.zeros(1)]
 
-    def motion(
-        self, evidence: Evidence, q: NDArray, parameters: NDArray
-    ) -> NDArray:
+    def motion(self, evidence: Evidence, q: NDArray, parameters: NDArray) -> NDArray:
         """Return the drifting motion of the actuator (N,) [unit of q]."""
         rows = evidence.rows
         passed = (rows - evidence.rows[0]) / max(len(evidence.motion.q), 1)

@@ -11,7 +11,20 @@ from numpy.typing import NDArray
 
 from hybridkin.causes.body import Misread, ModelError, OffPlane, OutsideTheLog, Payload
 from hybridkin.causes.cause import Cause, Nothing, distances
-from hybridkin.causes.commands import AllSigns, Dead, FirstRow, Gain, GainOfAll, Numbering, Sign, Size, Slip, Swap, Zero, ZeroDrift
+from hybridkin.causes.commands import (
+    AllSigns,
+    Dead,
+    FirstRow,
+    Gain,
+    GainOfAll,
+    Numbering,
+    Sign,
+    Size,
+    Slip,
+    Swap,
+    Zero,
+    ZeroDrift,
+)
 from hybridkin.causes.evidence import Evidence
 from hybridkin.causes.frames import Axes, Bump, Drift, MovedBase, Units
 from hybridkin.causes.timing import Backlash, Creep, Lag
@@ -199,7 +212,9 @@ def compare_causes(
     for kind in causes:
         explanations += _explained(evidence, few, kind)
     (nothing,) = Nothing.members(evidence)
-    return CauseComparison(evidence, _judged(evidence, nothing, np.zeros(0)), explanations)
+    return CauseComparison(
+        evidence, _judged(evidence, nothing, np.zeros(0)), explanations
+    )
 
 
 def _explained(

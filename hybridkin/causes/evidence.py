@@ -54,6 +54,11 @@ class Actuators(NamedTuple):
         return self.layout.absolute
 
     @property
+    def signed(self) -> NDArray:
+        """Which actuators (n,) can be read with a wrong sign, bool."""
+        return self.layout.signed
+
+    @property
     def segments(self) -> list[list[int]]:
         """The actuators of every segment, in order of their angles."""
         return self.layout.segments
@@ -229,7 +234,5 @@ class Evidence:
             inside=np.ones(n_rows, dtype=bool),
             off_plane=np.zeros_like(q),
         )
-        vars(further)["path"] = np.concatenate(
-            [self.path, evaluate(self.model, q)[0]]
-        )
+        vars(further)["path"] = np.concatenate([self.path, evaluate(self.model, q)[0]])
         return further

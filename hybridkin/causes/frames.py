@@ -94,9 +94,7 @@ class MovedBase(Cause):
     """The base, or the camera, stands elsewhere than in the log."""
 
     name = "moved base"
-    remedy = (
-        "measure where the base is, or call `model.adapt(q, x)` with this log"
-    )
+    remedy = "measure where the base is, or call `model.adapt(q, x)` with this log"
     n_parameters = 6
 
     @classmethod
@@ -155,9 +153,7 @@ class Bump(MovedBase):
     row: int
 
     name = "bump"
-    remedy = (
-        "use the rows before it; measure where the base is, or repeat the motion"
-    )
+    remedy = "use the rows before it; measure where the base is, or repeat the motion"
     n_parameters = 7
 
     @classmethod

@@ -15,7 +15,9 @@ _ROWS = 40  # of a sweep
 _HOLD = 10.0  # [s]
 _SLOWER = 10.0
 _CLEARLY = 1.1  # ratio of the differences on a later motion and on a simpler one
-_TOLD = 3.0  # times the error that is left: least difference that tells two causes apart
+_TOLD = (
+    3.0  # times the error that is left: least difference that tells two causes apart
+)
 
 
 @dataclass(frozen=True, eq=False)

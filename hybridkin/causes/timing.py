@@ -117,7 +117,9 @@ class Creep(_Hysteresis):
     """A share of every change comes late."""
 
     name = "creep"
-    remedy = "fit named motions with times (--play auto), or move slowly and wait for rest"
+    remedy = (
+        "fit named motions with times (--play auto), or move slowly and wait for rest"
+    )
     n_parameters = 2
 
     def starts(self, evidence: Evidence) -> Sequence[NDArray]:
@@ -132,7 +134,9 @@ class Creep(_Hysteresis):
         """Return one for both."""
         return np.ones(2)
 
-    def _share_and_time(self, motion: Motion, parameters: NDArray) -> tuple[float, float]:
+    def _share_and_time(
+        self, motion: Motion, parameters: NDArray
+    ) -> tuple[float, float]:
         share = 0.95 / (1.0 + np.exp(-np.clip(parameters[0], -30.0, 30.0)))
         longest = np.log(motion.duration / motion.period)
         time = motion.period * np.exp(np.clip(parameters[1], -1.0, max(longest, 0.0)))

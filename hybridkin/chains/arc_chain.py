@@ -174,15 +174,19 @@ class ArcChain(MarkedChain):
     def actuator_layout(self) -> ActuatorLayout:
         """Rest, kind and segment of every actuator; pressures have no effect at zero."""
         absolute = self.absolute.cpu().numpy()
+        signed = ~absolute
         rest = as_array(self.rest.detach())
         if not self.in_metres:
+            signed = np.ones_like(absolute)
             rest = np.where(absolute, 0.0, rest)
         segments = []
         first = 0
         for count in self.actuators_per_segment:
             segments.append([*range(first, first + count)])
             first += count
-        return ActuatorLayout(rest, absolute, segments, self._still_directions())
+        return ActuatorLayout(
+            rest, absolute, signed, segments, self._still_directions()
+        )
 
     def _still_directions(self) -> NDArray:
         """Return the directions of q (n, k) that no arcs of the robot move, in orthonormal columns.

@@ -37,6 +37,8 @@ class ActuatorLayout(NamedTuple):
         The q at which they have no effect, for lengths of chambers zero [unit of q].
     absolute : ndarray of shape (n,) of bool
         Which have lengths in place of changes of length.
+    signed : ndarray of shape (n,) of bool
+        Which can be read with a wrong sign: all but lengths.
     segments : list of list of int
         The actuators of every segment, in order of their angles.
     balance : ndarray of shape (n, k)
@@ -45,6 +47,7 @@ class ActuatorLayout(NamedTuple):
 
     rest: NDArray
     absolute: NDArray
+    signed: NDArray
     segments: list[list[int]]
     balance: NDArray
 
@@ -52,7 +55,8 @@ class ActuatorLayout(NamedTuple):
     def independent(cls, n: int) -> ActuatorLayout:
         """Return the layout of n actuators of which nothing is known."""
         segments = [[i] for i in range(n)]
-        return cls(np.zeros(n), np.zeros(n, dtype=bool), segments, np.zeros((n, 0)))
+        none = np.zeros(n, dtype=bool)
+        return cls(np.zeros(n), none, ~none, segments, np.zeros((n, 0)))
 
 
 class Chain(PoseModel):

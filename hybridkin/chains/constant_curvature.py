@@ -21,7 +21,6 @@ from hybridkin._core.stored import Layout, Restore, Stored
 from hybridkin.chains._arcs import turned_by_first
 from hybridkin.chains._checks import filled, float_dtype
 from hybridkin.chains._paths import bend_counts, bend_extremes, free_arcs
-from hybridkin.chains.chain import Chain
 from hybridkin.chains.arc_chain import (
     STRUCTURE,
     ArcChain,
@@ -29,6 +28,7 @@ from hybridkin.chains.arc_chain import (
     each_marker,
     frame_numbers,
 )
+from hybridkin.chains.chain import Chain
 
 __all__ = ["ConstantCurvatureChain"]
 

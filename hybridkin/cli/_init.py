@@ -46,7 +46,9 @@ class _Question(NamedTuple):
 _KINDS = "tendons, elastic-tendons (they can go slack) or chambers (of measured length)"
 _SIZES = ("radius", "length", "angle", "gain", "spool_radius", "zeros")
 _AT_ZERO = 0.05  # of the range: first values this near to zero are zero
-_ALIKE = 0.05  # of the range: first values of motions that differ by less are one posture
+_ALIKE = (
+    0.05  # of the range: first values of motions that differ by less are one posture
+)
 _EACH = "[mm]; one value, or one for each segment"
 _LENGTHS = ", ".join(METRES)
 _UNIT = f"unit of the actuators: {_LENGTHS}; deg or rad of motors; another name, such as counts"

@@ -39,6 +39,7 @@ from hybridkin.datasets._logs import Log, column_names
 
 if TYPE_CHECKING:
     from hybridkin.chains.arc_chain import ArcChain
+    from hybridkin.chains.chain import ActuatorLayout
 
 _FACTORS = (1e-3, 1e-2, 1e-1, 10.0, 100.0, 1000.0)
 _ROWS = 500  # enough to distinguish a robot from its mirror image
@@ -61,11 +62,15 @@ _GOOD = 0.55  # relative error of another reading
 _ENOUGH = 0.85  # explained part of the variance
 _TWIST = 120.0  # [deg] least rotation of a base about its axis
 _TILT = 45.0  # [deg] largest tilt of a base
-_FAR_FEWER = 0.6  # error of many changes relative to that of one, from which they are named
+_FAR_FEWER = (
+    0.6  # error of many changes relative to that of one, from which they are named
+)
 _WORTH = 0.3  # relative error from which columns of q and x may be exchanged
 _UNBALANCED = 0.1  # the same, from which tendons are not in balance
 _MOST_FLIPPED = 3  # signs that balance can correct
-_BALANCED = 0.02  # of the spread of the tendons: motion along a direction that counts as none
+_BALANCED = (
+    0.02  # of the spread of the tendons: motion along a direction that counts as none
+)
 _SHIFTED = 0.87  # relative error; for clean logs, simulated and real, it was above 0.89
 _ADVICE = {
     "axes": "check order and signs of the columns of x, which must be right-handed, and [base] of "
@@ -79,8 +84,9 @@ _ADVICE = {
     "drift": "look for a slipping spool or sensor; fit the parts of the log separately.",
     "geometry": "check which columns are q and x, their order, the zero of each actuator, the "
     "angles, the routing, the lengths and, if it is not fitted, [base].",
-    "whole": "subtract from each column its value at the straight robot; or, for chambers that "
-    "stretch, remove `length` from every [[segment]].",
+    "whole": "subtract from each column its value at the straight robot, or give these values as "
+    "`zeros` of every [[segment]], which `hybridkin init` proposes; or, for chambers that stretch, "
+    "remove `length` from every [[segment]].",
     "changes": "if the log holds changes of length, add the length at rest to each; or, for a "
     "robot with tendons on a backbone of fixed length, give `length` in every [[segment]].",
 }
@@ -93,7 +99,12 @@ def geometry_findings(
     findings = [*_negated_zeros(log, chain)]
     if findings:
         return findings
-    comparison = _Comparison(*_in_metres(log, chain), base_is_free)
+    layout = chain.actuator_layout
+    rest = chain.metres(torch.from_numpy(layout.rest)).detach().cpu().numpy()
+    layout = layout._replace(rest=rest)
+    log, chain = _in_metres(log, chain)
+    layout = layout._replace(balance=chain.actuator_layout.balance)
+    comparison = _Comparison(log, chain, layout, base_is_free)
     checks = _CHECKS_OF_VALUES
     if comparison.comparable:
         checks += _CHECKS_OF_MOTION
@@ -123,9 +134,12 @@ class _Comparison:
     Relative errors are those of `misses`.
     """
 
-    def __init__(self, log: Log, chain: ArcChain, base_is_free: bool) -> None:
+    def __init__(
+        self, log: Log, chain: ArcChain, layout: ActuatorLayout, base_is_free: bool
+    ) -> None:
         self.log = log
         self.chain = chain
+        self.layout = layout
         self.base_is_free = base_is_free
         self.q_names = column_names(log, "q")
         self.radii = chain.radii.detach().cpu().double().numpy()
@@ -173,14 +187,13 @@ class _Comparison:
         n_rows = len(self.few_q)
         q = self.few_q
         per_unit = np.full(q.shape[1], 1e-3)
-        layout = self.chain.actuator_layout
         return Evidence(
             motion=Motion.of(q, None, None),
             rows=np.arange(n_rows),
             x=self.few_x,
             model=self.chain,
             bodies=[self.chain],
-            actuators=Actuators(self.q_names, "mm", per_unit, layout),
+            actuators=Actuators(self.q_names, "mm", per_unit, self.layout),
             inside=np.ones(n_rows, dtype=bool),
             off_plane=np.zeros_like(q),
             promised=0.0,
@@ -191,7 +204,7 @@ class _Comparison:
 
     def imbalance(self, q: NDArray) -> float:
         """Return how far rows q (N, n) move where tendons in balance do not, of all motion."""
-        balance = self.chain.actuator_layout.balance
+        balance = self.layout.balance
         moved = q - q.mean(axis=0)
         size = max(float(np.linalg.norm(moved)), np.finfo(float).tiny)
         return float(np.linalg.norm(moved @ balance)) / size
@@ -200,6 +213,10 @@ class _Comparison:
         """Return whether tendons are as much in balance with another way to read the columns."""
         declared = max(self.imbalance(self.q), _BALANCED)
         return self.imbalance(self.q @ way) < 2.0 * declared
+
+    def read(self, q: NDArray, way: NDArray) -> NDArray:
+        """Return rows q (N, n) that are read in another way; rest stays rest."""
+        return self.layout.rest + (q - self.layout.rest) @ way
 
     @cached_property
     def reading(self) -> tuple[NDArray, float]:
@@ -210,7 +227,7 @@ class _Comparison:
         least = self.declared_error
         for explanation in compared.explanations:
             way = explanation.cause.way(compared.evidence).astype(int)
-            error = self.error(self.q @ way, self.x, self.base_is_free)
+            error = self.error(self.read(self.q, way), self.x, self.base_is_free)
             if error * SIMPLE < least and self.keeps_balance(way):
                 best = way
                 least = error
@@ -429,37 +446,51 @@ def _exchanged_columns(comparison: _Comparison) -> Iterator[LogFinding]:
         yield LogFinding("exchanged", "warning", message, "exchange these two columns.")
 
 
-def _reversed_tendons(comparison: _Comparison) -> Iterator[LogFinding]:
-    """Yield the fewest signs with which the tendons of a log are in balance, as never without."""
-    q = comparison.q
-    n = q.shape[1]
-    if comparison.imbalance(q) < _UNBALANCED:
+def _unbalanced(comparison: _Comparison) -> Iterator[LogFinding]:
+    """Yield the fewest changes with which the tendons of a log are in balance, as never without."""
+    if comparison.imbalance(comparison.q) < _UNBALANCED:
         return
-    for n_flipped in range(1, _MOST_FLIPPED + 1):
+    for ways in _few_changes(comparison.layout):
         balanced = []
-        for flipped in itertools.combinations(range(n), n_flipped):
-            signs = np.ones(n, dtype=int)
-            signs[[*flipped]] = -1
-            if comparison.imbalance(signs * q) < _BALANCED:
-                balanced.append(signs)
+        for way in ways:
+            if comparison.imbalance(comparison.few_q @ way) < _BALANCED:
+                error = comparison.error(comparison.few_q @ way, comparison.few_x)
+                balanced.append((error, len(balanced), way))
         if balanced:
             break
     else:
         return
-    errors = [comparison.error(signs * comparison.few_q, comparison.few_x) for signs in balanced]
-    signs = balanced[int(np.argmin(errors))]
+    way = min(balanced)[-1]
     names = comparison.q_names
-    layout = comparison.chain.actuator_layout
-    never = in_terms(signs[:, None] * layout.balance, names).split("; ")
-    wanted = in_terms(layout.balance, names).split("; ")
-    of_log = "; ".join(term for term in never if term not in wanted)
-    of_tendons = "; ".join(term for term in wanted if term not in never)
-    flipped = ", ".join(repr(names[i]) for i in np.flatnonzero(signs < 0))
+    of_log = in_terms(way @ comparison.layout.balance, names).split("; ")
+    of_tendons = in_terms(comparison.layout.balance, names).split("; ")
+    never = "; ".join(term for term in of_log if term not in of_tendons)
+    wanted = "; ".join(term for term in of_tendons if term not in of_log)
+    kind, causes, advice = _reading_in_words(comparison, way)
     message = (
-        f"the log has no motion along {of_log}, but tendons that do not pull against each other "
-        f"have none along {of_tendons}: the sign of {flipped} is reversed."
+        f"the log has no motion along {never}, but tendons that do not pull against each other "
+        f"have none along {wanted}, as with {causes}."
     )
-    yield LogFinding("sign", "warning", message, _sign_advice(comparison.log, np.diag(signs)))
+    yield LogFinding(kind, "warning", message, advice)
+
+
+def _few_changes(layout: ActuatorLayout) -> Iterator[list[NDArray]]:
+    """Yield the ways with one change that balance can show, then those with more signs."""
+    n = len(layout.rest)
+    declared = np.eye(n, dtype=int)
+    single = []
+    for one, other in itertools.combinations(layout.segments, 2):
+        for i, j in itertools.product(one, other):
+            order = np.arange(n)
+            order[[i, j]] = [j, i]
+            single.append(declared[:, order])
+    for n_flipped in range(1, _MOST_FLIPPED + 1):
+        ways = single if n_flipped == 1 else []
+        for flipped in itertools.combinations(range(n), n_flipped):
+            signs = np.ones(n, dtype=int)
+            signs[[*flipped]] = -1
+            ways = [*ways, np.diag(signs)]
+        yield ways
 
 
 def _misread_columns(comparison: _Comparison) -> Iterator[LogFinding]:
@@ -474,13 +505,12 @@ def _misread_columns(comparison: _Comparison) -> Iterator[LogFinding]:
         error = error_of_many
     if error >= limit:
         return
-    yield _reading_finding(comparison, way, error)
+    kind, causes, advice = _reading_in_words(comparison, way)
+    yield LogFinding(kind, "warning", comparison.better(error, causes), advice)
 
 
-def _reading_finding(
-    comparison: _Comparison, way: NDArray, error: float
-) -> LogFinding:
-    """Return the finding of another way to read the columns of q, with its relative error."""
+def _reading_in_words(comparison: _Comparison, way: NDArray) -> tuple[str, str, str]:
+    """Return the kind of another way to read the columns of q, what is wrong, and advice."""
     log = comparison.log
     chain = comparison.chain
     order = np.abs(way).argmax(axis=0).tolist()
@@ -512,8 +542,7 @@ def _reading_finding(
             flipped = ", ".join(repr(names[i]) for i in np.flatnonzero(sign < 0))
         causes.append(f"the sign of {flipped} flipped")
         advice.append(_sign_advice(log, way))
-    message = comparison.better(error, " and ".join(causes))
-    return LogFinding(kind, "warning", message, " ".join(advice))
+    return kind, " and ".join(causes), " ".join(advice)
 
 
 def _turned_base(comparison: _Comparison) -> Iterator[LogFinding]:
@@ -597,7 +626,7 @@ _CHECKS_OF_VALUES: tuple[_Check, ...] = (_no_lengths, _wrong_units, _only_length
 _CHECKS_OF_MOTION: tuple[_Check, ...] = (
     _turned_axes,
     _exchanged_columns,
-    _reversed_tendons,
+    _unbalanced,
     _misread_columns,
     _turned_base,
     _changed_values,

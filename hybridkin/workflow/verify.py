@@ -413,9 +413,7 @@ def _separation(compared: CauseComparison) -> str:
     """Return the motion that tells the likely cause from the first of the others, in words."""
     if not compared.also:
         return ""
-    separation = separating_motion(
-        compared.evidence, compared.likely, compared.also[0]
-    )
+    separation = separating_motion(compared.evidence, compared.likely, compared.also[0])
     if not separation.words:
         return ""
     far = millimetres(separation.difference, ".2g")

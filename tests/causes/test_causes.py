@@ -24,8 +24,7 @@ def smooth(low, high, seed=0, n=N):
     rng = np.random.default_rng(seed)
     t = np.linspace(0.0, 1.0, n)[:, None]
     waves = sum(
-        np.sin(2.0 * np.pi * (k * t + rng.random(6))) * rng.uniform(0.3, 1.0, 6)
-        for k in (1, 2, 3)
+        np.sin(2.0 * np.pi * (k * t + rng.random(6))) * rng.uniform(0.3, 1.0, 6) for k in (1, 2, 3)
     )
     return 0.5 * (low + high) + 0.5 * (high - low) * waves / np.abs(waves).max()
 
@@ -183,7 +182,10 @@ def test_what_is_unknown_of_the_frame_does_not_count(alignment):
     weights = np.ones(N)
     assert_allclose(alignment.aligned(tips(Q), moved, weights), moved, atol=1e-12)
     given = evidence(moved, alignment=alignment)
-    assert compare_causes(given, [c for c in CAUSES if c.name != "unit of the tips"]).nothing.mean < 1e-4
+    assert (
+        compare_causes(given, [c for c in CAUSES if c.name != "unit of the tips"]).nothing.mean
+        < 1e-4
+    )
 
 
 def test_times_that_do_not_increase_are_not_used():
