@@ -189,7 +189,7 @@ class Bellows(_Sagging):
 class Tendons(FaultRobot):
     """The tendon robot of `motor_robot`: two segments of three tendons, in counts of motors."""
 
-    settings = {"error_model": "auto"}
+    settings: ClassVar[dict[str, Any]] = {"error_model": "auto"}
     name = "tendons"
     unit = "1"
     noise = 3e-4

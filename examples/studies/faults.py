@@ -12,8 +12,8 @@ was and once with each of 14 faults. A fault is
 - *named* if it is that cause or one of those that explain as much on this path;
 - *wrongly blamed* if another cause is named, and the fault is not among the others.
 
-An earlier version, without causes that explain as much, is judged by the shares that it prints: there
-a fault is *named* if its share is above a half.
+An earlier version, without causes that explain as much, is judged by the shares that it prints:
+there a fault is *named* if its share is above a half.
 
 The second table is of mistakes in the log before a fit, as `check_log` names them: *first* if the
 first finding about columns, values or time has the right kind and, for signs and orders, its advice

@@ -1,4 +1,4 @@
-"""Causes in the body, and in the model: a load, an error of the model, rows that it does not know."""
+"""Causes in the body and in the model: a load, an error, rows that it does not know."""
 
 from __future__ import annotations
 
