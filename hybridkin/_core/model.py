@@ -188,8 +188,9 @@ class ForwardModel(PortableModule):
 
     @property
     def limits(self) -> dict[str, Any]:
-        """Defaults of `q_min`, `q_max` and `dq_max` of `InverseKinematics`."""
-        return {"q_min": -math.inf, "q_max": math.inf, "dq_max": math.inf}
+        """Defaults of `q_min`, `q_max`, `dq_max` and `ddq_max` of `InverseKinematics`."""
+        unlimited = dict.fromkeys(("q_min", "q_max", "dq_max", "ddq_max"), math.inf)
+        return {**unlimited, "q_min": -math.inf}
 
     @property
     def turns(self) -> Tensor | bool:

@@ -15,6 +15,25 @@ METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254}
 UNITS = {**METRES, "rad": 1.0, "deg": math.pi / 180, "1": 1.0}
 """Metres or radians per unit of actuators; "1" keeps the values as they are."""
 
+
+class LogUnit(NamedTuple):
+    """The unit of the actuators in the files of a robot, for texts."""
+
+    name: str  # "mm" in place of "m"
+    size: float  # in the unit of q of the model: metres, radians, or one
+
+    @classmethod
+    def of(cls, q_unit: str) -> LogUnit:
+        """Return the unit that a log names; "1" is one without a name."""
+        if q_unit in ("m", "1"):
+            return {"m": cls("mm", METRES["mm"]), "1": cls("(unit of q)", 1.0)}[q_unit]
+        return cls(q_unit, UNITS.get(q_unit, 1.0))
+
+    def in_words(self, change: float) -> str:
+        """Return a change of q in this unit."""
+        return f"{change / self.size:.3g} {self.name}"
+
+
 LONGEST_PULL = 4.0
 """Largest plausible tendon displacement, in backbone lengths."""
 

@@ -160,18 +160,19 @@ def numeric(
 
 
 def joint_limits(n: int, *given: Numbers | None) -> dict[str, Tensor]:
-    """Return `q_min`, `q_max` and `dq_max`, shape (n,), infinite if given as None."""
+    """Return `q_min`, `q_max`, `dq_max` and `ddq_max`, shape (n,), infinite if given as None."""
     limits = {}
-    ends = {"q_min": -math.inf, "q_max": math.inf, "dq_max": math.inf}
+    ends = dict.fromkeys(("q_min", "q_max", "dq_max", "ddq_max"), math.inf)
+    ends["q_min"] = -math.inf
     for (name, end), value in zip(ends.items(), given, strict=True):
         if value is None:
             value = np.full(n, end)
         limits[name] = numeric(value, name, need="n", length=n, finite=False)
-    low, high, speed = limits.values()
-    if not ((low <= high) & (speed > 0.0)).all():
+    low, high, speed, acceleration = limits.values()
+    if not ((low <= high) & (speed > 0.0) & (acceleration > 0.0)).all():
         raise ValueError(
-            "`q_min` must not exceed `q_max`, and `dq_max` must be positive, got "
-            f"{low.tolist()}, {high.tolist()} and {speed.tolist()}."
+            "`q_min` must not exceed `q_max`, and `dq_max` and `ddq_max` must be positive, got "
+            f"{low.tolist()}, {high.tolist()}, {speed.tolist()} and {acceleration.tolist()}."
         )
     return limits
 

@@ -16,6 +16,7 @@ import torch
 
 from hybridkin._core.arrays import shaped
 from hybridkin._core.rotations import rotation
+from hybridkin._core.text_rows import DECIMALS
 from hybridkin._core.units import METRES, UNITS
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
@@ -115,7 +116,13 @@ _ROWS: list[tuple[str, str, str, _Test]] = [
     ("segment", "angle_deg offset", "be a number", _is_number),
     ("segment", "weight", "be zero or more", lambda v: _is_number(v) and v >= 0),
     ("segment", "taper", "lie in [0, 1)", lambda v: _is_number(v) and 0 <= v < 1),
-    ("segment", "angles_deg zeros", "hold numbers", _many(_is_number)),
+    ("segment", "angles_deg", "hold numbers", _many(_is_number)),
+    (
+        "segment",
+        "zeros",
+        "be a number, or a list of numbers",
+        _one_or_many(_is_number),
+    ),
     ("segment", "gain spool_radius", *_POSITIVE),
     ("segment", "rest_bend_deg", "hold 2 numbers", _many(_is_number, 2)),
     ("segment", "stage", *_among("insertion", "rotation")),
@@ -136,8 +143,17 @@ _ROWS: list[tuple[str, str, str, _Test]] = [
         _many(_many(_is_number, 5)),
     ),
     ("log", "q_unit groups runs time", *_TEXT),
+    (
+        "log",
+        "unwrap",
+        "be true or false, a positive period, or a table of columns and their periods",
+        lambda v: isinstance(v, (bool, dict)) or _is_positive(v),
+    ),
     ("log", "group_suffix", "be text", lambda value: isinstance(value, str)),
     ("log", "x_unit", *_among(*METRES)),
+    ("log", "header_line", *_WHOLE),
+    ("log", "decimal", *_among(*DECIMALS)),
+    ("log", "missing", "hold numbers", _many(_is_number)),
     ("log", "q_sign", "be 1 or -1, or a list of them", _one_or_many(_among(1, -1)[1])),
     (
         "limits",

@@ -13,7 +13,13 @@ from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from hybridkin.chains._arm_files import UNLIMITED, Joint, check_link, source_of
+from hybridkin.chains._arm_files import (
+    Joint,
+    JointLimits,
+    check_link,
+    moved,
+    source_of,
+)
 
 _KINDS = ("revolute", "continuous", "prismatic", "fixed")
 _FREE = {
@@ -116,11 +122,7 @@ class Urdf:
         if kind == "fixed":
             return [Joint(origin)]
         axis = np.array(_numbers(element, "axis", "xyz", "1 0 0"))
-        step = offset * axis / (np.linalg.norm(axis) or 1.0)
-        if kind == "prismatic":
-            origin = origin @ _matrix(position=step)
-        else:
-            origin = origin @ _matrix(Rotation.from_rotvec(step))
+        origin = moved(origin, kind, axis, offset)
         if driver_kind == "fixed":
             return [Joint(origin)]
         limits = _limits(actuator, driver)
@@ -205,19 +207,25 @@ def _numbers(joint: etree._Element, tag: str, key: str, default: str) -> list[fl
     return numbers
 
 
-def _limits(name: str, joint: etree._Element | None) -> tuple[float, float, float]:
-    """Return the lower limit, the upper limit and the largest speed of a joint."""
-    speed = math.inf
-    if joint is not None:  # 0 means no limit
-        speed = _numbers(joint, "limit", "velocity", "0")[0] or math.inf
+def _limits(name: str, joint: etree._Element | None) -> JointLimits:
+    """Return the limits of a joint; a speed or an acceleration of 0 means no limit."""
+    limits = JointLimits()
+    if joint is not None:
+        speed = _numbers(joint, "limit", "velocity", "0")[0]
+        # URDF 1.2; a joint that brakes less than it accelerates must keep to the smaller one.
+        acceleration = _numbers(joint, "limit", "acceleration", "0")[0] or math.inf
+        deceleration = _numbers(joint, "limit", "deceleration", "0")[0] or math.inf
+        limits = JointLimits(
+            speed=speed or math.inf, acceleration=min(acceleration, deceleration)
+        )
         if joint.get("type") == "continuous":
-            return -math.inf, math.inf, speed
+            return limits
     if joint is None or joint.find("limit") is None:
         _warn(
             f"joint {name!r} has no <limit>, which URDF requires; it is unlimited. Add <limit>, or "
             'set type="continuous" if it turns without limits.'
         )
-        return UNLIMITED
+        return limits
     low = _numbers(joint, "limit", "lower", "0")[0]
     high = _numbers(joint, "limit", "upper", "0")[0]
     if low == high == 0.0:
@@ -227,8 +235,8 @@ def _limits(name: str, joint: etree._Element | None) -> tuple[float, float, floa
         )
     if low > high:
         _warn(f"limits of joint {name!r} are swapped; they are used in order.")
-        return high, low, speed
-    return low, high, speed
+        return limits._replace(low=high, high=low)
+    return limits._replace(low=low, high=high)
 
 
 def _warn(message: str) -> None:
@@ -245,15 +253,25 @@ def _free_joints(name: str, kind: str) -> list[Joint]:
 
 
 def _origin(joint: etree._Element) -> NDArray:
-    turn = Rotation.from_euler("xyz", _numbers(joint, "origin", "rpy", "0 0 0"))
-    return _matrix(turn, _numbers(joint, "origin", "xyz", "0 0 0"))
+    """Return the pose of a joint; it is rotated by angles or, since URDF 1.1, a quaternion."""
+    position = _numbers(joint, "origin", "xyz", "0 0 0")
+    quaternion = _numbers(joint, "origin", "quat_xyzw", "0 0 0 1")
+    angles = _numbers(joint, "origin", "rpy", "0 0 0")
+    element = joint.find("origin")
+    if element is None or element.get("quat_xyzw") is None:
+        return _matrix(Rotation.from_euler("xyz", angles), position)
+    if element.get("rpy") is not None or not np.any(quaternion):
+        raise ValueError(
+            f"<origin> of joint {joint.get('name')!r} must have either `rpy` or `quat_xyzw`, a "
+            f"quaternion that is not zero, got {dict(element.attrib)}; correct the URDF."
+        )
+    return _matrix(Rotation.from_quat(quaternion), position)
 
 
-def _matrix(turn: Rotation | None = None, position: ArrayLike = 0.0) -> NDArray:
+def _matrix(turn: Rotation, position: ArrayLike) -> NDArray:
     matrix = np.eye(4)
+    matrix[:3, :3] = turn.as_matrix()
     matrix[:3, 3] = position
-    if turn is not None:
-        matrix[:3, :3] = turn.as_matrix()
     return matrix
 
 
@@ -268,6 +286,7 @@ def _write_origin(joint: etree._Element, placed: NDArray) -> None:
     element = joint.find("origin")
     if element is None:
         element = etree.SubElement(joint, "origin")
+    element.attrib.pop("quat_xyzw", None)
     element.set("xyz", _text(placed[:3, 3]))
     element.set("rpy", _text([roll, pitch, yaw]))
 

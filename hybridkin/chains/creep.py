@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybridkin._core.arrays import real_array
 from hybridkin._core.kernel_numbers import HK_MAX_CREEPS
+from hybridkin._core.units import LogUnit
 from hybridkin.chains.hysteresis import HysteresisOperator
 from hybridkin.native.hysteresis import Stage
 
@@ -81,6 +82,12 @@ class CreepOperator(HysteresisOperator):
     @property
     def _size(self) -> int | str:
         return self.gains.shape[1] if self.gains.ndim == 2 else "n"
+
+    def in_words(self, unit: LogUnit) -> str:
+        """Return the largest share of a change that comes late, and the time constants."""
+        late = 100.0 * self.gains.sum(axis=0).max()
+        times = [f"{time:.3g}" for time in np.unique(self.times[[0, -1]])]
+        return f"creep (up to {late:.2g} % late, with {' to '.join(times)} s)"
 
     def stages(self, n: int) -> list[Stage]:
         """Return the operator of n actuators as one stage of creep."""

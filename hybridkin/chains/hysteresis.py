@@ -19,6 +19,7 @@ from hybridkin._core.arrays import (
     real_array,
 )
 from hybridkin._core.kernel_numbers import HK_CREEP_ROUNDING
+from hybridkin._core.units import LogUnit
 from hybridkin.chains._stages import follow_in_numpy
 from hybridkin.native.hysteresis import Stage, follow, stage_numbers
 from hybridkin.native.library import available
@@ -66,6 +67,10 @@ class HysteresisOperator(ABC):
     def parts(self) -> tuple[HysteresisOperator, ...]:
         """The operators in series that it consists of."""
         return (self,)
+
+    def in_words(self, unit: LogUnit) -> str:
+        """Return what it is, with its largest width in the unit of a log."""
+        return f"{self.kind} of {unit.in_words(float(self.width.max()))}"
 
     def apply(
         self, q: Any, state: Numbers | None = None, dt: ArrayLike | None = None

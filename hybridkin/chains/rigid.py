@@ -19,7 +19,6 @@ from hybridkin.chains._arm_files import (
     Joint,
     Options,
     chain_path,
-    mjcf_path,
     without_fixed,
 )
 from hybridkin.chains._checks import (
@@ -37,6 +36,7 @@ from hybridkin.chains._joint_motions import (
     joint_motions,
     moving_frames,
 )
+from hybridkin.chains._mjcf import mjcf_path
 from hybridkin.chains.chain import Chain
 
 if TYPE_CHECKING:
@@ -135,6 +135,8 @@ class RigidChain(Chain):
         Default: infinite.
     dq_max : array-like of shape (n,), optional
         Largest joint speeds [rad/s] or [m/s], used likewise. Default: infinite.
+    ddq_max : array-like of shape (n,), optional
+        Largest accelerations of the joints [rad/s^2] or [m/s^2], used likewise. Default: infinite.
     tip : array-like of shape (4, 4), optional
         Pose of the end link in the moving frame of the last joint. Default: identity.
     tool : array-like of shape (3,), default=(0, 0, 0)
@@ -167,7 +169,8 @@ class RigidChain(Chain):
 
     _entries = ("base", "joint_zeros", "tool")
     _structure = ("n_actuators", "kinds", "names")
-    _arrays = ("origins", "axes", "tip", "tool", "q_min", "q_max", "dq_max", "base")
+    _limits = ("q_min", "q_max", "dq_max", "ddq_max")
+    _arrays = ("origins", "axes", "tip", "tool", *_limits, "base")
     _arrays += ("joint_zeros", "couplings")
     layout = Layout(
         "rigid",
@@ -190,6 +193,7 @@ class RigidChain(Chain):
         q_min: Numbers | None = None,
         q_max: Numbers | None = None,
         dq_max: Numbers | None = None,
+        ddq_max: Numbers | None = None,
         tip: Numbers | None = None,
         tool: Numbers = (0.0, 0.0, 0.0),
         base: Numbers | Transform | None = None,
@@ -220,7 +224,7 @@ class RigidChain(Chain):
         geometry = {
             "origins": origins,
             "axes": axes,
-            **joint_limits(n, q_min, q_max, dq_max),
+            **joint_limits(n, q_min, q_max, dq_max, ddq_max),
             "tip": rigid_pose(tip, "tip"),
             "tool": numeric(tool, "tool", need="3"),
             "base": pose(base, "base", torch.float64),
@@ -260,7 +264,8 @@ class RigidChain(Chain):
             the joint it mimics, on the path or not, with that joint's limits. A floating joint
             becomes six (x, y, z, yaw, pitch, roll), a planar one three (x, y, yaw, in the frame of
             the joint). Equal limits lock a joint. Continuous joints have infinite limits, and so
-            have, with a warning, joints without <limit>. A velocity of 0 means no speed limit.
+            have, with a warning, joints without <limit>. A velocity of 0 means no speed limit. An
+            acceleration or a deceleration (URDF 1.2), the smaller one, is `ddq_max`.
             Without moving joints the tip is constant. Tags that are not part of URDF are ignored.
 
         Raises
@@ -354,7 +359,9 @@ class RigidChain(Chain):
         -------
         RigidChain
             Its actuators are the hinges and slides of the path, in order, with the limits that
-            MuJoCo uses. q = 0 is MuJoCo's ``qpos`` = 0.
+            MuJoCo uses. q = 0 is MuJoCo's ``qpos`` = 0. A joint that an <equality> holds at
+            ``a + b q`` of another joint is replaced by that joint, on the path or not, with that
+            joint's limits; one that it holds at a constant is fixed.
 
         Raises
         ------
@@ -363,10 +370,17 @@ class RigidChain(Chain):
         FileNotFoundError
             If there is no such file.
         ValueError
-            For text that is not an MJCF, bodies that are missing or not connected, and free or ball
-            joints.
+            For text that is not an MJCF, bodies that are missing or not connected, free or ball
+            joints, joints that an <equality> couples otherwise or in a circle, and a driven fixed
+            tendon that moves several joints which nothing else drives.
+
+        Warns
+        -----
+        UserWarning
+            If <connect> or <weld> ties a body of the path to another one, which is ignored.
         """
-        return cls._of_joints(mjcf_path(text_or_path, end_link, root_link), options)
+        path = mjcf_path(text_or_path, end_link, root_link)
+        return cls._of_joints(path, options)
 
     @classmethod
     def from_chain(
@@ -406,7 +420,7 @@ class RigidChain(Chain):
         for k, joint in enumerate(joints):
             couplings[k, columns.index(joint.actuator)] = joint.factor
         limits = np.array([joint.limits for joint in actuators.values()])
-        q_min, q_max, dq_max = limits.reshape(-1, 3).T
+        q_min, q_max, dq_max, ddq_max = limits.reshape(-1, 4).T
         return cls(
             np.reshape([joint.origin for joint in joints], (n, 4, 4)),
             np.reshape([joint.axis for joint in joints], (n, 3)),
@@ -416,6 +430,7 @@ class RigidChain(Chain):
             q_min=q_min,
             q_max=q_max,
             dq_max=dq_max,
+            ddq_max=ddq_max,
             tip=tip,
             **options,
         )
@@ -427,8 +442,7 @@ class RigidChain(Chain):
         arrays = {}
         for name in cls.layout.arrays:
             if name in stored.arrays:
-                is_limit = name in ("q_min", "q_max", "dq_max")
-                arrays[name] = stored.array(name, finite=not is_limit)
+                arrays[name] = stored.array(name, finite=name not in cls._limits)
         dtype = torch.from_numpy(arrays["base"]).dtype
         arm = cls(**arrays, **settings, dtype=dtype)
         # The constructor rounds poses and axes; the state is what the file holds.
@@ -492,7 +506,7 @@ class RigidChain(Chain):
     @property
     def limits(self) -> dict[str, Tensor]:
         """The limits of the joints, as tensors of shape (n,)."""
-        return {"q_min": self.q_min, "q_max": self.q_max, "dq_max": self.dq_max}
+        return {name: getattr(self, name) for name in self._limits}
 
     @property
     def reach(self) -> Tensor:

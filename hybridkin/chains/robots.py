@@ -73,8 +73,13 @@ class LogFormat:
         -1 if the log counts a pulled (shortened) tendon as positive.
     group_suffix : str
         A motion whose name ends in this suffix belongs to the motion named without it.
+    unwrap : bool, float or mapping of str to float
+        Periods of encoders to correct, see `datasets.load_log`.
     groups, runs, time : str or None
         Columns of the motion of each row, of its run (see `Commands`), and of its time stamp [s].
+    header_line, decimal, missing
+        Form of text files, and numbers that stand for missing values; as for
+        `datasets.load_log`.
     """
 
     q: tuple[str, ...]
@@ -86,6 +91,10 @@ class LogFormat:
     groups: str | None = None
     time: str | None = None
     runs: str | None = None
+    header_line: int | None = None
+    decimal: str = "."
+    missing: tuple[float, ...] = ()
+    unwrap: bool | float | Mapping[str, float] = False
 
     @property
     def q_factor(self) -> NDArray:
@@ -102,6 +111,18 @@ class LogFormat:
     def from_log(self, q: Numbers) -> NDArray:
         """Return actuator vectors (..., n) of the log in unit and sign of the model."""
         return shaped(q, "q", ("...", len(self.q))) * self.q_factor
+
+    def of_tracks(self, target: tuple[str, ...]) -> LogFormat:
+        """Return the format of a track.csv, which has the columns of q and targets as tips."""
+        return replace(
+            self,
+            x=target,
+            groups="status",
+            header_line=None,
+            decimal=".",
+            missing=(),
+            unwrap=False,
+        )
 
     @property
     def reading(self) -> dict[str, Any]:
@@ -319,6 +340,11 @@ def read_description(path: str | Path) -> RobotDescription:
             runs = "session"                # column with the run of each row: motions that follow
                                             # each other without a break; optional
             time = "t"                      # column of the time stamp [s], optional; for creep
+            header_line = 7                 # line of the header of a text file, from 1; optional:
+                                            # blocks of Motive, Vicon and Qualisys are known
+            decimal = ","                   # decimal sign of a text file; default "."
+            missing = [9999.999]            # numbers that stand for missing values, optional; 0:
+                                            # the 0, 0, 0 of a lost marker
 
             [limits]                        # of the actuators, optional; one number or one each
             q_min = -0.010                  # with the chain's sign: shortening < 0 [m]

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridkin._core.units import LogUnit
 from hybridkin.chains.hysteresis import HysteresisOperator
 from hybridkin.native.hysteresis import Stage
 
@@ -67,6 +68,10 @@ class HysteresisSeries(HysteresisOperator):
     def parts(self) -> tuple[HysteresisOperator, ...]:
         """The operators."""
         return self.operators
+
+    def in_words(self, unit: LogUnit) -> str:
+        """Return what every operator is, with its largest width in the unit of a log."""
+        return " and ".join(operator.in_words(unit) for operator in self.operators)
 
     @property
     def _size(self) -> int | str:

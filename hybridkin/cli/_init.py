@@ -9,13 +9,13 @@ import re
 import sys
 from collections.abc import Callable, Sequence
 from importlib.resources import files
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-import hybridkin
+from hybridkin._core.text_rows import TextForm
 from hybridkin._core.texts import toml_value, visible
-from hybridkin._core.units import METRES
+from hybridkin._core.units import METRES, UNITS
 from hybridkin.cli._terminal import write
 from hybridkin.cli._values import (
     count,
@@ -25,7 +25,11 @@ from hybridkin.cli._values import (
     numbers,
     one_of,
     positive,
+    signs,
 )
+
+if TYPE_CHECKING:
+    from hybridkin.workflow import MeasuredLog
 
 _NEEDED = object()  # the default of what must be given
 _Answers = dict[str, Any]
@@ -43,16 +47,20 @@ class _Question(NamedTuple):
     default: Any = _NEEDED
 
 
-_KINDS = "tendons, elastic-tendons (they can go slack) or chambers (of measured length)"
-_SIZES = ("radius", "length", "angle", "gain", "spool_radius", "zeros")
+_KINDS = "tendons, elastic-tendons (they can go slack) or chambers (of measured length or pressure)"
 _AT_ZERO = 0.05  # of the range: first values this near to zero are zero
-_ALIKE = (
-    0.05  # of the range: first values of motions that differ by less are one posture
-)
+_ALIKE = 0.05  # of the range: first values that differ by less are of one posture
 _EACH = "[mm]; one value, or one for each segment"
 _LENGTHS = ", ".join(METRES)
-_UNIT = f"unit of the actuators: {_LENGTHS}; deg or rad of motors; another name, such as counts"
-_SIGN = "-1: a pulled tendon counts as positive in the log; 1: as negative"
+_UNIT = f"unit of the actuators: {_LENGTHS}; deg or rad; another name, as counts or bar"
+_SIGN = (
+    "-1: a pulled tendon counts as positive in the log; 1: as negative; one value, or one for each "
+    "actuator"
+)
+_ANGLE = (
+    "angle of the first actuator of a segment [degrees]; one value, one for each segment, or those "
+    "of all actuators"
+)
 QUESTIONS = (
     _Question("log", "log file: CSV, npz or parquet", existing, None),
     _Question("kind", _KINDS, one_of(*_MODELS)),
@@ -63,25 +71,37 @@ QUESTIONS = (
         f"radius of the circle on which the actuators lie {_EACH}",
         in_millimetres,
     ),
-    _Question("length", f"length of the backbone of a segment {_EACH}", in_millimetres),
-    _Question(
-        "angle", "angle of the first actuator of a segment [degrees]", numbers, (0,)
-    ),
+    _Question("angle", _ANGLE, numbers, (0,)),
     _Question("q_unit", _UNIT, str, "mm"),
+    _Question(
+        "length",
+        f"length of the backbone of a segment, or of its chambers where q is 0 {_EACH}",
+        in_millimetres,
+    ),
     _Question(
         "spool_radius", f"radius of the spools of motors {_EACH}", in_millimetres, None
     ),
     _Question("counts_per_turn", "q of a whole turn of a spool, in its unit", positive),
     _Question(
-        "gain", "change of length for a q of 1, if not from spools [mm]", in_millimetres
+        "gain",
+        f"change of length for a q of 1, if not from spools {_EACH}",
+        in_millimetres,
     ),
     _Question("x_unit", f"unit of the tip: {_LENGTHS}", one_of(*METRES), "mm"),
-    _Question("q_sign", _SIGN, one_of(1, -1)),
+    _Question("q_sign", _SIGN, signs),
     _Question("q", "columns of the actuators from base to tip, as A,B,...", names),
     _Question("x", "columns of the tip, as X,Y,Z", names),
     _Question("groups", "column that names the motion of a row, or none", str, None),
     _Question("time", "column of the time [s], or none", str, None),
 )
+_IN_WORDS = {  # by kind; the unit of q is known
+    "chambers": {
+        "length": "length of a chamber at 0 {unit}",
+        "gain": "length that 1 {unit} adds to a chamber",
+    },
+    "tendons": {"length": "length of the backbone of a segment"},
+}
+_IN_WORDS["elastic-tendons"] = _IN_WORDS["tendons"]
 _WORDS = {  # how names of columns begin
     "groups": "motion|pattern|group|run|trial|episode|traj|trajectory|sequence",
     "time": "t|time|times|timestamp|stamp|seconds",
@@ -95,38 +115,67 @@ def answered(given: _Answers, ask: bool) -> tuple[_Answers, list[str]]:
     defaults of columns come from the header of the log.
     """
     answers: _Answers = {"q_sign": 1}
+    answers |= {name: given[name] for name in ("header_line", "decimal", "missing")}
     missing = []
     columns = {}
     for question in QUESTIONS:
         name = question.name
-        if _is_needless(name, answers, given):
-            continue
-        if name == "q":
-            if missing:
-                columns = {"q": (), "x": ()}
-            else:
-                columns = _proposed(answers, given["delimiter"])
-        question = question._replace(default=columns.get(name, question.default))
         value = given[name]
+        needless = _why_needless(name, answers)
+        if needless and value is not None:
+            raise ValueError(f"{_option(name)} has no use: {needless}; leave it out.")
+        if needless or (name == "q_sign" and value is None and _has_chambers(answers)):
+            continue
+        if name == "x_unit":
+            if missing:
+                columns = {"q": (), "x": (), "x_unit": "mm"}
+            else:
+                columns = _proposed(answers, given)
+        question = question._replace(default=columns.get(name, question.default))
         if value is None:
-            value = _asked(question) if ask else question.default
+            value = _asked(_worded(question, answers)) if ask else question.default
         if value is _NEEDED:
-            missing.append(f"--{name.replace('_', '-')}")
+            missing.append(_option(name))
         answers[name] = None if value == "none" else value
     return answers, missing
 
 
-def _is_needless(name: str, answers: _Answers, given: _Answers) -> bool:
-    """Return whether the earlier answers leave no need to answer a question."""
-    if name in ("length", "q_sign"):
-        return answers["kind"] == "chambers"
+def _option(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
+
+
+def _has_chambers(answers: _Answers) -> bool:
+    return answers.get("kind") == "chambers"
+
+
+def _why_needless(name: str, answers: _Answers) -> str:
+    """Return why the earlier answers leave no need to answer a question; empty: it is needed."""
     unit = answers.get("q_unit")
-    spools = answers.get("spool_radius")
-    if name == "counts_per_turn":
-        return spools is None or unit in ("deg", "rad")
-    if name not in ("spool_radius", "gain") or given[name] is not None:
-        return False
-    return unit in METRES or (name == "gain" and spools is not None)
+    is_length = unit in METRES
+    has_spools = answers.get("spool_radius") is not None
+    chambers = _has_chambers(answers)
+    rules = (
+        ("length", "q is the length of the chambers", is_length and chambers),
+        ("spool_radius", "q is a length", is_length),
+        ("spool_radius", "chambers have no spools", chambers),
+        ("counts_per_turn", "it goes with --spool-radius", not has_spools),
+        ("counts_per_turn", f"q is an angle, in {unit}", unit in ("deg", "rad")),
+        ("gain", "q is a length", is_length),
+        ("gain", "the spools give it", has_spools),
+    )
+    for needless, reason, holds in rules:
+        if needless == name and holds:
+            return reason
+    return ""
+
+
+def _worded(question: _Question, answers: _Answers) -> _Question:
+    """Return a question in the words of the kind of robot and of the unit of q."""
+    of_kind = _IN_WORDS.get(answers.get("kind", ""), {})
+    if question.name not in of_kind:
+        return question
+    text = of_kind[question.name].format(unit=answers.get("q_unit"))
+    return question._replace(text=f"{text} {_EACH}")
 
 
 def _asked(question: _Question) -> Any:
@@ -149,16 +198,21 @@ def _asked(question: _Question) -> Any:
             write(f"  {error if clear else 'must be a number'}", sys.stderr)
 
 
-def _proposed(answers: _Answers, delimiter: str | None) -> _Answers:
-    """Return the columns whose names look like actuators, tip, motion and time."""
+def _proposed(answers: _Answers, given: _Answers) -> _Answers:
+    """Return the columns whose names look like actuators, tip, motion and time, and their unit."""
     n = answers["segments"] * answers["actuators"]
     if answers["log"] is None:
         return {"q": [f"q{i + 1}" for i in range(n)], "x": ["x", "y", "z"]}
-    header = hybridkin.datasets.log_columns(answers["log"], delimiter)
+    from hybridkin.datasets.table_files import read_table  # loads torch
+
+    form = TextForm(given["delimiter"], given["header_line"], given["decimal"] or ".")
+    table = read_table(answers["log"], form)
+    header = table.header
     proposed: _Answers = {}
     tips = [*filter(_is_tip, zip(header, header[1:], header[2:], strict=False))]
     if tips:
-        proposed["x"] = max(tips, key=lambda three: "tip" in three[0].lower())
+        proposed["x"] = max(tips, key=_likeness_to_tip)
+        proposed["x_unit"] = table.units.get(proposed["x"][0], "mm")
     families: dict[str, list[str]] = {}  # names that differ in numbers only
     for name in header:
         if name not in proposed.get("x", ()) and re.search(r"\d", name):
@@ -173,85 +227,108 @@ def _proposed(answers: _Answers, delimiter: str | None) -> _Answers:
     return proposed
 
 
+def _likeness_to_tip(three: Sequence[str]) -> tuple[bool, bool]:
+    """Return whether three columns are called tip, and whether they are no rotations."""
+    name = three[0].lower()
+    return "tip" in name, "rot " not in name
+
+
 def _is_tip(three: Sequence[str]) -> bool:
     """Return whether three names differ only in their last x, y and z."""
     axes = zip(three, "xyz", strict=True)
     return len({"#".join(name.lower().rsplit(axis, 1)) for name, axis in axes}) == 1
 
 
-def with_zeros(answers: _Answers, delimiter: str | None) -> tuple[_Answers, str]:
-    """Return the answers with the zeros of tendons from the first rows of a log, and words for it.
+def with_zeros(answers: _Answers, log: MeasuredLog) -> tuple[_Answers, str]:
+    """Return the answers with the zeros of tendons from a log, and words for it.
 
     They are the median of the first rows of all motions, if these are alike.
     """
-    if answers["log"] is None or answers["kind"] == "chambers":
+    unit = answers["q_unit"]
+    is_length = unit in METRES
+    if _has_chambers(answers) or (answers["kind"] != "tendons" and not is_length):
         return answers, ""
-    log = hybridkin.datasets.load_log(
-        answers["log"],
-        answers["q"],
-        answers["x"],
-        answers["groups"],
-        q_unit="1",
-        x_unit=answers["x_unit"],
-        q_sign=answers["q_sign"],
-        delimiter=delimiter,
-        drop_invalid=True,
-    )
     span = np.ptp(log.q, axis=0)
     first = np.zeros(1, dtype=int)
-    if log.groups is not None:
-        _, first = np.unique(log.groups, return_index=True)
+    if log.named:
+        _, first = np.unique(log.motions, return_index=True)
     starts = log.q[first]
     zeros = np.median(starts, axis=0)
     if (np.abs(zeros) <= _AT_ZERO * span).all():
         return answers, ""
     if (np.median(np.abs(starts - zeros), axis=0) > _ALIKE * span).any():
         words = (
-            "The actuators do not start at 0, and the motions do not start alike: set `zeros` in "
-            "every [[segment]] to their values at the straight robot."
+            "The actuators do not start at 0, and the motions do not start alike: give `zeros` of "
+            "every [[segment]], their values at the straight robot."
         )
         return answers, words
-    if answers["q_unit"] in METRES:
-        zeros = METRES[answers["q_unit"]] * zeros  # lengths are in metres there
-    rounded = [float(f"{zero:.6g}") for zero in zeros]
-    n = answers["actuators"]
-    segments = [rounded[k : k + n] for k in range(0, len(rounded), n)]
     words = (
-        f"The actuators do not start at 0: `zeros` are the values of the first row of "
-        f"{len(first)} motion{'s' if len(first) > 1 else ''}. Check that the robot is straight "
-        "there."
+        "The actuators do not start at 0: `zeros` are the median of the first rows of the motions "
+        f"({len(first)}). Check that the robot is straight there."
     )
-    return {**answers, "zeros": segments}, words
+    if not is_length:
+        zeros = zeros / UNITS.get(unit, 1.0)  # in the unit of the log
+    return {**answers, "zeros": [float(f"{zero:.6g}") for zero in zeros]}, words
 
 
 def description(answers: _Answers, name: str) -> str:
     """Return the robot description of the answers, every key with a comment."""
     template = (files("hybridkin.cli") / "robot.toml").read_text(encoding="utf-8")
     head, segment, tail = re.split(r"(?=\[\[segment|# The logs)", template)
-    if per_turn := answers.get("counts_per_turn"):
-        gains = [
-            float(f"{math.tau * r / per_turn:.9g}") for r in answers["spool_radius"]
-        ]
-        answers = {**answers, "gain": gains, "spool_radius": None}
-    sizes = [_of_segments(answers, key) for key in _SIZES]
-    segments = [
-        _filled(segment, {**answers, "repeat": len([*alike]), **dict(values)})
-        for values, alike in itertools.groupby(zip(*sizes, strict=True))
-    ]
+    segments = []
+    for values, alike in itertools.groupby(_segments(answers)):
+        segments.append(_filled(segment, {**values, "repeat": len([*alike])}))
     values = {**answers, **_MODELS[answers["kind"]], "name": name}
     return "".join([_filled(head, values), *segments, _filled(tail, values)])
 
 
-def _of_segments(answers: _Answers, key: str) -> Sequence[tuple[str, float | None]]:
-    """Return a key and its value for every segment."""
+def _segments(answers: _Answers) -> list[_Answers]:
+    """Return what the template says of every segment."""
+    n = answers["segments"]
+    n_actuators = answers["actuators"]
+    angles = answers["angle"]
+    all_angles = len(angles) == n * n_actuators != n
+    columns = {
+        "radius": _each(answers, "radius"),
+        "length": _each(answers, "length"),
+        "gain": _each(answers, "gain"),
+        "spool_radius": _each(answers, "spool_radius"),
+    }
+    if not all_angles:
+        columns["angle"] = _each(answers, "angle")
+    per_turn = answers.get("counts_per_turn")
+    segments = []
+    for k in range(n):
+        values: _Answers = {key: column[k] for key, column in columns.items()}
+        values |= {"actuators": n_actuators, "clockwise": False, "angles": None}
+        values["zeros"] = None
+        of_segment = slice(k * n_actuators, (k + 1) * n_actuators)
+        if "zeros" in answers:
+            values["zeros"] = answers["zeros"][of_segment]
+        if all_angles:
+            values |= dict.fromkeys(("actuators", "clockwise", "angle"))
+            values["angles"] = angles[of_segment]
+        if per_turn is not None:
+            gain = math.tau * values["spool_radius"] / per_turn
+            values["gain"] = float(f"{gain:.9g}")
+            values["spool_radius"] = None
+        if _has_chambers(answers) and values["length"] is not None:
+            values["zeros"] = float(f"{-values['length'] / values['gain']:.9g}")
+            values["length"] = None
+        segments.append(values)
+    return segments
+
+
+def _each(answers: _Answers, key: str) -> Sequence[float | None]:
+    """Return the value of every segment; None where there is no answer."""
     values = answers.get(key) or (None,)
     n = answers["segments"]
     if len(values) not in (1, n):
-        option = f"--{key.replace('_', '-')}"
+        of_all = ", or those of all actuators" if key == "angle" else ""
         raise ValueError(
-            f"{option} must be one value, or one for each segment, got {len(values)}."
+            f"{_option(key)} must be one value, or one for each segment{of_all}, got {len(values)}."
         )
-    return [(key, value) for value in values] * (n // len(values))
+    return [*values] * (n // len(values))
 
 
 def _filled(block: str, values: _Answers) -> str:

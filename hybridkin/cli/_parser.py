@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import hybridkin
+from hybridkin._core.text_rows import DECIMALS
 from hybridkin._core.units import METRES, UNITS
 from hybridkin.cli._init import QUESTIONS
 from hybridkin.cli._terminal import write
@@ -27,6 +28,7 @@ from hybridkin.cli._values import (
     play,
     positive,
     share,
+    signs,
     start,
 )
 
@@ -156,7 +158,7 @@ def _init(command: argparse.ArgumentParser) -> None:
         option = f"--{question.name.replace('_', '-')}"
         value = question.name.rpartition("_")[2].upper()
         add(option, type=question.parse, metavar=value, help=question.text)
-    add("--delimiter", metavar="CHAR", help=_DELIMITER)
+    _add_text_form(command)
     add("--force", action="store_true", help="replace the file if it exists")
 
 
@@ -610,7 +612,21 @@ def _add_model(
 
 
 _REPLACE_OTHERS = "replace files that another command or program wrote"
-_DELIMITER = "separator of a text file (comma, semicolon or tab, by the header)"
+
+
+def _add_text_form(command: argparse._ActionsContainer) -> None:
+    """Add the options of how a text file is written."""
+    add = command.add_argument
+    text = "separator of a text file (comma, semicolon or tab, by the header)"
+    add("--delimiter", metavar="CHAR", help=text)
+    text = (
+        "line of the header of a text file, from 1 (blocks of Motive, Vicon and Qualisys are "
+        "known, else line 1)"
+    )
+    add("--header-line", type=count, metavar="N", help=text)
+    add("--decimal", choices=DECIMALS, help="decimal sign of a text file (.)")
+    text = "numbers that stand for missing values, such as 9999.999; 0: a marker at 0, 0, 0"
+    add("--missing", type=numbers, metavar="A,...", help=text)
 
 
 def _add_log(command: argparse.ArgumentParser) -> None:
@@ -622,12 +638,11 @@ def _add_log(command: argparse.ArgumentParser) -> None:
     add("--x", type=names, metavar="X,Y,Z", help="columns of the tip")
     add("--q-unit", choices=UNITS, help="unit of the actuators")
     add("--x-unit", choices=METRES, help="unit of the tip")
-    add(
-        "--q-sign",
-        type=int,
-        choices=(1, -1),
-        help="-1: a pulled tendon counts as positive",
-    )
+    pulled = "-1: a pulled tendon counts as positive; one, or one for each actuator"
+    add("--q-sign", type=signs, metavar="SIGN", help=pulled)
+    wraps = "correct encoders that wrap, lose turns, or read whole turns off; the period, such as "
+    wraps += "4096 or 360 (without: usual ones)"
+    add("--unwrap", type=positive, nargs="?", const=True, metavar="PERIOD", help=wraps)
     add(
         "--groups",
         metavar="COLUMN",
@@ -636,7 +651,7 @@ def _add_log(command: argparse.ArgumentParser) -> None:
     text = "column that names the run, motions without a break between them; or none"
     add("--runs", metavar="COLUMN", help=text)
     add("--time", metavar="COLUMN", help="column of the time [s]; or none")
-    add("--delimiter", metavar="CHAR", help=_DELIMITER)
+    _add_text_form(log)
     text = "leave out motions by name, such as '*tendon*'; may be repeated"
     add("--exclude", action="append", default=[], metavar="PATTERN", help=text)
     add(

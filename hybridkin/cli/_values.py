@@ -36,6 +36,17 @@ def not_negative(text: str) -> float:
     return value
 
 
+def signs(text: str) -> int | Sequence[int]:
+    """Return 1 or -1, or several of them separated by commas."""
+    parts = [part.strip() for part in text.split(",")]
+    if not {*parts} <= {"1", "+1", "-1"}:
+        raise argparse.ArgumentTypeError(
+            f"must be 1 or -1, or one for each actuator, as in 1,-1,1, got {text!r}"
+        )
+    numbers = [*map(int, parts)]
+    return numbers[0] if len(numbers) == 1 else numbers
+
+
 def names(text: str) -> Sequence[str]:
     """Return names separated by commas."""
     return tuple(part.strip() for part in text.split(","))

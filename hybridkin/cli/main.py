@@ -389,20 +389,20 @@ def _init(arguments: argparse.Namespace, stages: Stages) -> _Result:
             f"`init` needs {', '.join(missing)} where it cannot ask on a terminal; see "
             "`hybridkin init --help`."
         )
-    answers, about_zeros = with_zeros(answers, arguments.delimiter)
     text = description(answers, out.stem)
     robot = _robot_of(text)
     log_format: LogFormat = robot.log
     check = None
+    about_zeros = ""
     log = answers["log"]
     if log is not None:
-        check = workflow.read_log(
-            log,
-            log_format,
-            chain=robot.chain,
-            base_is_free=robot.base_is_free,
-            delimiter=arguments.delimiter,
-        ).report
+        measured = _log_of_init(arguments, log, robot)
+        answers, about_zeros = with_zeros(answers, measured)
+        if "zeros" in answers:
+            text = description(answers, out.stem)
+            robot = _robot_of(text)
+            measured = _log_of_init(arguments, log, robot)
+        check = measured.report
         _note(check, stages)
     record = {"columns": log_format, "log_check": check}
     report = workflow.Report(f"{robot.name}: {robot.n_actuators} actuators", record)
@@ -428,6 +428,17 @@ def _init(arguments: argparse.Namespace, stages: Stages) -> _Result:
     write_file(out, partial(Path.write_text, data=text, encoding="utf-8"))
     report.paths = [out]
     return report, int(check is not None and not check.ok)
+
+
+def _log_of_init(arguments: argparse.Namespace, log: Path, robot: Any) -> MeasuredLog:
+    """Return the log of a new description, read and checked."""
+    return hybridkin.workflow.read_log(
+        log,
+        robot.log,
+        chain=robot.chain,
+        base_is_free=robot.base_is_free,
+        delimiter=arguments.delimiter,
+    )
 
 
 def _robot_of(text: str) -> Any:
@@ -549,12 +560,16 @@ def _read(
     )
 
 
+_COLUMNS = ("q", "x", "q_unit", "x_unit", "q_sign", "groups", "runs", "time")
+_FORM = ("header_line", "decimal", "missing", "unwrap")
+
+
 def _log_format(
     arguments: argparse.Namespace, described: LogFormat | None, source: Path
 ) -> LogFormat:
     """Return how the log is written: as described, with what the options say instead."""
     entries = {}
-    for name in ("q", "x", "q_unit", "x_unit", "q_sign", "groups", "runs", "time"):
+    for name in (*_COLUMNS, *_FORM):
         value = vars(arguments)[name]
         if value is not None:
             entries[name] = None if value == "none" else value

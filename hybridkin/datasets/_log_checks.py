@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 
 from hybridkin._core.arrays import countable
 from hybridkin.datasets._log_columns import COLUMN_CHECKS, LogRows
+from hybridkin.datasets._log_encoders import encoder_findings
 from hybridkin.datasets._log_geometry import geometry_findings
+from hybridkin.datasets._log_missing import missing_values
 from hybridkin.datasets._log_report import (
     MISREAD,
     SEVERITIES,
@@ -35,13 +37,16 @@ def check_log(
 ) -> LogReport:
     """Return possible errors of a log: sensors, rows, times, motions, units and signs.
 
-    The check looks for NaN and infinite rows, a frozen sensor of the tip or of an actuator while
-    the rest moves, columns that never change, rows that occur twice, jumps of the tip, gaps in time
-    and decreasing times, columns with the same values, a tip that lags or drifts, and too few
-    motions for held-out errors. With a chain it also looks for wrong units, a wrong order or sign
-    of the columns of q, actuators numbered in the other direction, rotated or left-handed axes of
-    the tip, radii that are far off, and an offset or a drift of one actuator. Rows must be in order
-    of time. With several markers, the last one, the tip, is checked in the rows that have it.
+    The check looks for NaN and infinite rows, numbers that stand for missing values, a frozen
+    sensor of the tip or of an actuator while the rest moves, columns that never change, rows that
+    occur twice, jumps of the tip, gaps in time and decreasing times, columns with the same values,
+    a tip that lags or drifts, and too few motions for held-out errors; in columns of motors also
+    encoders that wrap, lose turns, or have single readings whole turns off.
+
+    With a chain it also looks for wrong units, a wrong order or sign of the columns of q, actuators
+    numbered in the other direction, rotated or left-handed axes of the tip, radii that are far off,
+    and an offset or a drift of one actuator. Rows must be in order of time. With several markers,
+    the last one, the tip, is checked in the rows that have it.
 
     Parameters
     ----------
@@ -76,6 +81,7 @@ def check_log(
     ('frozen tip', 40)
     """
     n_actuators = log.q.shape[1]
+    missing = [*missing_values(LogRows(log, np.arange(len(log.q))))]
     if chain is not None and n_actuators != chain.n_actuators:
         raise ValueError(
             f"`log` must have {chain.n_actuators} actuators, as many as `chain`, got "
@@ -90,15 +96,21 @@ def check_log(
     valid = countable(columns).all(axis=1)
     # A row of several markers may lack the tip.
     complete = countable(log.q).all(axis=1) if has_markers else valid
-    findings = [*_invalid_rows(log, complete, drop_invalid)]
+    findings = [*_invalid_rows(log, complete, drop_invalid), *missing]
+    for finding in missing:
+        valid[finding.rows] = False  # the other checks look at the measured rows
     if valid.any():
         columns = columns[valid]
         rows = LogRows(log.rows(valid), np.flatnonzero(valid))
+        of_encoders = [*encoder_findings(rows)]
+        findings += of_encoders
         for check in COLUMN_CHECKS:
             findings += check(rows)
+        if of_encoders:
+            chain = None  # readings that are turns off look like wrong orders, signs and units
         if chain is not None and chain.takes_lengths:
             findings += geometry_findings(rows.log, chain, base_is_free)
-        if not any(finding.kind in MISREAD for finding in findings):
+        if not any(finding.kind in (*MISREAD, "encoder") for finding in findings):
             residual = [*residual_findings(rows.log, chain, rows.same_motion)]
             if any(finding.kind == "lag" for finding in residual):
                 # A tip of another time is not what the nominal model explains.

@@ -26,9 +26,9 @@ class LogFinding:
     Attributes
     ----------
     kind : str
-        "invalid", "frozen tip", "frozen actuator", "constant", "duplicates", "same command",
-        "jumps", "time", "motions", "rows", "same column", "drift", "lag", "offset", "units",
-        "order", "sign", "numbering", "axes", "size" or "geometry".
+        "invalid", "missing", "frozen tip", "frozen actuator", "constant", "duplicates",
+        "same command", "jumps", "time", "motions", "rows", "same column", "drift", "lag", "offset",
+        "units", "order", "sign", "numbering", "axes", "size" or "geometry".
     severity : {"error", "warning", "note"}
         "error": a fit would be worthless; "warning": check it; "note": information.
     message : str

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import csv
-import difflib
-import itertools
 import os
-import re
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,15 +21,13 @@ from hybridkin._core.arrays import (
     real_array,
 )
 from hybridkin._core.commands import Commands
-from hybridkin._core.texts import csv_cell
+from hybridkin._core.text_rows import TextForm
 from hybridkin._core.units import METRES, UNITS
+from hybridkin.datasets._encoders import given_periods, unwrapped
+from hybridkin.datasets._frames import frame_table
 from hybridkin.datasets._log_report import named_rows
-from hybridkin.datasets._npz import arrays_of, check_expansion
-
-_DELIMITERS = (",", ";", "\t")
-_UNNAMED = ("", "nan", "NaN", "NaT", "None", "<NA>")  # a missing motion, as text
-_MOST_COLUMNS = 10_000  # of an array
-_LONGEST = 256  # characters of a motion's name
+from hybridkin.datasets._tables import UNNAMED, Table
+from hybridkin.datasets.table_files import read_table
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -112,7 +105,9 @@ class Log:
         if self.groups is not None:
             head += f", {len(np.unique(self.groups))} motions"
         names = ", ".join(column_names(self, "q"))
-        values = f"{self.q.min():.4g} to {self.q.max():.4g} {self.units['q']}"
+        values = "no commands"
+        if self.q.size:
+            values = f"{self.q.min():.4g} to {self.q.max():.4g} {self.units['q']}"
         lines = [
             head,
             f"{self.q.shape[1]} actuators: {names}; {values}",
@@ -121,6 +116,58 @@ class Log:
         if self.time is not None:
             lines.append(f"time from {self.time[0]:.6g} to {self.time[-1]:.6g} s")
         return "\n  ".join(lines)
+
+    @classmethod
+    def from_frame(
+        cls,
+        df: Any,
+        q: Sequence[str],
+        x: Sequence[str],
+        groups: str | None = None,
+        *,
+        runs: str | None = None,
+        time: str | None = None,
+        q_unit: str = "m",
+        x_unit: str = "m",
+        q_sign: ArrayLike = 1,
+        missing: ArrayLike = (),
+        unwrap: bool | float | Mapping[str, float] = False,
+        drop_invalid: bool = False,
+    ) -> Log:
+        """Return the log in a data frame, as `load_log` from a file.
+
+        Parameters
+        ----------
+        df : data frame
+            A frame of pandas, polars, modin or narwhals, or a table of pyarrow. Null is missing.
+        q, x, groups, runs, time, q_unit, x_unit, q_sign, missing, unwrap, drop_invalid
+            As for `load_log`.
+
+        Returns
+        -------
+        Log
+            In SI units; its lines are the numbers of rows, from 0.
+
+        Raises
+        ------
+        TypeError
+            If `df` is no data frame.
+        ValueError
+            As for `load_log`.
+
+        Examples
+        --------
+        >>> import pandas as pd
+        >>> from hybridkin.datasets import Log
+        >>> df = pd.DataFrame({"a": [1.0, 2.0], "X": [10, 20], "Y": [0, 0], "Z": [50, 60]})
+        >>> Log.from_frame(df, q=["a"], x=["X", "Y", "Z"], q_unit="mm", x_unit="mm").x
+        array([[0.01, 0.  , 0.05],
+               [0.02, 0.  , 0.06]])
+        """
+        table = frame_table(df, "data frame")
+        columns = _Columns.of(table, q, x, time, {"groups": groups, "runs": runs})
+        conversion = _Conversion(q_unit, x_unit, q_sign, missing, unwrap)
+        return _converted(table, columns, conversion, drop_invalid)
 
     @property
     def commands(self) -> Commands:
@@ -157,6 +204,10 @@ def load_log(
     x_unit: str = "m",
     q_sign: ArrayLike = 1,
     delimiter: str | None = None,
+    header_line: int | None = None,
+    decimal: str = ".",
+    missing: ArrayLike = (),
+    unwrap: bool | float | Mapping[str, float] = False,
     drop_invalid: bool = False,
 ) -> Log:
     r"""Return actuator vectors and tip positions from a log: a CSV, npz or parquet file.
@@ -165,10 +216,12 @@ def load_log(
     ----------
     path : path-like
         The file. ``.npz`` is read by NumPy, ``.parquet`` and ``.pq`` by pandas with pyarrow or
-        fastparquet, anything else as text with a header line.
+        fastparquet, anything else as text with a header: UTF-8, UTF-16 with its mark, or the
+        encoding of Windows (cp1252, with Latin-1).
     q : sequence of str
         Columns of the actuator vector, in the order of the robot model. In an npz file an array
         (N,) is a column; ``"name[2]"`` is column 2 of an array (N, k), ``"name"`` all its columns.
+        Empty: a recording of a camera alone.
     x : sequence of 3 str, or of 3 K
         Columns of the tip position, or of the positions of K markers, the last of which is the tip.
         A row without some markers is kept, with NaN for these.
@@ -180,9 +233,10 @@ def load_log(
     time : str or None, default=None
         Column of the time stamp [s]. In npz and parquet files also dates, which become seconds
         since 1970 (UTC), and durations.
-    q_unit : {"m", "cm", "mm", "um", "in", "rad", "deg", "1"}, default="m"
+    q_unit : {"m", "cm", "mm", "um", "in", "rad", "deg", "1", "counts"}, default="m"
         Unit of the actuator columns in the file; lengths become metres and angles radians. "1" is
-        not converted: counts or pressures, for a chain with `gains`.
+        not converted: counts or pressures, for a chain with `gains`. "counts" is another name of
+        "1".
     x_unit : {"m", "cm", "mm", "um", "in"}, default="m"
         Unit of the tip columns in the file.
     q_sign : 1, -1 or sequence of them, default=1
@@ -190,6 +244,22 @@ def load_log(
         here a shortening is negative.
     delimiter : str or None, default=None
         Separator of a text file. None: the most frequent in the header of comma, semicolon and tab.
+    header_line : int or None, default=None
+        Line of the header of a text file, from 1; lines above it are not read. None: the block of
+        header lines of Motive, Vicon Nexus or Qualisys Track Manager, else line 1. In such a block
+        columns are named "marker X" or "body X", and the rotations "body rot X"; the unit of length
+        that it states must be `x_unit`.
+    decimal : {".", ","}, default="."
+        Decimal sign of a text file.
+    missing : sequence of float, default=()
+        Numbers in q and x that stand for missing values, such as 9999.999, in the unit of the
+        file. Zero means the 0, 0, 0 of a lost marker, not zeros elsewhere.
+    unwrap : bool, float or mapping of str to float, default=False
+        Correct encoders: readings that start again after a period, turns that are lost from some
+        row on, and single readings that are whole periods off. The period of the encoders in the
+        unit of the file, such as 4096 or 360; a mapping gives those of some columns. True: usual
+        periods are tried, and only what the tips confirm is corrected. A column is corrected up
+        to a constant number of periods. The rows of a run must be in order of time.
     drop_invalid : bool, default=False
         Leave out rows with a missing, NaN or infinite value, or without the name of their motion,
         instead of raising an error.
@@ -207,8 +277,9 @@ def load_log(
     ImportError
         If a parquet file is given and pandas cannot read it.
     ValueError
-        If a column is unknown or used twice, a cell is not a number, rows are invalid, a quote in
-        a text file is not closed, or no row is left.
+        If a column is unknown or used twice, a cell is not a number, rows are invalid or do not fit
+        the header, a quote in a text file is not closed, the file states another unit, or no row is
+        left.
 
     Warns
     -----
@@ -217,6 +288,7 @@ def load_log(
 
     See Also
     --------
+    Log.from_frame : The same from a data frame.
     check_log : Possible errors of a log, with advice.
 
     Examples
@@ -230,80 +302,24 @@ def load_log(
     >>> log.x, log.q_names
     (array([[0.01, 0.02, 0.03]]), ['a', 'b', 'c'])
     """
-    table = _read(as_path(path), delimiter)
-    q = table.names("q", q)
-    x = table.names("x", x)
-    if len(x) % 3:
-        raise ValueError(
-            f"`x` must name 3 columns, or 3 for each of several markers, got {len(x)}: {x}."
-        )
-    factor = _checked_factor(len(q), q_unit, x_unit, q_sign)
-    names = [*q, *x]
-    if time is not None:
-        names.append(time)
-    values = table.values(names, time)
-    labelled = {}
-    for argument, column in {"groups": groups, "runs": runs}.items():
-        if column is not None:
-            labelled[argument] = table.labels(argument, column, len(values))
-    commands = values[:, : len(q)]
-    tips = values[:, len(q) : len(names) - (time is not None)]
-    complete = countable(tips).reshape(len(tips), -1, 3).all(axis=2)
-    tips = np.where(complete.repeat(3, axis=1), tips, np.nan)
-    valid = countable(commands).all(axis=1) & complete.any(axis=1)
-    if time is not None:
-        valid &= countable(values[:, -1])
-    for labels_of_rows in labelled.values():
-        valid &= ~np.isin(labels_of_rows, _UNNAMED)
-    kind = "line"
-    places = table.lines
-    if places is None:
-        kind = "row"
-        places = np.arange(len(values))
-    if not valid.any() or not (drop_invalid or valid.all()):
-        raise ValueError(
-            f"{(~valid).sum()} of {len(values)} rows of {str(path)!r} have a missing, NaN or "
-            f"infinite value, or no motion ({named_rows(places[~valid], kind)}); correct them, or "
-            "leave them out with drop_invalid=True if others are left."
-        )
-    commands = commands[valid]
-    tips = tips[valid]
-    for name, unit, column in (("q", q_unit, commands), ("x", x_unit, tips)):
-        span = (np.nanmax(column, axis=0) - np.nanmin(column, axis=0)).max()
-        middle = np.nanmedian(np.abs(column))
-        if unit == "m" and (middle > 10 or span > 5):
-            warnings.warn(
-                f"The `{name}` columns span {span:.4g} m around {middle:.4g} m; if the file has "
-                f"millimetres, give {name}_unit='mm' (centimetres: 'cm').",
-                stacklevel=2,
-            )
-    si_unit = q_unit if q_unit == "1" else "rad"
-    if q_unit in METRES:
-        si_unit = "m"
-    return Log(
-        commands * factor,
-        tips * METRES[x_unit],
-        time=None if time is None else values[valid, -1],
-        line=places[valid],
-        invalid_lines=places[~valid],
-        q_names=q,
-        x_names=x,
-        q_sign=q_sign,
-        units={"q": si_unit, "x": "m"},
-        file_units={"q": q_unit, "x": x_unit},
-        source=str(path),
-        **{argument: names[valid] for argument, names in labelled.items()},
-    )
+    table = read_table(as_path(path), TextForm(delimiter, header_line, decimal))
+    columns = _Columns.of(table, q, x, time, {"groups": groups, "runs": runs})
+    conversion = _Conversion(q_unit, x_unit, q_sign, missing, unwrap)
+    return _converted(table, columns, conversion, drop_invalid)
 
 
 def log_columns(
-    path: str | os.PathLike[str], delimiter: str | None = None
+    path: str | os.PathLike[str],
+    delimiter: str | None = None,
+    *,
+    header_line: int | None = None,
+    decimal: str = ".",
 ) -> list[str]:
     """Return the names of the columns of a log file.
 
     Parameters
     ----------
-    path, delimiter
+    path, delimiter, header_line, decimal
         As for `load_log`.
 
     Returns
@@ -311,122 +327,151 @@ def log_columns(
     list of str
         In the order of the file.
     """
-    return _read(as_path(path), delimiter).header
+    return read_table(as_path(path), TextForm(delimiter, header_line, decimal)).header
 
 
-def _read(path: Path, delimiter: str | None) -> _Table:
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"`path` must be a log file, there is none at {str(path)!r}."
-        )
-    if path.suffix.lower() == ".npz":
-        return _read_npz(path)
-    if path.suffix.lower() in (".parquet", ".pq"):
-        return _read_parquet(path)
-    return _read_text(path, delimiter)
+class _Columns(NamedTuple):
+    """The names of the columns of a log; of motions and runs by argument."""
 
+    q: list[str]
+    x: list[str]
+    times: list[str]  # one name, or none
+    labels: dict[str, str]
 
-class _Table(NamedTuple):
-    """The unconverted columns of a file; for text also the line of every row."""
-
-    path: Path
-    header: list[str]
-    columns: Sequence[NDArray | Sequence[str]]
-    lines: NDArray | None = None
-
-    def names(self, argument: str, names: Sequence[str]) -> list[str]:
-        """Return names of columns; the name of an array (N, k) becomes those of its columns."""
-        names = [names] if names is None or isinstance(names, str) else list(names)
-        if not names or not all(isinstance(name, str) for name in names):
-            raise ValueError(f"`{argument}` must be column names, got {names!r}.")
-        if len(set(names)) < len(names):
-            raise ValueError(f"`{argument}` names a column twice: {names}.")
-        columns = []
-        for name in names:
-            part = re.compile(rf"{re.escape(name)}\[\d+\]")
-            if name not in self.header and any(map(part.fullmatch, self.header)):
-                columns += filter(part.fullmatch, self.header)
-            else:
-                self.column(name)
-                columns.append(name)
-        return columns
-
-    def column(self, name: str) -> NDArray | Sequence[str]:
-        """Return the column of that name."""
-        if not isinstance(name, str):
-            raise TypeError(
-                f"`groups`, `runs` and `time` must be names of columns, got {name!r:.80}."
-            )
-        written = csv_cell(name).strip()  # as our own tables hold it
-        if name not in self.header and written in self.header:
-            name = written
-        count = self.header.count(name)
-        path = str(self.path)
-        if count > 1:
+    @classmethod
+    def of(
+        cls,
+        table: Table,
+        q: Sequence[str],
+        x: Sequence[str],
+        time: str | None,
+        labels: Mapping[str, str | None],
+    ) -> Self:
+        """Return the names as the table has them."""
+        of_q = []
+        if not isinstance(q, (list, tuple)) or q:
+            of_q = table.names("q", q)
+        of_x = table.names("x", x)
+        if len(of_x) % 3:
             raise ValueError(
-                f"Column {name!r} occurs {count} times in {path!r}; rename it."
+                "`x` must name 3 columns, or 3 for each of several markers, got "
+                f"{len(of_x)}: {of_x}."
             )
-        if count:
-            return self.columns[self.header.index(name)]
-        close = [other for other in self.header if other.lower() == name.lower()]
-        close = close or difflib.get_close_matches(name, self.header, n=3, cutoff=0.4)
-        hint = f"did you mean {', '.join(map(repr, close))}? Its" if close else "its"
-        if len(self.header) == 1:
-            hint = "it has only one column, check `delimiter`. Its"
+        given = {
+            argument: name for argument, name in labels.items() if name is not None
+        }
+        times = [] if time is None else [time]
+        return cls(of_q, of_x, times, given)
+
+
+class _Conversion(NamedTuple):
+    """The units and signs of columns, their missing values, and the periods of encoders."""
+
+    q_unit: str
+    x_unit: str
+    q_sign: ArrayLike
+    missing: ArrayLike
+    unwrap: bool | float | Mapping[str, float]
+
+    @property
+    def unit_of_q(self) -> str:
+        """The unit of the actuator columns."""
+        return "1" if self.q_unit == "counts" else self.q_unit
+
+    def without_missing(self, commands: NDArray, tips: NDArray) -> None:
+        """Set the missing values among commands (N, n) and tips (N, 3 K) to NaN, in place.
+
+        Zeros are missing only where all three coordinates of a marker are zero.
+        """
+        missing = real_array(self.missing, "missing").ravel()
+        values = missing[missing != 0.0]
+        commands[np.isin(commands, values)] = np.nan
+        tips[np.isin(tips, values)] = np.nan
+        if len(values) < len(missing):
+            markers = tips.reshape(len(tips), -1, 3)
+            markers[(markers == 0.0).all(axis=2)] = np.nan
+
+
+def _converted(
+    table: Table, columns: _Columns, conversion: _Conversion, drop_invalid: bool
+) -> Log:
+    """Return a log in SI units, without its invalid rows."""
+    q_unit = conversion.unit_of_q
+    x_unit = conversion.x_unit
+    n = len(columns.q)
+    factor = _checked_factor(n, q_unit, x_unit, conversion.q_sign)
+    table.check_unit("q_unit", columns.q, q_unit)
+    table.check_unit("x_unit", columns.x, x_unit)
+    values = table.values([*columns.q, *columns.x, *columns.times], columns.times)
+    labelled = {
+        argument: table.labels(argument, name, len(values))
+        for argument, name in columns.labels.items()
+    }
+    commands = values[:, :n]
+    tips = values[:, n : n + len(columns.x)]
+    times = values[:, n + len(columns.x) :]
+    conversion.without_missing(commands, tips)
+    complete = countable(tips).reshape(len(tips), -1, 3).all(axis=2)
+    tips = np.where(complete.repeat(3, axis=1), tips, np.nan)
+    valid = countable(commands).all(axis=1) & complete.any(axis=1)
+    valid &= countable(times).all(axis=1)
+    for labels_of_rows in labelled.values():
+        valid &= ~np.isin(labels_of_rows, UNNAMED)
+    kind = "line"
+    places = table.lines
+    if places is None:
+        kind = "row"
+        places = np.arange(len(values))
+    if not valid.any() or not (drop_invalid or valid.all()):
         raise ValueError(
-            f"There is no column {name!r} in {path!r}; {hint:.400} columns: {self.header!s:.1000}."
+            f"{(~valid).sum()} of {len(values)} rows of {str(table.source)!r} have a missing, NaN "
+            f"or infinite value, or no motion ({named_rows(places[~valid], kind)}); correct them, "
+            "or leave them out with drop_invalid=True if others are left."
         )
+    commands = commands[valid]
+    tips = tips[valid]
+    periods = given_periods(conversion.unwrap, columns.q, q_unit)
+    if any(periods):
+        same_run = np.ones(len(commands) - 1, dtype=bool)
+        for (
+            labels_of_rows
+        ) in labelled.values():  # those of runs, if there are any, come last
+            names_of_rows = labels_of_rows[valid]
+            same_run = names_of_rows[1:] == names_of_rows[:-1]
+        commands = unwrapped(commands, tips[:, -3:], same_run, periods)
+    _warn_of_millimetres("q", commands, q_unit)
+    _warn_of_millimetres("x", tips, x_unit)
+    si_unit = q_unit if q_unit == "1" else "rad"
+    if q_unit in METRES:
+        si_unit = "m"
+    return Log(
+        commands * factor,
+        tips * METRES[x_unit],
+        time=times[valid, 0] if columns.times else None,
+        line=places[valid],
+        invalid_lines=places[~valid],
+        q_names=columns.q,
+        x_names=columns.x,
+        q_sign=conversion.q_sign,
+        units={"q": si_unit, "x": "m"},
+        file_units={"q": q_unit, "x": x_unit},
+        source=str(table.source),
+        **{argument: names[valid] for argument, names in labelled.items()},
+    )
 
-    def numbers(self, name: str, as_time: bool) -> NDArray:
-        """Return the column of that name as numbers, NaN for empty cells; times in seconds."""
-        column = self.column(name)
-        if self.lines is not None:
-            numbers = []
-            for cell, line in zip(column, self.lines, strict=True):
-                numbers.append(_number(str(cell), name, line, self.path))
-            return np.array(numbers)
-        values = np.asarray(column)
-        kind = values.dtype
-        if as_time and kind.kind in "mM":
-            return (values - kind.type(0, "s")) / np.timedelta64(1, "s")
-        try:
-            # astype would use a real part, or ticks of some unit.
-            if kind.kind not in "cVmM":
-                return values.astype(float)
-        except (TypeError, ValueError, OverflowError):
-            pass
-        raise ValueError(
-            f"Column {name!r} of {str(self.path)!r} must hold numbers, got {kind}."
+
+def _warn_of_millimetres(name: str, column: NDArray, unit: str) -> None:
+    """Warn if metres are declared but values (N, k) look like millimetres."""
+    if not column.size:
+        return
+    span = (np.nanmax(column, axis=0) - np.nanmin(column, axis=0)).max()
+    middle = np.nanmedian(np.abs(column))
+    if unit == "m" and (middle > 10 or span > 5):
+        warnings.warn(
+            f"The `{name}` columns span {span:.4g} m around {middle:.4g} m; if the file has "
+            f"millimetres, give {name}_unit='mm' (centimetres: 'cm').",
+            stacklevel=4,
         )
-
-    def values(self, names: list[str], time: str | None) -> NDArray:
-        """Return columns as numbers (N, k), that of the time in seconds."""
-        columns = {name: self.numbers(name, name == time) for name in names}
-        if len(columns) < len(names):
-            raise ValueError(
-                f"`q`, `x` and `time` must name a column once, got {names}."
-            )
-        sizes = {name: len(column) for name, column in columns.items()}
-        if len({*sizes.values()}) > 1:
-            raise ValueError(
-                f"The columns of {str(self.path)!r} must be equally long, got {sizes}."
-            )
-        if not all(sizes.values()):
-            header = "no" if self.lines is None else "a header but no"
-            raise ValueError(f"{str(self.path)!r} has {header} rows.")
-        return np.column_stack([*columns.values()])
-
-    def labels(self, argument: str, name: str, n_rows: int) -> NDArray:
-        """Return the column of that name as labels of the rows."""
-        labels = [str(value).strip() for value in self.column(name)]
-        longest = max(map(len, labels), default=0)
-        if len(labels) != n_rows or longest > _LONGEST:
-            raise ValueError(
-                f"`{argument}` must name each of {n_rows} rows in at most {_LONGEST} characters, "
-                f"but column {name!r} of {str(self.path)!r} has {len(labels)} rows of up to "
-                f"{longest} characters; check the file."
-            )
-        return np.array(labels)
 
 
 def _checked_factor(n: int, q_unit: str, x_unit: str, q_sign: ArrayLike) -> NDArray:
@@ -440,108 +485,3 @@ def _checked_factor(n: int, q_unit: str, x_unit: str, q_sign: ArrayLike) -> NDAr
             f"`q_sign` must be 1 or -1, or one per column of `q`, got {q_sign!r}."
         )
     return sign * UNITS[q_unit]
-
-
-def _read_text(path: Path, delimiter: str | None) -> _Table:
-    if delimiter is not None and not (
-        isinstance(delimiter, str) and len(delimiter) == 1
-    ):
-        raise ValueError(
-            f"`delimiter` must be one character or None, got {delimiter!r:.80}."
-        )
-    try:
-        with open(path, encoding="utf-8-sig", newline="") as file:
-            unquoted = re.sub('"[^"]*("|$)', "", file.readline())
-            delimiter = delimiter or max(_DELIMITERS, key=unquoted.count)
-            file.seek(0)
-            reader = csv.reader(file, delimiter=delimiter)
-            rows = [
-                (reader.line_num, row) for row in reader if any(map(str.strip, row))
-            ]
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(
-            f"{str(path)!r} is not a text file in UTF-8, or does not close a quote ({error}); save "
-            "the log as CSV, npz or parquet."
-        ) from error
-    if not rows:
-        raise ValueError(f"{str(path)!r} is empty; a header line and rows are needed.")
-    n = len(rows[0][1])
-    for line, row in rows:
-        if len(row) > n:
-            raise ValueError(
-                f"Line {line} of {str(path)!r} has {len(row)} cells, the header {n}; check "
-                f"`delimiter` (now {delimiter!r})."
-            )
-        # A cell may have line breaks, but with all delimiters of a row it hides one.
-        text = delimiter.join(row)
-        n_lines = len(text.splitlines()) - 1
-        if n_lines > 0 and text.count(delimiter) >= len(row) + n - 2:
-            raise ValueError(
-                f'A quote (") in line {line - n_lines} of {str(path)!r} hides rows up to line '
-                f"{line}; close or remove it."
-            )
-    lines, cells = zip(*rows, strict=True)
-    header = [name.strip() for name in cells[0]]
-    columns = [column[1:] for column in itertools.zip_longest(*cells, fillvalue="")]
-    return _Table(path, header, columns, np.array(lines[1:], dtype=int))
-
-
-def _read_npz(path: Path) -> _Table:
-    """Return the arrays (N,) of a file; columns of arrays (N, k) are named ``name[i]``."""
-    arrays = arrays_of(path)
-    columns = {name: array for name, array in arrays.items() if array.ndim == 1}
-    for name, array in arrays.items():
-        if array.ndim == 2 and array.shape[1] > _MOST_COLUMNS:
-            raise ValueError(
-                f"{name!r} of {str(path)!r} must have at most {_MOST_COLUMNS} columns, got "
-                f"{array.shape[1]}; transpose it if rows and columns are swapped."
-            )
-        if array.ndim == 2:
-            columns |= {f"{name}[{i}]": column for i, column in enumerate(array.T)}
-    return _Table(path, [*columns], [*columns.values()])
-
-
-def _read_parquet(path: Path) -> _Table:
-    try:
-        import pandas as pd
-
-        _check_rows(path)
-        frame = pd.read_parquet(path)
-        for name in frame.select_dtypes("datetimetz"):
-            frame[name] = frame[name].dt.tz_convert(None)  # to UTC
-    except ImportError as error:
-        raise ImportError(
-            f"Reading {str(path)!r} needs pandas and pyarrow (pip install pandas pyarrow); or "
-            "save the log as CSV or npz."
-        ) from error
-    except Exception as error:  # pyarrow and pandas have many kinds of them
-        raise ValueError(
-            f"{str(path)!r} is not a parquet file: {error!s:.200}."
-        ) from error
-    return _Table(
-        path, [*map(str, frame.columns)], [frame[c].to_numpy() for c in frame.columns]
-    )
-
-
-def _check_rows(path: Path) -> None:
-    """Raise if a parquet file has too many rows for its size, e.g. one value repeated."""
-    try:
-        from pyarrow.parquet import read_metadata
-    except ImportError:  # fastparquet reads it
-        return
-    metadata = read_metadata(path)
-    check_expansion(path, 8 * metadata.num_rows * metadata.num_columns)
-
-
-def _number(cell: str, name: str, line: int, path: Path) -> float:
-    text = cell.strip()
-    if not text:
-        return np.nan
-    try:
-        return float(text)
-    except ValueError:
-        raise ValueError(
-            f"Line {line} of {str(path)!r}, column {name!r}: a number is needed, got {text!r:.60}; "
-            "correct the cell (an empty cell is a missing value, see `drop_invalid`; decimals "
-            "need a point)."
-        ) from None

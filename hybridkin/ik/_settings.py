@@ -57,6 +57,10 @@ _FULL = 0.999  # a range of this fraction of a turn counts as a whole turn
 PLANE_ROUNDS = 8  # of alternating projections onto a plane and a box
 
 
+RATES = ("dq_max", "ddq_max")
+"""Limits that must be positive: of speed and of acceleration."""
+
+
 class Bounds(NamedTuple):
     """Limits of q or of a step, each of shape () or (..., n)."""
 
@@ -101,9 +105,7 @@ def bound(
 def limits_of(task: Task, names: Iterable[str]) -> dict[str, Tensor]:
     """Return these limits of the model of a task."""
     limits = task.models[0].robot.limits
-    return {
-        name: bound(limits[name], name, positive=name == "dq_max") for name in names
-    }
+    return {name: bound(limits[name], name, positive=name in RATES) for name in names}
 
 
 def stopping(way: Tensor, change: Tensor) -> Tensor:

@@ -31,6 +31,7 @@ from hybridkin.ik._half_spaces import half_spaces
 from hybridkin.ik._implicit import differentiable as with_derivatives
 from hybridkin.ik._search import Search
 from hybridkin.ik._settings import (
+    RATES,
     Array,
     Posture,
     StepSettings,
@@ -77,6 +78,7 @@ class InverseKinematics:
     ddq_max : float or array-like of shape (n,), optional
         Largest acceleration of every actuator [unit of q per second squared]: the speed changes by
         at most ``ddq_max dt`` per step, and every actuator can stop within `q_min` and `q_max`.
+        Default: that of the model, e.g. from a URDF; infinity means none.
     q_pref : float, array-like of shape (n,) or callable, optional
         Preferred configuration, or a function that returns it for configurations (..., n), torch
         to torch, e.g. a gradient step. Default: the middle of the limits if they are finite, else
@@ -166,14 +168,12 @@ class InverseKinematics:
             0 not in np.shape(task.models[0].robot.limits["q_min"]),
             "`model` must have an actuator, but all its joints are fixed.",
         )
-        box = {"q_min": q_min, "q_max": q_max, "dq_max": dq_max}
+        box = {"q_min": q_min, "q_max": q_max, "dq_max": dq_max, "ddq_max": ddq_max}
         of_model = tuple(name for name, value in box.items() if value is None)
         bounds = limits_of(task, of_model)
         for name, value in box.items():
             if value is not None:
-                bounds[name] = bound(value, name, positive=name == "dq_max")
-        if ddq_max is None:
-            ddq_max = np.inf
+                bounds[name] = bound(value, name, positive=name in RATES)
         if q_pref is not None and not callable(q_pref):
             q_pref = bound(q_pref, "q_pref", finite=True)
         if weights is not None:
@@ -191,7 +191,6 @@ class InverseKinematics:
         self._settings = StepSettings(
             task,
             **bounds,
-            ddq_max=bound(ddq_max, "ddq_max", positive=True),
             q_pref=q_pref,
             beta=beta,
             gain=gain,

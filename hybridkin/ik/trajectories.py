@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-import re
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from os import PathLike
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybridkin._core.arrays import as_path, one_of, real_array, shaped
+from hybridkin._core.text_rows import TextFile, TextForm, is_number
 from hybridkin._core.units import METRES
 
 __all__ = ["Trajectory", "figure_eight", "from_csv", "line", "min_jerk", "spiral"]
@@ -267,8 +268,9 @@ def from_csv(
     Parameters
     ----------
     path : path-like
-        A text file with comma-separated columns t, x, y, z, or x, y, z if `dt` is given. One line
-        of names and lines that start with # are allowed.
+        A text file with columns t, x, y, z, or x, y, z if `dt` is given, separated by commas,
+        semicolons or tabs; with the latter two decimals may have a comma. One line of names and
+        lines that start with # are allowed.
     dt : float, optional
         Time between points [s]; a file with times is interpolated linearly to this period.
     unit : {"m", "cm", "mm"}, default="m"
@@ -294,17 +296,7 @@ def from_csv(
         raise FileNotFoundError(
             f"`path` must be a CSV file of points, there is none at {path}."
         )
-    try:
-        with open(path, encoding="utf-8-sig") as file:
-            rows = [
-                text.split(",")
-                for text in map(str.strip, file)
-                if text and text[0] != "#"
-            ]
-    except UnicodeDecodeError as error:
-        raise ValueError(
-            f"`path` must be a CSV file of points, {path} is not text."
-        ) from error
+    rows = _rows_of(path)
     columns = 4
     need = "t, x, y, z"
     if max(map(len, rows), default=0) == 3:
@@ -314,11 +306,12 @@ def from_csv(
             raise ValueError(
                 f"{path} has no times; give the time between its points (--dt 0.02)."
             )
-    named = bool(rows) and not re.match(
-        r"[-+.\d]|nan|inf", rows[0][0].strip(), re.IGNORECASE
-    )
+    named = bool(rows) and not is_number(rows[0][0])
+    numbers = []
     try:
-        table = np.array(rows[named:], dtype=float)
+        for row in rows[named:]:
+            numbers.append([float(cell) for cell in row])
+        table = np.array(numbers)
     except ValueError as error:
         need = f"numbers in {columns} columns ({need}) after one line of names"
         raise ValueError(f"{path} must hold {need}: {error!s:.200}.") from error
@@ -334,6 +327,27 @@ def from_csv(
         return timed
     n_steps = int(periods(timed.duration, dt) + 1e-9)
     return interpolated(timed, timed.t[0] + dt * np.arange(n_steps + 1))
+
+
+def _rows_of(path: Path) -> list[list[str]]:
+    """Return the cells of the rows of a file of points, without comments.
+
+    Decimals have a comma if another character separates the columns, and no cell has a point.
+    """
+    file = TextFile.of(path)
+    lines = [line for line in file.head() if line.strip() and line.strip()[0] != "#"]
+    delimiter = TextForm(decimal=",").separator(lines[-1:])
+    rows = []
+    for row in file.rows(delimiter):
+        cells = [cell.strip() for cell in row.cells]
+        while not cells[-1]:
+            cells.pop()  # a separator at the end of the line
+        if cells[0][:1] != "#":
+            rows.append(cells)
+    has_points = any("." in cell for cells in rows[1:] for cell in cells)
+    if delimiter == "," or has_points:
+        return rows
+    return [[cell.replace(",", ".") for cell in cells] for cells in rows]
 
 
 def interpolated(path: Trajectory, t: NDArray) -> Trajectory:

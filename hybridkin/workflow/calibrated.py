@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from hybridkin._core.arrays import as_array
+from hybridkin._core.units import LogUnit
 from hybridkin.calibration.calibrate import CalibrationResult
 from hybridkin.chains.arc_chain import ALIASES, ArcChain
 from hybridkin.chains.chain import Chain
@@ -23,7 +24,9 @@ _Unit = tuple[float, str]  # factor from SI, and name
 _MILLIMETRES: _Unit = (1e3, "mm")
 _DEGREES: _Unit = (180.0 / np.pi, "deg")
 _SHOWN = {"m": _MILLIMETRES, "rad": _DEGREES, "m²/rad²": (1e6, "mm²/rad²")}
+_PER_UNIT = "/unit of q"
 _SIZES = ("radii", "lengths", "gain", "gains")
+_RESOLVED = ("mm", "deg", "-")  # two decimals are enough
 _FAR = 0.15  # of a size; more than the error of a ruler
 # [deg]
 _TURN = 30.0
@@ -39,7 +42,7 @@ class CalibratedParameter:
     name : str
         As in `CalibrationResult.names`.
     unit : str
-        "mm", "deg", "mm²/rad²", "-" or another one, for gains "m/unit of q".
+        "mm", "deg", "mm²/rad²", "-" or another one, for gains e.g. "mm/counts".
     start, value, std_error : float
         Before and after the calibration, in that unit; of the base its rotation from the start and
         its position.
@@ -60,6 +63,12 @@ class CalibratedParameter:
     physical: bool
     identified: bool
 
+    def digits(self, number: float) -> str:
+        """Return a number in the unit of the parameter, to what a ruler or a gauge resolves."""
+        if self.unit in _RESOLVED:
+            return f"{number:.2f}"
+        return f"{number:.3g}"
+
     def checked(self, others: Sequence[CalibratedParameter]) -> CalibratedParameter:
         """Return the parameter, not identified where other calibrations contradict it.
 
@@ -78,9 +87,12 @@ class CalibratedParameter:
 
 
 def calibrated_parameters(
-    start: Chain, result: CalibrationResult
+    start: Chain, result: CalibrationResult, q_unit: LogUnit
 ) -> list[CalibratedParameter]:
-    """Return the free parameters of a calibration from `start`, in the order of its `names`."""
+    """Return the free parameters of a calibration from `start`, in the order of its `names`.
+
+    Gains and zeros are shown in the unit of the log.
+    """
     labels = zip(result.names, result.narrowing.tolist(), strict=True)
     parameters = []
     for name, calibrated in result.values.items():
@@ -89,7 +101,7 @@ def calibrated_parameters(
         errors = np.ravel(result.std_errors[name])
         for k, std_error in enumerate(errors):
             label, narrowing = next(labels)
-            scale, unit = _unit(start, name, k)
+            scale, unit = _unit(start, name, k, q_unit)
             parameters.append(
                 CalibratedParameter(
                     name=label,
@@ -132,13 +144,19 @@ def _start_value(start: Chain, name: str) -> NDArray:
     return geometry[name]
 
 
-def _unit(start: Chain, name: str, k: int) -> _Unit:
+def _unit(start: Chain, name: str, k: int, q_unit: LogUnit) -> _Unit:
     """Return the unit of the k-th number of a parameter."""
     if name == "base" and k < 3:
         return _DEGREES
     if name == "actuator_zeros" and isinstance(start, ArcChain) and start.in_metres:
         return _MILLIMETRES
     unit = start.unit_of(ALIASES.get(name, name))
+    if unit.endswith(_PER_UNIT):
+        of_what = unit.removesuffix(_PER_UNIT)
+        scale, symbol = _SHOWN.get(of_what, (1.0, of_what))
+        return scale * q_unit.size, f"{symbol}/{q_unit.name}"
+    if unit == "unit of q":
+        return 1.0 / q_unit.size, q_unit.name
     return _SHOWN.get(unit, (1.0, unit))
 
 
@@ -150,9 +168,9 @@ def write_parameters(report: Report, parameters: Sequence[CalibratedParameter]) 
         rows.append(
             [
                 f"{parameter.name} [{parameter.unit}]",
-                f"{parameter.start:.2f}",
-                f"{parameter.value:.2f}",
-                f"{parameter.std_error:.2f}",
+                parameter.digits(parameter.start),
+                parameter.digits(parameter.value),
+                parameter.digits(parameter.std_error),
                 f"{parameter.narrowing:.3g}",
                 identified if parameter.physical else "not physical",
             ]
@@ -175,12 +193,13 @@ class Calibration:
         cls,
         start: Chain,
         result: CalibrationResult,
+        q_unit: LogUnit,
         warnings: Sequence[str] = (),
         others: Sequence[CalibratedParameter] = (),
     ) -> Calibration:
         """Return the calibration of `start`; `others` are of sets with nearly the same errors."""
         entries = []
-        for parameter in calibrated_parameters(start, result):
+        for parameter in calibrated_parameters(start, result, q_unit):
             entries.append(parameter.checked(others))
         return cls(
             rmse=result.rmse,
@@ -210,10 +229,12 @@ class Calibration:
             report.items(self.unidentified)
 
 
-def deviations(start: Chain, result: CalibrationResult) -> Iterator[str]:
+def deviations(
+    start: Chain, result: CalibrationResult, q_unit: LogUnit
+) -> Iterator[str]:
     """Yield what the calibration moved far from the description, and what else may be wrong."""
     far = []
-    for parameter in calibrated_parameters(start, result):
+    for parameter in calibrated_parameters(start, result, q_unit):
         is_size = parameter.name.partition("[")[0] in _SIZES and parameter.physical
         if is_size and abs(parameter.value / parameter.start - 1.0) > _FAR:
             far.append(

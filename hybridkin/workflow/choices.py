@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import math
 
+from hybridkin._core.units import LogUnit
 from hybridkin.hybrid.cv_results import CvResults
 from hybridkin.hybrid.estimator import HybridForwardModel
 from hybridkin.learning.elm_cv import ELMRegressorCV
-from hybridkin.workflow.model import hysteresis_in_words
 from hybridkin.workflow.report import millimetres
 
 
-def choice_in_words(model: HybridForwardModel) -> str:
-    """Return the chosen settings of a fitted model in a few words."""
+def choice_in_words(model: HybridForwardModel, unit: LogUnit) -> str:
+    """Return the chosen settings of a fitted model in a few words; widths in the unit of a log."""
     if model.cv_results_ is not None:
-        return auto_in_short(model.cv_results_, memory_in_words(model))
+        return auto_in_short(model.cv_results_, memory_in_words(model, unit))
     network = model.error_model_
     if isinstance(network, ELMRegressorCV):
         return (
@@ -36,9 +36,9 @@ def _weights(results: CvResults) -> dict[str, float]:
     return dict(sorted(chosen.items(), key=lambda item: -item[1]))
 
 
-def memory_in_words(model: HybridForwardModel) -> str:
+def memory_in_words(model: HybridForwardModel, unit: LogUnit) -> str:
     """Return the hysteresis of a fitted model in words; empty without one."""
-    return "" if model.play_ is None else hysteresis_in_words(model)
+    return "" if model.play_ is None else model.play_.in_words(unit)
 
 
 def auto_in_short(results: CvResults, hysteresis: str) -> str:
@@ -55,7 +55,7 @@ def auto_in_short(results: CvResults, hysteresis: str) -> str:
     return words
 
 
-def auto_in_words(model: HybridForwardModel) -> list[str]:
+def auto_in_words(model: HybridForwardModel, unit: LogUnit) -> list[str]:
     """Return the choices of error_model="auto" in sentences; none for other error models."""
     results = model.cv_results_
     if results is None:
@@ -81,7 +81,7 @@ def auto_in_words(model: HybridForwardModel) -> list[str]:
     ]
     if model.play_ is not None:
         sentences.append(
-            f"The actuators have {hysteresis_in_words(model)}. Predictions depend on the order of "
+            f"The actuators have {model.play_.in_words(unit)}. Predictions depend on the order of "
             "the rows in a motion, with creep on their times."
         )
     elif model.play is not None:

@@ -213,7 +213,7 @@ class Mechanical:
             result, _ = fit_geometry(
                 rival.chain, rows.q, rows.x, rival.parameters, loss, start=rival.start
             )
-            yield from calibrated_parameters(rival.chain, result)
+            yield from calibrated_parameters(rival.chain, result, rows.q_unit)
 
 
 def quadratic() -> Pipeline:
@@ -445,7 +445,7 @@ def _one_fold(
         if outside is None or candidates is None:
             tips[name] = evaluate(model.module_, test.q)[0]
             if name in (DATA_ELM, HYBRID_ELM):
-                choices[name] = choice_in_words(model)
+                choices[name] = choice_in_words(model, train.q_unit)
             continue
         q = model.effective(test.commands)
         for candidate, module in candidates.items():
@@ -454,7 +454,7 @@ def _one_fold(
             [*candidates],
             outside,
             fitted.geometry,
-            memory_in_words(model),
+            memory_in_words(model, train.q_unit),
         )
     distance = held_out_distances(train.q, train.motions, test.q)
     return _FoldResult(tips, distance, choices, auto)

@@ -13,7 +13,7 @@ from hybridkin._core.texts import visible
 from hybridkin.chains.robots import Limits, LogFormat
 from hybridkin.hybrid.cv_results import CvResults
 from hybridkin.workflow.errors import HeldOutErrors
-from hybridkin.workflow.model import LoadedModel, hysteresis_in_words, play_widths
+from hybridkin.workflow.model import LoadedModel
 from hybridkin.workflow.report import Report, listed
 
 _NAMES = 24  # width of the names of rows
@@ -36,7 +36,7 @@ class Description:
     auto : dict or None
         The choices of "auto", see ``HybridForwardModel.cv_results_``.
     play : list of float or None
-        Width of the hysteresis of every actuator [m].
+        Widths of the hysteresis of one or all actuators, in the unit of the robot's logs.
     domain : Limits or None
         Training range.
     log_format : LogFormat
@@ -87,7 +87,7 @@ def describe(loaded: LoadedModel) -> Report[Description]:
         n_actuators=loaded.n_actuators,
         geometry={} if loaded.chain is None else loaded.chain.geometry(),
         auto=None if hybrid is None else hybrid.cv_results_,
-        play=play_widths(hybrid),
+        play=loaded.play_widths,
         domain=loaded.trained_range,
         log_format=loaded.log_format(),
         limits=None if robot is None else robot.limits,
@@ -102,8 +102,8 @@ def describe(loaded: LoadedModel) -> Report[Description]:
     else:
         rows = hybrid.html_rows()
     report.verbatim(_in_lines(rows))
-    if hybrid is not None and hybrid.play_ is not None:
-        report.text(f"The actuators have {hysteresis_in_words(hybrid)}.")
+    if loaded.play is not None:
+        report.text(f"The actuators have {loaded.play.in_words(loaded.log_unit)}.")
     log = record.log_format
     for name, limits in {
         "Training range": record.domain,

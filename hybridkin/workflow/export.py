@@ -95,6 +95,6 @@ def _about_q(loaded: LoadedModel) -> str:
     if loaded.play is None:
         return about_q
     return (
-        f"{about_q} The robot has hysteresis (play) of a width of {loaded.play.width.tolist()}, in "
-        "the unit of q. x(q) is that of what the actuators do; steps return commands for it."
+        f"{about_q} The actuators have {loaded.play.in_words(loaded.log_unit)}: x(q) is that of "
+        "what the actuators do; steps return commands for it."
     )

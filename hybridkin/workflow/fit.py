@@ -130,7 +130,7 @@ def fit_log(
         excluded=complete.excluded,
         loss=settings.loss,
         saved=saved,
-        chosen=choice_in_words(model),
+        chosen=choice_in_words(model, rows.q_unit),
         held_out=held_out,
         promise=Promise.of(compared.errors[saved], compared.distance),
         counts=None
@@ -181,7 +181,7 @@ def _suspicions(log: MeasuredLog, mechanical: Mechanical) -> list[str]:
     if mechanical.start is None or mechanical.result is None:
         return []
     misread = log.misread(mechanical.result.chain)
-    return [*misread, *deviations(mechanical.start, mechanical.result)]
+    return [*misread, *deviations(mechanical.start, mechanical.result, log.q_unit)]
 
 
 def _best_to_save(compared: Comparison) -> str:
@@ -199,12 +199,17 @@ def _calibration(
     if mechanical.start is None or mechanical.result is None:
         return None
     others = [*mechanical.rivals(rows, loss)]
-    return Calibration.of(mechanical.start, mechanical.result, messages, others)
+    return Calibration.of(
+        mechanical.start, mechanical.result, rows.q_unit, messages, others
+    )
 
 
 def _in_words(loaded: LoadedModel, model: HybridForwardModel) -> list[str]:
     """Return what a model chose and expects, its error radius, and motions that its log lacks."""
-    words = [*auto_in_words(model), *model._fitted.error.structure_in_words()]
+    words = [
+        *auto_in_words(model, loaded.log_unit),
+        *model._fitted.error.structure_in_words(),
+    ]
     if model.radius_ is not None:
         words.append(f"Estimated error radius: {model.radius_}.")
     if loaded.plane_in_words():

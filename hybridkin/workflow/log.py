@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridkin._core.commands import Commands
+from hybridkin._core.units import LogUnit
 from hybridkin.chains import robots
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
@@ -70,6 +71,11 @@ class MeasuredLog(Log):
         if not self.named and self.runs is None:
             return Commands(self.q, time=self.time)
         return super().commands
+
+    @property
+    def q_unit(self) -> LogUnit:
+        """The unit of q in the file."""
+        return LogUnit.of(self.file_units["q"])
 
     @property
     def split(self) -> str:
@@ -162,6 +168,7 @@ def read_log(
         )
     suffix = log_format.group_suffix
     log = load_log(path, **log_format.reading, delimiter=delimiter, drop_invalid=True)
+    log = replace(log, file_units={**log.file_units, "q": log_format.q_unit})
     if log.groups is None and exclude:
         raise ValueError("`exclude` needs `groups`, the column that names the motions.")
     if log.groups is not None:

@@ -16,13 +16,13 @@ from hybridkin._core.commands import Commands
 from hybridkin._core.digests import row_digests
 from hybridkin._core.directions import in_terms
 from hybridkin._core.model import ForwardModel, as_forward_model
+from hybridkin._core.units import UNITS, LogUnit
 from hybridkin.chains import robots
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
 from hybridkin.native.library import evaluate
 from hybridkin.saving.header import model_header
 from hybridkin.workflow.errors import ExpectedErrors, HeldOutErrors, Promise
-from hybridkin.workflow.report import millimetres
 
 if TYPE_CHECKING:
     from hybridkin.chains.hysteresis import HysteresisOperator
@@ -115,6 +115,19 @@ class LoadedModel:
         if self.play is None:
             return 0.0
         return 0.5 * self.play.width
+
+    @property
+    def log_unit(self) -> LogUnit:
+        """The unit of q in the logs of the robot."""
+        return LogUnit.of(self.log_format().q_unit)
+
+    @property
+    def play_widths(self) -> list[float] | None:
+        """Widths of the hysteresis of one or all actuators, in the unit of logs; None without."""
+        if self.play is None:
+            return None
+        size = UNITS.get(self.log_format().q_unit, 1.0)
+        return np.ravel(self.play.width / size).tolist()
 
     def effective(self, commands: ArrayLike | Commands) -> NDArray:
         """Return what the actuators do for commands (N, n)."""
@@ -257,37 +270,6 @@ class LoadedModel:
         if isinstance(self.chain, ArcChain) and not self.chain.in_metres:
             unit = "1"
         return robots.LogFormat(names, ("x", "y", "z"), unit)
-
-
-def play_widths(model: HybridForwardModel | None) -> list[float] | None:
-    """Return the width of the hysteresis of every actuator [m], None without."""
-    if model is None or model.play_ is None:
-        return None
-    return _in_metres(model, model.play_.width).tolist()
-
-
-def hysteresis_in_words(model: HybridForwardModel) -> str:
-    """Return the kinds of hysteresis that the actuators have, with their widths.
-
-    Parameters
-    ----------
-    model : HybridForwardModel
-        A model with hysteresis.
-    """
-    assert model.play_ is not None
-    words = []
-    for part in model.play_.parts:
-        width = _in_metres(model, part.width).max()
-        words.append(f"{part.kind} {millimetres(width)}" if width > 0.0 else part.kind)
-    return " and ".join(words)
-
-
-def _in_metres(model: HybridForwardModel, width: NDArray) -> NDArray:
-    """Return widths in the unit of q in metres, of one or all actuators."""
-    chain = model.mechanical_model_
-    if isinstance(chain, ArcChain) and not chain.in_metres:
-        width = width * as_array(chain.gains.detach().abs())
-    return np.ravel(width)
 
 
 def open_model(path: str | Path, robot: str | Path | None = None) -> LoadedModel:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -18,14 +17,14 @@ import hybridkin
 from hybridkin._core.units import METRES
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.robots import LogFormat
-from hybridkin.datasets import Log, load_log
+from hybridkin.datasets import Log, load_log, log_columns
 from hybridkin.ik import trajectories
 from hybridkin.ik.results import IKStatus, Track, score, statuses
 from hybridkin.ik.trajectories import Trajectory
 from hybridkin.workflow.counts import Counts
 from hybridkin.workflow.domain import Domain, PathLimits, path_limits
 from hybridkin.workflow.errors import Errors
-from hybridkin.workflow.model import LoadedModel, hysteresis_in_words, play_widths
+from hybridkin.workflow.model import LoadedModel
 from hybridkin.workflow.reach import better_place, check_reach
 from hybridkin.workflow.report import (
     Progress,
@@ -80,7 +79,7 @@ class TrackRecord:
     backend : str
         What computed the steps: "compiled", or "torch: " and the reason.
     play : list of float or None
-        Width of the hysteresis of every actuator [m].
+        Widths of the hysteresis of one or all actuators, in the unit of the robot's logs.
     lead_in : int
         Number of rows that lead from the robot's configuration to the path.
     limits : PathLimits
@@ -128,9 +127,9 @@ def _write(report: Report[TrackRecord], loaded: LoadedModel, better: str) -> Non
         "path.",
         unit=log.q_unit,
     )
-    if loaded.hybrid is not None and loaded.play is not None:
+    if loaded.play is not None:
         report.text(
-            f"The actuators have {hysteresis_in_words(loaded.hybrid)}: a command crosses the "
+            f"The actuators have {loaded.play.in_words(loaded.log_unit)}: a command crosses the "
             "width when its actuator reverses, and leads where they creep. Send q; effective_... "
             "is the motion of the actuators."
         )
@@ -297,7 +296,7 @@ def track_path(
         expected_inside=_expected(loaded, track, track.status == IKStatus.CONVERGED),
         rounded=rounded,
         backend=domain.solver().tracker(track.q[0]).backend,
-        play=play_widths(loaded.hybrid),
+        play=loaded.play_widths,
         lead_in=n_lead,
         limits=domain.limits,
         delay=delay,
@@ -578,15 +577,16 @@ def read_track(path: str | Path, log_format: LogFormat) -> Log:
         raise FileNotFoundError(
             f"`track` must be a file of commands, there is none at {file}."
         )
-    with open(file, encoding="utf-8-sig", newline="") as lines:
-        header = [name.strip() for name in next(csv.reader(lines), [])]
+    header = log_columns(
+        file, header_line=log_format.header_line, decimal=log_format.decimal
+    )
     time = None
     for name in (TIME, log_format.time):
         if time is None and name in header:
             time = name
     columns = replace(log_format, groups=None, time=time)
     if {*TARGET} <= {*header}:
-        columns = replace(columns, x=TARGET, groups="status")
+        columns = columns.of_tracks(TARGET)
     return load_log(file, **columns.reading)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -452,12 +452,12 @@ def read_tips(
     time = log_format.time if log_format.time in columns else None
     reading = {
         **log_format.reading,
-        "q": log_format.x,
-        "q_unit": log_format.x_unit,
+        "q": (),
+        "q_unit": "m",
         "q_sign": 1,
         "groups": None,
         "runs": None,
         "time": time,
     }
-    log = load_log(path, **reading, delimiter=delimiter, drop_invalid=True)
-    return replace(log, q=log.q[:, :0], q_names=())
+    reading.pop("unwrap", None)
+    return load_log(path, **reading, delimiter=delimiter, drop_invalid=True)

@@ -268,6 +268,135 @@ def test_bad_mjcf_says_what_is_needed(text, end, root, message):
         RigidChain.from_mjcf(text, end, root_link=root)
 
 
+TENDON_ARM = """
+<mujoco>
+  <compiler angle="radian"/>
+  <worldbody>
+    <body name="one"><joint name="one" axis="0 1 0" ref="0.2"/><geom size="0.01"/>
+      <body name="two" pos="0 0 0.3">
+        <joint name="two" axis="1 0 0.3" pos="0.01 0 0" ref="-0.1"/><geom size="0.01"/>
+        <body name="three" pos="0.1 0 0.2">
+          <joint name="three" type="slide" axis="0 0 1" range="-0.1 0.1" limited="true"/>
+          <geom size="0.01"/>
+          <body name="hand" pos="0 0.1 0.1"><joint name="four" axis="0 1 0"/>
+            <geom size="0.01"/></body>
+        </body>
+      </body>
+    </body>
+    <body name="motor"><joint name="motor" range="-1 1.5" limited="true" ref="0.4"/>
+      <geom size="0.01"/></body>
+  </worldbody>
+  <tendon>
+    <fixed name="pair"><joint joint="one" coef="1"/><joint joint="two" coef="0.5"/></fixed>
+  </tendon>
+  {}
+</mujoco>
+"""
+CIRCLE = '<joint joint1="one" joint2="two"/><joint joint1="two" joint2="one"/>'
+PULLED = '<actuator><position tendon="pair"/>{}</actuator>'
+
+
+def coupled(equality="", other=""):
+    return TENDON_ARM.format(f"<equality>{equality}</equality>{other}")
+
+
+def test_joints_that_an_equality_couples_follow_their_driver(rng):
+    """Against MuJoCo at positions that satisfy the constraints, of joints with references."""
+    mujoco = pytest.importorskip("mujoco")
+    text = coupled(
+        '<joint joint1="two" joint2="one" polycoef="0.3 -0.7 0 0 0"/>'
+        '<joint joint1="one" joint2="motor" polycoef="-0.1 1.5 0 0 0"/>'
+        '<joint joint1="four" polycoef="0.25 0 0 0 0"/>'
+        '<joint joint1="three" joint2="motor" polycoef="0 0 1 0 0" active="false"/>'
+    )
+    chain = RigidChain.from_mjcf(text, "hand")
+    assert chain.names == ("motor", "three")
+    assert_close(chain.q_min, torch.tensor([-1.0, -0.1], dtype=torch.float64))
+    assert_close(chain.q_max, torch.tensor([1.5, 0.1], dtype=torch.float64))
+    model = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(model)
+    for motor, three in random_q(rng, size=2).tolist():
+        one = 0.2 - 0.1 + 1.5 * (motor - 0.4)
+        two = -0.1 + 0.3 - 0.7 * (one - 0.2)
+        for name, value in dict(one=one, two=two, three=three, four=0.25, motor=motor).items():
+            data.joint(name).qpos[0] = value
+        mujoco.mj_fwdPosition(model, data)
+        assert np.abs(data.efc_pos[:3]).max() < 1e-12, "the constraints hold"
+        tip = chain(torch.tensor([motor, three], dtype=torch.float64))
+        assert_close(tip, torch.from_numpy(data.body("hand").xpos), rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (coupled('<joint name="bent" joint1="two" joint2="one" polycoef="0 1 2 0 0"/>'), "bent"),
+        (coupled(2 * '<joint joint1="two" joint2="one"/>'), "'two' must follow one other"),
+        (coupled(CIRCLE), r"in a circle, got \['one', 'two'\]"),
+        (coupled("", PULLED.format("")), r"'pair' moves the joints \['one', 'two'\]"),
+    ],
+)
+def test_couplings_that_kinematics_do_not_know_are_refused(text, message):
+    pytest.importorskip("mujoco")
+    with pytest.raises(ValueError, match=message):
+        RigidChain.from_mjcf(text, "hand")
+
+
+def test_a_fixed_tendon_whose_joints_are_known_is_no_matter():
+    pytest.importorskip("mujoco")
+    driven = coupled("", PULLED.format('<position joint="two"/>'))
+    assert RigidChain.from_mjcf(driven, "hand").n_actuators == 4
+    joined = coupled('<joint joint1="two" joint2="one"/>', PULLED.format(""))
+    assert RigidChain.from_mjcf(joined, "hand").names == ("one", "three", "four")
+    assert RigidChain.from_mjcf(coupled(), "hand").n_actuators == 4
+
+
+def test_a_loop_is_named():
+    pytest.importorskip("mujoco")
+    tied = coupled('<connect body1="two" body2="motor" anchor="0 0 0"/>')
+    with pytest.warns(UserWarning, match="body 'two' is tied .* <connect>") as caught:
+        assert RigidChain.from_mjcf(tied, "hand").n_actuators == 4
+    assert caught[0].filename == __file__
+
+
+def test_quaternions_of_a_urdf_are_poses(rng):
+    """As the angles of the same rotation, and written back as angles."""
+    for _ in range(20):
+        turn = Rotation.from_rotvec(torch.randn(3, generator=rng).numpy())
+        quaternion = " ".join(map(repr, (3.0 * turn.as_quat()).tolist()))
+        limit = '<limit lower="-1" upper="1"/><origin xyz="1 2 3" quat_xyzw="{}"/>'
+        text = LINKS.format(JOINT.format("revolute", limit.format(quaternion)))
+        arm = urdf(text)
+        assert_close(arm.origins[0, :3, :3], torch.from_numpy(turn.as_matrix()))
+        placed = arm.with_geometry(links=arm.geometry()["links"] + 0.1)
+        again = urdf(placed.to_urdf(text, "b"))
+        assert_close(again.origins, placed.origins, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("origin", ['rpy="0 0 0" quat_xyzw="0 0 0 1"', 'quat_xyzw="0 0 0 0"'])
+def test_a_urdf_has_one_rotation_for_a_joint(origin):
+    joint = JOINT.format("continuous", f"<origin {origin}/>")
+    with pytest.raises(ValueError, match="must have either `rpy` or `quat_xyzw`"):
+        urdf(LINKS.format(joint))
+
+
+@pytest.mark.parametrize(
+    ("limit", "acceleration"),
+    [
+        ('acceleration="3"', 3.0),
+        ('acceleration="3" deceleration="2"', 2.0),
+        ('deceleration="4"', 4.0),
+        ('acceleration="0"', math.inf),
+        ("", math.inf),
+    ],
+)
+@pytest.mark.parametrize("kind", ["revolute", "continuous"])
+def test_accelerations_of_a_urdf_limit_inverse_kinematics(kind, limit, acceleration):
+    tags = f'<limit lower="-1" upper="1" {limit}/>'
+    arm = urdf(LINKS.format(JOINT.format(kind, tags)))
+    assert arm.ddq_max == InverseKinematics(arm).settings.ddq_max == acceleration
+    assert InverseKinematics(arm, ddq_max=7.0).settings.ddq_max == 7.0
+
+
 def test_degrees_and_millimetres_are_noticed():
     slider = planar(kinds=["revolute", "prismatic"])
     (message,) = slider.check_actuators(torch.tensor([[90.0, 0.1]]))

@@ -65,7 +65,7 @@ SHAPE = ["--shape", "figure-eight", "--size", "5,5", "--unit", "mm"]
         (["evaluate", "log.csv", "robot.toml"], "must be a model or a robot description"),
         (["track", "robot.toml"], "give either a file of points or --shape"),
         (["track", "robot.toml", "none.csv"], "there is none at"),
-        (["track", "robot.toml", "noise.bin"], "noise.bin is not text"),
+        (["track", "robot.toml", "noise.bin"], "'noise.bin' is not a text file"),
         (["track", "robot.toml", "--shape", "line", "--size", "2,1"], "--size must be 3 numbers"),
         (["track", "robot.toml", *SHAPE, "--q-min", "1,2"], "number or 6"),
         (["track", "robot.toml", *SHAPE, "--duration", "1e9"], "times `dt`"),

@@ -52,6 +52,42 @@ def test_init_from_options(tmp_path, capsys):
 
 
 MOTORS = [*TENDONS, "--q-sign", "1"]
+BELLOWS = ["--kind", "chambers", "--segments", "2", "--radius", "30", "--q-unit", "bar"]
+
+
+def test_init_of_pressures(tmp_path, capsys):
+    """The length of a chamber is that without pressure, and what a bar adds."""
+    path = tmp_path / "bellows.toml"
+    lengths = ["--length", "100,80", "--gain", "20"]
+    assert run(capsys, "init", path, *BELLOWS, *lengths)[0] == 0
+    robot = robots.read_description(path)
+    assert (robot.log.q_unit, robot.log.q_sign) == ("bar", 1)
+    pressures = torch.tensor([0.0, 0, 0, 1, 1, 1], dtype=torch.float64)
+    metres = robot.chain.metres(pressures).tolist()
+    assert metres == pytest.approx([0.1, 0.1, 0.1, 0.1, 0.1, 0.1], rel=1e-8)
+    assert robot.chain(pressures).tolist() == pytest.approx([0, 0, 0.2], abs=1e-9)
+
+
+def test_init_takes_a_value_for_every_actuator(tmp_path, capsys):
+    path = tmp_path / "arm.toml"
+    options = ["--angle=0,130,240,60,180,-60", "--q-sign=1,-1,1,1,1,-1"]
+    assert run(capsys, "init", path, *TENDONS, *options)[0] == 0
+    robot = robots.read_description(path)
+    degrees = [0, 130, 240, 60, 180, -60]
+    assert np.degrees(robot.chain.angles.tolist()) == pytest.approx(degrees)
+    assert robot.log.q_sign == (1, -1, 1, 1, 1, -1)
+
+
+def test_init_asks_for_pressures_in_words(tmp_path, capsys, monkeypatch):
+    path = tmp_path / "bellows.toml"
+    typed = ["", "chambers", "1", "", "30", "", "bar", "90", "15", "", "", "", "", "", ""]
+    monkeypatch.setattr(sys, "stdin", Terminal("\n".join(typed) + "\n"))
+    code, _, err = run(capsys, "init", path)
+    assert code == 0
+    assert "length: length of a chamber at 0 bar [mm]" in err
+    assert "gain: length that 1 bar adds to a chamber [mm]" in err
+    assert not {"spool_radius:", "q_sign:"} & {*err.split()}
+    assert robots.read_description(path).chain.metres(torch.ones(3))[0] == pytest.approx(0.105)
 
 
 @pytest.mark.parametrize(
@@ -101,6 +137,14 @@ def test_init_reads_the_header_of_a_log_and_checks_it(log, tmp_path, capsys):
             [*TENDONS, "--q-sign", "1", "--q-unit", "counts", "--spool-radius", "6"],
             "needs --counts-per-turn where",
         ),
+        ([*BELLOWS, "--gain", "20"], "needs --length where"),
+        ([*BELLOWS, "--length", "90"], "needs --gain where"),
+        ([*BELLOWS, "--q-unit", "mm", "--length", "90"], "--length has no use: q is the length of"),
+        ([*BELLOWS, "--spool-radius", "9"], "--spool-radius has no use: chambers have no spools"),
+        ([*TENDONS, "--q-sign", "1", "--gain", "9"], "--gain has no use: q is a length; leave"),
+        ([*TENDONS, "--q-sign", "1", "--counts-per-turn", "9"], "it goes with --spool-radius"),
+        ([*TENDONS, "--q-sign", "1,-1"], "`q_sign` in [log] must hold 6 numbers"),
+        ([*TENDONS, "--q-sign", "1", "--angle", "1,2,3"], "or those of all actuators, got 3"),
     ],
 )
 def test_init_without_what_it_needs_writes_nothing(tmp_path, capsys, options, message):
@@ -117,7 +161,7 @@ class Terminal(io.StringIO):
 
 def test_init_asks_on_a_terminal(log, tmp_path, capsys, monkeypatch):
     path = tmp_path / "robot.toml"
-    typed = [log, "cables", "tendons", "two", "2", "", "5", "100", "", "", "", "-1", "", "", "none"]
+    typed = [log, "cables", "tendons", "two", "2", "", "5", "", "", "100", "", "-1", "", "", "none"]
     text = "\n".join(map(str, [*typed, ""])) + "\n"
     monkeypatch.setattr(sys, "stdin", Terminal(text))
     code, out, err = run(capsys, "init", path)

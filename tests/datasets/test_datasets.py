@@ -97,7 +97,7 @@ def test_csv_reads_units_signs_groups_and_time(log):
     ("text", "arguments", "message"),
     [
         (HEADER + "0,r,1,x1,1,1,1,1\n", {}, r"Line 2 .* column 'b': .* got 'x1'"),
-        (HEADER + "0,r,1,1,1,1,1,1,9\n", {}, "9 cells, the header 8"),
+        (HEADER + "0,r,1,1,1,1,1,1,9\n", {}, "names 8 columns, but line 2 has 9 cells"),
         (HEADER, {}, "no rows"),
         ("", {}, "is empty"),
         (HEADER, {"x": ["x", "Y", "Z"]}, "did you mean 'X'"),

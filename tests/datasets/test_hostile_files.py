@@ -55,8 +55,8 @@ def test_an_npz_that_expands_without_measure(tmp_path, monkeypatch):
 
 def test_paths_that_are_no_text_or_no_file(tmp_path):
     path = tmp_path / "path.csv"
-    path.write_bytes(b"t,x,y,z\n0,0,0,\xae\n")
-    with pytest.raises(ValueError, match=r"path\.csv is not text"):
+    path.write_bytes(b"t,x,y,z\n0,0,0,\x00\n")
+    with pytest.raises(ValueError, match=r"path\.csv' is not a text file"):
         trajectories.from_csv(path)
     if sys.platform != "win32":
         os.mkfifo(tmp_path / "pipe")

@@ -5,9 +5,19 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from hybridkin import ConstantCurvatureChain, calibrate, datasets, robots, workflow
+from hybridkin import (
+    ConstantCurvatureChain,
+    CreepOperator,
+    HysteresisSeries,
+    PlayOperator,
+    calibrate,
+    datasets,
+    robots,
+    workflow,
+)
+from hybridkin._core.units import LogUnit
 from hybridkin.datasets import Log
-from hybridkin.workflow.calibrated import deviations
+from hybridkin.workflow.calibrated import calibrated_parameters, deviations
 
 RADII = np.array([0.008, 0.007])
 RING = 2 * np.pi / 3 * np.arange(3)
@@ -36,7 +46,7 @@ def measured(truth, sign=1):
 def said(nominal, truth, parameters, sign=1):
     """Sentences about a calibration of the nominal robot to the true one."""
     q, x = measured(truth, sign)
-    return [*deviations(nominal, calibrate(nominal, q, x, parameters))]
+    return [*deviations(nominal, calibrate(nominal, q, x, parameters), LogUnit.of("m"))]
 
 
 @pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (150.0, 0.0, 60.0)])
@@ -86,3 +96,21 @@ def test_a_fit_warns_of_deviations_and_reports_them(tmp_path):
         workflow.fit_log(log, description, tmp_path, settings, n_jobs=1)
     assert len(caught) == 1
     assert "Warning: the calibration moved" in (tmp_path / "report.md").read_text()
+
+
+def test_gains_and_widths_are_in_the_unit_of_the_log():
+    """As a lab writes them: millimetres for a count, counts of backlash, three digits."""
+    truth = robot(gains=9.2e-6)
+    q, x = measured(truth)
+    start = robot(gains=1e-5)
+    result = calibrate(start, q, x, ["gain", "base"])
+    of_gain = calibrated_parameters(start, result, LogUnit.of("counts"))[0]
+    assert (of_gain.name, of_gain.unit) == ("gain", "mm/counts")
+    assert of_gain.digits(of_gain.start) == "0.01"
+    assert of_gain.value == pytest.approx(1e3 * float(result.chain.gains[0]), rel=1e-12)
+    assert of_gain.digits(0.00923456) == "0.00923"
+    series = HysteresisSeries([PlayOperator([12.34, 9.0]), CreepOperator([0.25], [3.0])])
+    words = series.in_words(LogUnit.of("counts"))
+    assert words == "backlash of 12.3 counts and creep (up to 25 % late, with 3 s)"
+    assert PlayOperator(0.0004).in_words(LogUnit.of("m")) == "backlash of 0.4 mm"
+    assert PlayOperator(np.radians(3.0)).in_words(LogUnit.of("deg")) == "backlash of 3 deg"

@@ -4,9 +4,12 @@ import numpy as np
 import pytest
 
 from hybridkin import datasets, robots
+from hybridkin._core.units import LogUnit
 from hybridkin.workflow.calibrated import Calibration, calibrated_parameters
 from hybridkin.workflow.compare import Mechanical
 from hybridkin.workflow.log import checked
+
+MILLIMETRES = LogUnit.of("m")
 
 
 def measured(q, x, motions):
@@ -17,8 +20,8 @@ def entries(robot, rows):
     """Parameters of the calibration on rows, as in their report, and those without other sets."""
     mechanical = Mechanical.of(robot, rows, "linear")
     others = [*mechanical.rivals(rows, "linear")]
-    reported = Calibration.of(mechanical.start, mechanical.result, (), others)
-    alone = calibrated_parameters(mechanical.start, mechanical.result)
+    reported = Calibration.of(mechanical.start, mechanical.result, MILLIMETRES, (), others)
+    alone = calibrated_parameters(mechanical.start, mechanical.result, MILLIMETRES)
     by_name = [{entry.name: entry for entry in found} for found in (reported.entries, alone)]
     return mechanical.geometry, *by_name
 

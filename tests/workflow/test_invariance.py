@@ -23,7 +23,6 @@ from hybridkin.workflow.domain import Domain
 from hybridkin.workflow.errors import Errors, HeldOutErrors, Promise
 from hybridkin.workflow.fit_record import largest_errors
 from hybridkin.workflow.log import checked
-from hybridkin.workflow.model import hysteresis_in_words, play_widths
 from hybridkin.workflow.path import scaled_path
 
 # ---------------------------------------------------------------- statistics of errors
@@ -175,8 +174,10 @@ def test_commands_exceed_the_limits_by_half_the_backlash_in_any_unit(tmp_path):
         described = Domain(model, workflow.path_limits(model, within_fit=False)).of_commands
         ends = np.sort([described[0] * gains, described[1] * gains], axis=0)
         assert_allclose(ends, [LIMITS.q_min, LIMITS.q_max], rtol=1e-9)
-        assert_allclose(play_widths(model.hybrid), np.full(6, width), rtol=1e-12)
-        assert hysteresis_in_words(model.hybrid) == "backlash 0.4 mm"
+        of_log = np.ravel(model.play.width)
+        if gains is GAINS:
+            of_log = np.degrees(of_log)
+        assert_allclose(model.play_widths, of_log, rtol=1e-12)
     assert_allclose(found[1], found[0], rtol=1e-9, atol=1e-12)
     inner = workflow.path_limits(metres)
     assert_allclose(found[0], [inner.q_min - 0.5 * width, inner.q_max + 0.5 * width])

@@ -39,8 +39,8 @@ def files(tmp_path):
     for cells, state in zip(np.column_stack([t, q, x, x]), states, strict=True):
         lines.append(",".join([*map(str, cells), state]))
     (tmp_path / "track.csv").write_text("\n".join(lines))
-    measured = TURN.apply(x) + [0.002, -0.001, 0.003]
-    measured = measured + NOISE * rng.standard_normal(x.shape)
+    measured = TURN.apply(x) + np.array([0.002, -0.001, 0.003])
+    measured += NOISE * rng.standard_normal(x.shape)
     every = np.column_stack([t, measured])
     for name, rows in (("camera", every), ("some", every[::3])):
         head = "stamp,x,y,z"
@@ -49,7 +49,8 @@ def files(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "options"), [("camera", []), ("camera", ["--time", "stamp"]), ("some", ["--time", "stamp"])]
+    ("name", "options"),
+    [("camera", []), ("camera", ["--time", "stamp"]), ("some", ["--time", "stamp"])],
 )
 def test_the_commands_are_those_of_the_track(files, capsys, name, options):
     command = ["verify", files / "model.safetensors", files / "track.csv", files / f"{name}.csv"]
