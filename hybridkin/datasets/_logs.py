@@ -106,7 +106,9 @@ class Log:
         if self.groups is not None:
             head += f", {len(np.unique(self.groups))} motions"
         names = ", ".join(column_names(self, "q"))
-        values = f"{self.q.min():.4g} to {self.q.max():.4g} {self.units['q']}"
+        values = "no commands"
+        if self.q.size:
+            values = f"{self.q.min():.4g} to {self.q.max():.4g} {self.units['q']}"
         lines = [
             head,
             f"{self.q.shape[1]} actuators: {names}; {values}",
@@ -229,6 +231,7 @@ def load_log(
     q : sequence of str
         Columns of the actuator vector, in the order of the robot model. In an npz file an array
         (N,) is a column; ``"name[2]"`` is column 2 of an array (N, k), ``"name"`` all its columns.
+        Empty: a recording of a camera alone.
     x : sequence of 3 str, or of 3 K
         Columns of the tip position, or of the positions of K markers, the last of which is the tip.
         A row without some markers is kept, with NaN for these.
@@ -359,7 +362,9 @@ class _Columns(NamedTuple):
         labels: Mapping[str, str | None],
     ) -> Self:
         """Return the names as the table has them."""
-        of_q = table.names("q", q)
+        of_q = []
+        if not isinstance(q, (list, tuple)) or q:
+            of_q = table.names("q", q)
         of_x = table.names("x", x)
         if len(of_x) % 3:
             raise ValueError(
@@ -475,6 +480,8 @@ def _converted(
 
 def _warn_of_millimetres(name: str, column: NDArray, unit: str) -> None:
     """Warn if metres are declared but values (N, k) look like millimetres."""
+    if not column.size:
+        return
     span = (np.nanmax(column, axis=0) - np.nanmin(column, axis=0)).max()
     middle = np.nanmedian(np.abs(column))
     if unit == "m" and (middle > 10 or span > 5):
