@@ -24,6 +24,7 @@ _FACTORS = np.array([0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0])
 _ROUNDS = 4
 _LEAST_NOISE = 1e-5  # relative to the spread of the tips
 _COMMON = 0.5  # prior correlation of the weights of two actuators
+_BLOCK = 5_000_000  # largest number of entries that creep follows at once
 _MOST_LATE = 0.95  # largest share of a change that comes late
 _LEAST_GAIN = 1e-6  # of creep
 
@@ -96,21 +97,30 @@ class HysteresisProblem:
         rows = log.q[order.order]
         steps = order.steps(log.time)
         counted = np.argsort(order.order)[log.rows]
-        shape = (len(counted), len(self.times), len(self.widths), rows.shape[1])
-        changes = np.empty((shape[0], *shape[2:]))
-        late = np.empty(shape)
+        n = rows.shape[1]
+        n_changes = len(self.widths)
+        changes = np.empty((len(counted), n_changes, n))
+        late = np.empty((len(counted), len(self.times), n_changes, n))
+        at_once = max(1, _BLOCK // rows.size)
+        block: list[NDArray] = []
         play = PlayOperator(self.widths[0]).followed(rows, steps)
-        for k in range(len(self.widths)):
+        for k in range(n_changes):
             wider = np.zeros_like(
                 play
             )  # what is left of the widest one is the last change
-            if k + 1 < len(self.widths):
+            if k + 1 < n_changes:
                 wider = PlayOperator(self.widths[k + 1]).followed(rows, steps)
-            change = play - wider
+            block.append(play - wider)
             play = wider
-            changes[:, k] = change[counted]
+            changes[:, k] = block[-1][counted]
+            if len(block) < at_once and k + 1 < n_changes:
+                continue
+            side_by_side = np.concatenate(block, axis=1)
             for j, time in enumerate(self.times):
-                late[:, j, k] = self._late(change, steps, time)[counted]
+                of_block = self._late(side_by_side, steps, time)[counted]
+                part = late[:, j, k + 1 - len(block) : k + 1]
+                part[:] = of_block.reshape(part.shape)
+            block.clear()
         return changes, late
 
     def _late(self, change: NDArray, steps: NDArray, time: float) -> NDArray:

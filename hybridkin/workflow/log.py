@@ -14,8 +14,6 @@ from typing_extensions import Self
 from hybridkin._core.commands import Commands
 from hybridkin._core.runs import RunOrder
 from hybridkin._core.units import LogUnit
-from hybridkin.calibration.hysteresis_log import needed_rows
-from hybridkin.calibration.measured import thinned
 from hybridkin.chains import robots
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
@@ -141,6 +139,9 @@ class MeasuredLog(Log):
         """
         counts = np.zeros(len(self.q))
         counts[rows] = 1.0
+        # Reading a description loads no calibration.
+        from hybridkin.calibration.hysteresis_log import needed_rows
+
         needed = needed_rows(self.commands.run_of_rows, rows)
         return replace(self, counts=counts).rows(needed)
 
@@ -153,6 +154,8 @@ class MeasuredLog(Log):
         """
         if max_rows is None or len(self.q) <= max_rows:
             return self
+        from hybridkin.calibration.measured import thinned
+
         rows = thinned(self.motions, max_rows)
         return self.counting(rows) if self.named else self.rows(rows)
 
