@@ -132,6 +132,16 @@ CALIBRATE = {
 }
 
 
+RECORDING = FOLDER / "recording.csv"
+np.savetxt(
+    RECORDING,
+    np.column_stack([np.arange(24.0), X, GROUPS]),
+    delimiter=",",
+    header="t,x,y,z,g",
+    comments="",
+)
+
+
 READ = {
     **{"q_unit": "m", "x_unit": "m", "q_sign": 1, "delimiter": None, "drop_invalid": False},
     **{"header_line": None, "decimal": ".", "missing": ()},
@@ -270,6 +280,31 @@ ENTRIES = {
     "datasets.load_log": (
         datasets.load_log,
         {"path": CSV, **NAMES, "groups": "g", "time": None, **READ},
+    ),
+    "datasets.TimedColumns": (
+        datasets.TimedColumns,
+        {"values": Q, "time": np.arange(24.0), "groups": GROUPS},
+    ),
+    "datasets.read_columns": (
+        datasets.read_columns,
+        {
+            **{
+                "path": RECORDING,
+                "names": ["x", "y", "z"],
+                "time": "t",
+                "unit": "mm",
+                "sign": [1, 1, -1],
+            },
+            **{"groups": "g", "delimiter": None},
+        },
+    ),
+    "datasets.merge_logs": (
+        datasets.merge_logs,
+        {
+            "motors": datasets.TimedColumns(Q, np.arange(24.0)),
+            "camera": datasets.TimedColumns(X, np.arange(24.0)),
+            **{"lag": 0.5, "tolerance": 2.0, "hold": False},
+        },
     ),
     "datasets.check_log": (
         lambda q, x, groups, time, **k: str(

@@ -9,6 +9,7 @@ import torch
 from sklearn.utils import Bunch
 
 from hybridkin import calibrate, robots
+from hybridkin._core.units import LogUnit
 from hybridkin.calibration.measured import distance
 from hybridkin.datasets import paper_split
 from hybridkin.workflow.calibrated import (
@@ -59,7 +60,7 @@ def identifiability(data: Bunch, split: int = 0) -> dict[str, Any]:
         with torch.no_grad():
             tips = result.chain(torch.from_numpy(data.q[test])).numpy()
         errors = distance(tips, data.x[test])
-        entries = calibrated_parameters(chain, result)
+        entries = calibrated_parameters(chain, result, LogUnit.of("m"))
         found[label] = {"parameters": names, "entries": entries, "rmse": result.rmse}
         found[label] |= {"test": errors.mean(), "test_max": errors.max()}
         found[label]["unidentified"] = result.unidentified

@@ -143,6 +143,12 @@ _ROWS: list[tuple[str, str, str, _Test]] = [
         _many(_many(_is_number, 5)),
     ),
     ("log", "q_unit groups runs time", *_TEXT),
+    (
+        "log",
+        "unwrap",
+        "be true or false, a positive period, or a table of columns and their periods",
+        lambda v: isinstance(v, (bool, dict)) or _is_positive(v),
+    ),
     ("log", "group_suffix", "be text", lambda value: isinstance(value, str)),
     ("log", "x_unit", *_among(*METRES)),
     ("log", "header_line", *_WHOLE),

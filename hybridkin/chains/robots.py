@@ -73,6 +73,8 @@ class LogFormat:
         -1 if the log counts a pulled (shortened) tendon as positive.
     group_suffix : str
         A motion whose name ends in this suffix belongs to the motion named without it.
+    unwrap : bool, float or mapping of str to float
+        Periods of encoders to correct, see `datasets.load_log`.
     groups, runs, time : str or None
         Columns of the motion of each row, of its run (see `Commands`), and of its time stamp [s].
     header_line, decimal, missing
@@ -89,6 +91,7 @@ class LogFormat:
     groups: str | None = None
     time: str | None = None
     runs: str | None = None
+    unwrap: bool | float | Mapping[str, float] = False
     header_line: int | None = None
     decimal: str = "."
     missing: tuple[float, ...] = ()

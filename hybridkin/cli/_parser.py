@@ -28,6 +28,7 @@ from hybridkin.cli._values import (
     play,
     positive,
     share,
+    signs,
     start,
 )
 
@@ -637,12 +638,11 @@ def _add_log(command: argparse.ArgumentParser) -> None:
     add("--x", type=names, metavar="X,Y,Z", help="columns of the tip")
     add("--q-unit", choices=UNITS, help="unit of the actuators")
     add("--x-unit", choices=METRES, help="unit of the tip")
-    add(
-        "--q-sign",
-        type=int,
-        choices=(1, -1),
-        help="-1: a pulled tendon counts as positive",
-    )
+    pulled = "-1: a pulled tendon counts as positive; one, or one for each actuator"
+    add("--q-sign", type=signs, metavar="SIGN", help=pulled)
+    wraps = "correct encoders that wrap, lose turns, or read whole turns off; the period, such as "
+    wraps += "4096 or 360 (without: usual ones)"
+    add("--unwrap", type=positive, nargs="?", const=True, metavar="PERIOD", help=wraps)
     add(
         "--groups",
         metavar="COLUMN",

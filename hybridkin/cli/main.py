@@ -533,7 +533,7 @@ def _read(
     )
 
 
-_COLUMNS = ("q", "x", "q_unit", "x_unit", "q_sign", "groups", "runs", "time")
+_COLUMNS = ("q", "x", "q_unit", "x_unit", "q_sign", "groups", "runs", "time", "unwrap")
 _FORM = ("header_line", "decimal", "missing")
 
 

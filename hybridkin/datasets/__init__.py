@@ -7,6 +7,12 @@ from hybridkin.datasets._log_checks import LogFinding, LogReport, check_log
 from hybridkin.datasets._logs import Log, load_log, log_columns
 
 if TYPE_CHECKING:
+    from hybridkin.datasets._merged import (
+        Merged,
+        TimedColumns,
+        merge_logs,
+        read_columns,
+    )
     from hybridkin.datasets._recordings import (
         load_armlab,
         load_asl_trunk,
@@ -21,6 +27,8 @@ __all__ = [
     "Log",
     "LogFinding",
     "LogReport",
+    "Merged",
+    "TimedColumns",
     "check_log",
     "load_armlab",
     "load_asl_trunk",
@@ -30,12 +38,15 @@ __all__ = [
     "load_soromox_tentacle",
     "load_trunk",
     "log_columns",
+    "merge_logs",
     "paper_split",
+    "read_columns",
     "repeatability",
 ]
 
-# Their results are Bunches of scikit-learn.
+# Some results are Bunches of scikit-learn; a merge needs scipy.
 _NAMES_OF = {
+    "_merged": ("Merged", "TimedColumns", "merge_logs", "read_columns"),
     "_recordings": (
         "load_armlab",
         "load_asl_trunk",

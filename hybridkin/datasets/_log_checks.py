@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from hybridkin._core.arrays import countable
 from hybridkin.datasets._log_columns import COLUMN_CHECKS, LogRows
+from hybridkin.datasets._log_encoders import encoder_findings
 from hybridkin.datasets._log_geometry import geometry_findings
 from hybridkin.datasets._log_missing import missing_values
 from hybridkin.datasets._log_report import (
@@ -36,14 +37,16 @@ def check_log(
 ) -> LogReport:
     """Return possible errors of a log: sensors, rows, times, motions, units and signs.
 
-    The check looks for NaN and infinite rows, numbers that stand for missing values, a frozen
-    sensor of the tip or of an actuator while the rest moves, columns that never change, rows that
-    occur twice, jumps of the tip, gaps in time and decreasing times, columns with the same values,
-    a tip that lags or drifts, and too few motions for held-out errors. With a chain it also looks
-    for wrong units, a wrong order or sign of the columns of q, actuators numbered in the other
-    direction, rotated or left-handed axes of the tip, radii that are far off, and an offset or a
-    drift of one actuator. Rows must be in order of time. With several markers, the last one, the
-    tip, is checked in the rows that have it.
+    The check looks for NaN and infinite rows, numbers that stand for missing values, a
+    frozen sensor of the tip or of an actuator while the rest moves, columns that never change, rows
+    that occur twice, jumps of the tip, gaps in time and decreasing times, columns with the same
+    values, a tip that lags or drifts, and too few motions for held-out errors; in columns of motors
+    also encoders that wrap, lose turns, or have single readings whole turns off.
+
+    With a chain it also looks for wrong units, a wrong order or sign
+    of the columns of q, actuators numbered in the other direction, rotated or left-handed axes of
+    the tip, radii that are far off, and an offset or a drift of one actuator. Rows must be in order
+    of time. With several markers, the last one, the tip, is checked in the rows that have it.
 
     Parameters
     ----------
@@ -99,11 +102,15 @@ def check_log(
     if valid.any():
         columns = columns[valid]
         rows = LogRows(log.rows(valid), np.flatnonzero(valid))
+        of_encoders = [*encoder_findings(rows)]
+        findings += of_encoders
         for check in COLUMN_CHECKS:
             findings += check(rows)
+        if of_encoders:
+            chain = None  # readings that are turns off look like wrong orders, signs and units
         if chain is not None and chain.takes_lengths:
             findings += geometry_findings(rows.log, chain, base_is_free)
-        if not any(finding.kind in MISREAD for finding in findings):
+        if not any(finding.kind in (*MISREAD, "encoder") for finding in findings):
             findings += residual_findings(rows.log, chain, rows.same_motion)
     findings.sort(key=lambda finding: SEVERITIES.index(finding.severity))
     ranges = np.stack([columns.min(axis=0), columns.max(axis=0)], axis=1)

@@ -17,8 +17,12 @@ from hybridkin.datasets._logs import Log, column_names
 _FROZEN_ROWS = 3  # fewer rows may be chance
 _FROZEN_WAY = 0.1  # part of an actuator's range over which the tip must have moved
 _OFTEN_STILL = 0.2  # part of the rows: a coordinate that rests so often is no sensor
+_ABRUPT = (
+    3.0  # least change before or after a rest that is no rounding, in smallest changes
+)
 _RESTS = 0.05  # the same for an actuator, elsewhere
 _JUMP = 3.0  # relative to the 90 % quantile of the steps
+_MANY_ROWS = 1000  # of longer logs chance gives larger jumps
 _GAP = 10.0  # relative to the median time step
 _FEW_MOTIONS = 5
 _FEW_ROWS = 30
@@ -131,7 +135,8 @@ def frozen_actuator(rows: LogRows) -> Iterator[LogFinding]:
     x = rows.log.x
     tip_range = np.linalg.norm(np.ptp(x, axis=0))
     for name, column in rows.columns("q"):
-        still = np.diff(column) == 0
+        steps = np.abs(np.diff(column))
+        still = steps == 0
         periods = [(a, b) for a, b in _still_periods(still) if b - a >= _FROZEN_ROWS]
         if len(periods) != 1:
             continue
@@ -141,7 +146,10 @@ def frozen_actuator(rows: LogRows) -> Iterator[LogFinding]:
         often = still.sum() - n_still >= _RESTS * len(still)
         mostly = n_still >= 0.5 * len(still)
         value_recurs = (column == column[first]).sum() > n_still + 2
-        if often or mostly or value_recurs or way <= _FROZEN_WAY * tip_range:
+        beside = steps[[max(first - 1, 0), min(last, len(steps) - 1)]].max()
+        # What turns around slowly rests by rounding; a frozen sensor stops, or jumps, at once.
+        slow = beside < _ABRUPT * steps[steps > 0].min(initial=np.inf)
+        if often or mostly or value_recurs or slow or way <= _FROZEN_WAY * tip_range:
             continue
         frozen = np.arange(first, last + 1)
         message = (
@@ -265,7 +273,8 @@ def jumps(rows: LogRows) -> Iterator[LogFinding]:
     if not within.any():
         within = np.ones_like(within)
     ratio = dx / np.maximum(dq + np.median(dq[within]), np.finfo(float).tiny)
-    steps = np.flatnonzero(ratio > _JUMP * np.quantile(ratio[dx > 0], 0.9))
+    chance = np.sqrt(max(1.0, np.log(n_rows) / np.log(_MANY_ROWS)))
+    steps = np.flatnonzero(ratio > chance * _JUMP * np.quantile(ratio[dx > 0], 0.9))
     if 0 < len(steps) <= 0.1 * n_rows:
         message = (
             f"the tip jumps by up to {1e3 * dx[steps].max():.4g} mm, far more than the actuators "

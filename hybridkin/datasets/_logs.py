@@ -23,9 +23,10 @@ from hybridkin._core.arrays import (
 from hybridkin._core.commands import Commands
 from hybridkin._core.text_rows import TextForm
 from hybridkin._core.units import METRES, UNITS
+from hybridkin.datasets._encoders import given_periods, unwrapped
 from hybridkin.datasets._frames import frame_table
 from hybridkin.datasets._log_report import named_rows
-from hybridkin.datasets._tables import UNNAMED, Table
+from hybridkin.datasets._tables import UNNAMED, Table, without_missing
 from hybridkin.datasets.table_files import read_table
 
 
@@ -129,6 +130,7 @@ class Log:
         q_sign: ArrayLike = 1,
         missing: ArrayLike = (),
         drop_invalid: bool = False,
+        unwrap: bool | float | Mapping[str, float] = False,
     ) -> Log:
         """Return the log in a data frame, as `load_log` from a file.
 
@@ -136,7 +138,7 @@ class Log:
         ----------
         df : data frame
             A frame of pandas, polars, modin or narwhals, or a table of pyarrow. Null is missing.
-        q, x, groups, runs, time, q_unit, x_unit, q_sign, missing, drop_invalid
+        q, x, groups, runs, time, q_unit, x_unit, q_sign, missing, drop_invalid, unwrap
             As for `load_log`.
 
         Returns
@@ -162,7 +164,7 @@ class Log:
         """
         table = frame_table(df, "data frame")
         columns = _Columns.of(table, q, x, time, {"groups": groups, "runs": runs})
-        conversion = _Conversion(q_unit, x_unit, q_sign, missing)
+        conversion = _Conversion(q_unit, x_unit, q_sign, missing, unwrap)
         return _converted(table, columns, conversion, drop_invalid)
 
     @property
@@ -204,6 +206,7 @@ def load_log(
     decimal: str = ".",
     missing: ArrayLike = (),
     drop_invalid: bool = False,
+    unwrap: bool | float | Mapping[str, float] = False,
 ) -> Log:
     r"""Return actuator vectors and tip positions from a log: a CSV, npz or parquet file.
 
@@ -251,6 +254,12 @@ def load_log(
     drop_invalid : bool, default=False
         Leave out rows with a missing, NaN or infinite value, or without the name of their motion,
         instead of raising an error.
+    unwrap : bool, float or mapping of str to float, default=False
+        Correct encoders: readings that start again after a period, turns that are lost from some
+        row on, and single readings that are whole periods off. The period of the encoders in the
+        unit of the file, such as 4096 or 360; a mapping gives those of some columns. True: usual
+        periods are tried, and only what the tips confirm is corrected. A column is corrected up
+        to a constant number of periods. The rows of a run must be in order of time.
 
     Returns
     -------
@@ -292,7 +301,7 @@ def load_log(
     """
     table = read_table(as_path(path), TextForm(delimiter, header_line, decimal))
     columns = _Columns.of(table, q, x, time, {"groups": groups, "runs": runs})
-    conversion = _Conversion(q_unit, x_unit, q_sign, missing)
+    conversion = _Conversion(q_unit, x_unit, q_sign, missing, unwrap)
     return _converted(table, columns, conversion, drop_invalid)
 
 
@@ -357,24 +366,12 @@ class _Conversion(NamedTuple):
     x_unit: str
     q_sign: ArrayLike
     missing: ArrayLike
+    unwrap: bool | float | Mapping[str, float]
 
     @property
     def unit_of_q(self) -> str:
         """The unit of the actuator columns."""
         return "1" if self.q_unit == "counts" else self.q_unit
-
-    def without_missing(self, commands: NDArray, tips: NDArray) -> None:
-        """Set the missing values among commands (N, n) and tips (N, 3 K) to NaN, in place.
-
-        Zeros are missing only where all three coordinates of a marker are zero.
-        """
-        missing = real_array(self.missing, "missing").ravel()
-        values = missing[missing != 0.0]
-        commands[np.isin(commands, values)] = np.nan
-        tips[np.isin(tips, values)] = np.nan
-        if len(values) < len(missing):
-            markers = tips.reshape(len(tips), -1, 3)
-            markers[(markers == 0.0).all(axis=2)] = np.nan
 
 
 def _converted(
@@ -385,8 +382,8 @@ def _converted(
     x_unit = conversion.x_unit
     n = len(columns.q)
     factor = _checked_factor(n, q_unit, x_unit, conversion.q_sign)
-    table.check_unit("q", columns.q, q_unit)
-    table.check_unit("x", columns.x, x_unit)
+    table.check_unit("q_unit", columns.q, q_unit)
+    table.check_unit("x_unit", columns.x, x_unit)
     values = table.values([*columns.q, *columns.x, *columns.times], columns.times)
     labelled = {
         argument: table.labels(argument, name, len(values))
@@ -395,7 +392,8 @@ def _converted(
     commands = values[:, :n]
     tips = values[:, n : n + len(columns.x)]
     times = values[:, n + len(columns.x) :]
-    conversion.without_missing(commands, tips)
+    without_missing(commands, conversion.missing, zeros=False)
+    without_missing(tips, conversion.missing)
     complete = countable(tips).reshape(len(tips), -1, 3).all(axis=2)
     tips = np.where(complete.repeat(3, axis=1), tips, np.nan)
     valid = countable(commands).all(axis=1) & complete.any(axis=1)
@@ -415,6 +413,12 @@ def _converted(
         )
     commands = commands[valid]
     tips = tips[valid]
+    labelled = {argument: names[valid] for argument, names in labelled.items()}
+    periods = given_periods(conversion.unwrap, columns.q, q_unit)
+    if any(periods):
+        commands = unwrapped(
+            commands, tips[:, -3:], _same_run(labelled, len(tips)), periods
+        )
     _warn_of_millimetres("q", commands, q_unit)
     _warn_of_millimetres("x", tips, x_unit)
     si_unit = q_unit if q_unit == "1" else "rad"
@@ -432,8 +436,16 @@ def _converted(
         units={"q": si_unit, "x": "m"},
         file_units={"q": q_unit, "x": x_unit},
         source=str(table.source),
-        **{argument: names[valid] for argument, names in labelled.items()},
+        **labelled,
     )
+
+
+def _same_run(labelled: Mapping[str, NDArray], n_rows: int) -> NDArray:
+    """Return whether each row and the next belong to one run, else motion, shape (n_rows - 1,)."""
+    same = np.ones(n_rows - 1, dtype=bool)
+    for labels_of_rows in labelled.values():  # those of runs come last
+        same = labels_of_rows[1:] == labels_of_rows[:-1]
+    return same
 
 
 def _warn_of_millimetres(name: str, column: NDArray, unit: str) -> None:

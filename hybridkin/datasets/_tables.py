@@ -10,8 +10,9 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from hybridkin._core.arrays import real_array
 from hybridkin._core.text_rows import cell_advice, number_of
 from hybridkin._core.texts import csv_cell
 
@@ -127,9 +128,8 @@ class Table(NamedTuple):
             stated = self.units.get(name, unit)
             if stated != unit:
                 raise ValueError(
-                    f"`{argument}_unit` must be {stated!r} for column {name!r}, as "
-                    f"{self.statement} in {str(self.source)!r}, got {unit!r}; give "
-                    f"{argument}_unit={stated!r} (--{argument}-unit {stated})."
+                    f"`{argument}` must be {stated!r} for column {name!r}, as {self.statement} in "
+                    f"{str(self.source)!r}, got {unit!r}; give {argument}={stated!r}."
                 )
 
     def values(self, names: list[str], times: Sequence[str]) -> NDArray:
@@ -160,6 +160,21 @@ class Table(NamedTuple):
                 f"{longest} characters; check the file."
             )
         return np.array(labels)
+
+
+def without_missing(values: NDArray, missing: ArrayLike, zeros: bool = True) -> None:
+    """Set the missing values among columns (N, k) to NaN, in place.
+
+    Zeros are missing only where all three coordinates of a marker are zero, and not without
+    `zeros`.
+    """
+    numbers = real_array(missing, "missing").ravel()
+    values[np.isin(values, numbers[numbers != 0.0])] = np.nan
+    if zeros and (numbers == 0.0).any():
+        width = 3 if values.shape[1] % 3 == 0 else values.shape[1]
+        markers = values.reshape(len(values), -1, width)
+        lost = (markers == 0.0).all(axis=2)
+        values[lost.repeat(width, axis=1)] = np.nan
 
 
 def _of_objects(values: NDArray) -> NDArray:

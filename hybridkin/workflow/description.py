@@ -36,7 +36,7 @@ class Description:
     auto : dict or None
         The choices of "auto", see ``HybridForwardModel.cv_results_``.
     play : list of float or None
-        Width of the hysteresis of every actuator, in the unit of the robot's logs.
+        Widths of the hysteresis of one or all actuators, in the unit of the robot's logs.
     domain : Limits or None
         Training range.
     log_format : LogFormat

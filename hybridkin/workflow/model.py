@@ -16,7 +16,7 @@ from hybridkin._core.commands import Commands
 from hybridkin._core.digests import row_digests
 from hybridkin._core.directions import in_terms
 from hybridkin._core.model import ForwardModel, as_forward_model
-from hybridkin._core.units import LogUnit
+from hybridkin._core.units import UNITS, LogUnit
 from hybridkin.chains import robots
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
@@ -123,11 +123,11 @@ class LoadedModel:
 
     @property
     def play_widths(self) -> list[float] | None:
-        """Width of the hysteresis of every actuator, in the unit of the logs; None without."""
+        """Widths of the hysteresis of one or all actuators, in the unit of logs; None without."""
         if self.play is None:
             return None
-        size = np.abs(self.log_format().q_factor)
-        return (self.play.width / size + np.zeros(self.n_actuators)).tolist()
+        size = UNITS.get(self.log_format().q_unit, 1.0)
+        return np.ravel(self.play.width / size).tolist()
 
     def effective(self, commands: ArrayLike | Commands) -> NDArray:
         """Return what the actuators do for commands (N, n)."""

@@ -79,7 +79,7 @@ class TrackRecord:
     backend : str
         What computed the steps: "compiled", or "torch: " and the reason.
     play : list of float or None
-        Width of the hysteresis of every actuator, in the unit of the robot's logs.
+        Widths of the hysteresis of one or all actuators, in the unit of the robot's logs.
     lead_in : int
         Number of rows that lead from the robot's configuration to the path.
     limits : PathLimits

@@ -282,7 +282,7 @@ def test_code_and_trackers_tell_unit_sign_and_backlash_of_q(playful, tmp_path, c
     for text in (printed, *((out / name).read_text() for name in ("README.md", "robot.h"))):
         text = " ".join(text.split())
         assert f"log in mm: q[0] = -0.001 * {COLUMNS[0]}, q[1] = -0.001 * {COLUMNS[1]}" in text
-        assert "hysteresis (play) of a width of 0.0004" in text
+        assert "have backlash of 0.4 mm: x(q)" in " ".join(text.split())
     assert "what the actuators do" in (out / "robot.h").read_text()
     model = load_model(playful / "model.safetensors")
     ik = hybridkin.InverseKinematics(model, q_min=-0.005, q_max=0.005)
@@ -297,7 +297,7 @@ def test_track_with_play_tells_what_to_send_and_what_it_does(playful, tmp_path, 
     out = tmp_path / "track"
     shape = ["--shape", "figure-eight", "--size", "20,10", "--duration", "2", "--dt", "0.05"]
     code, record = document(capsys, "track", playful, *shape, "--out", out)
-    assert (code, record["play"]) == (0, [4e-4])
+    assert (code, record["play"]) == (0, [0.4])
     table = np.genfromtxt(out / "track.csv", delimiter=",", names=True, dtype=None, encoding=None)
     sent = -1e-3 * np.column_stack([table[name] for name in COLUMNS])
     does = -1e-3 * np.column_stack([table[f"effective_{name}"] for name in COLUMNS])
@@ -313,4 +313,4 @@ def test_track_with_play_tells_what_to_send_and_what_it_does(playful, tmp_path, 
     target = 1e-3 * np.column_stack([table["target_" + axis] for axis in "xyz"])
     model = load_model(playful / "model.safetensors")
     assert np.linalg.norm(model.predict(sent) - target, axis=1).max() < 1e-4
-    assert "The actuators have backlash 0.4 mm." in run(capsys, "describe", playful)[1]
+    assert "The actuators have backlash of 0.4 mm." in run(capsys, "describe", playful)[1]

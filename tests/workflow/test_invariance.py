@@ -174,7 +174,7 @@ def test_commands_exceed_the_limits_by_half_the_backlash_in_any_unit(tmp_path):
         described = Domain(model, workflow.path_limits(model, within_fit=False)).of_commands
         ends = np.sort([described[0] * gains, described[1] * gains], axis=0)
         assert_allclose(ends, [LIMITS.q_min, LIMITS.q_max], rtol=1e-9)
-        of_log = width / np.abs(gains)
+        of_log = np.ravel(model.play.width)
         if gains is GAINS:
             of_log = np.degrees(of_log)
         assert_allclose(model.play_widths, of_log, rtol=1e-12)

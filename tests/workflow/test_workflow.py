@@ -81,7 +81,7 @@ def test_play_lowers_the_errors_of_auto_on_held_out_motions(playful):
     compared = compare_by_group(log, robot, settings, fitted, n_jobs=1)
     errors, choices = compared.errors, compared.choices
     assert errors["hybrid, auto"].mean() < 0.1 * errors["mechanical, calibrated"].mean()
-    assert all(choice["hybrid, auto"].endswith("backlash 0.4 mm") for choice in choices)
+    assert all(choice["hybrid, auto"].endswith("backlash of 0.4 mm") for choice in choices)
 
 
 @pytest.mark.slow

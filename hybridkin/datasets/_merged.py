@@ -1,0 +1,570 @@
+"""One log from two recordings: commands by the motors, tips by the camera, merged by time."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import minimize_scalar
+
+from hybridkin._core.arrays import (
+    as_path,
+    check_shape,
+    countable,
+    labels,
+    number,
+    one_of,
+    real_array,
+)
+from hybridkin._core.text_rows import TextForm
+from hybridkin._core.units import METRES, UNITS
+from hybridkin.datasets._encoders import _features as rough_features
+from hybridkin.datasets._log_report import named_rows
+from hybridkin.datasets._logs import Log
+from hybridkin.datasets._tables import without_missing
+from hybridkin.datasets.table_files import read_table
+
+_GAP = 5.0  # usual periods of the motor rows: longer ones are gaps
+_CELLS = 2**14  # of the coarse search, at most
+_OVERLAP = 0.5  # of the shorter recording, at least
+_CANDIDATES = 6  # lags of the coarse search that are compared
+_SURE = 0.7  # least score of a candidate, relative to the best
+_ROWS = 2000  # camera rows that are compared, at most
+_FEATURES = 100  # of the rough model, at most
+_ROWS_PER_FEATURE = 5  # at least, for products of commands
+_WINDOWS = 30  # of the fine search, at most
+_PARTS = 10  # of a log, of which each is explained by the others
+_EXPLAINED = 0.5  # least share of the motion that the commands explain at the lag
+_RIVAL = 1.5  # least ratio of what the second best lag leaves to what the best leaves
+
+
+@dataclass(frozen=True, eq=False)
+class TimedColumns:
+    """Columns of one recording with the time of every row.
+
+    Attributes
+    ----------
+    values : ndarray of shape (N, k)
+        Values [m], [rad] or in the unit of the file; NaN where they are missing.
+    time : ndarray of shape (N,)
+        Times [s], increasing, by the clock of the recording.
+    names : tuple of str
+        Names of the columns.
+    unit : str
+        Unit of the values in the file.
+    groups : ndarray of shape (N,) or None
+        Motion of each row.
+    source : str
+        Source of the recording, for example its path.
+    """
+
+    values: NDArray
+    time: NDArray
+    names: Sequence[str] = ()
+    unit: str = "m"
+    groups: NDArray | None = None
+    source: str = "in memory"
+
+    def __post_init__(self) -> None:
+        values = real_array(self.values, "values").astype(float)
+        time = real_array(self.time, "time").astype(float)
+        check_shape(values, "values", ("N", "k"), "one row for each time")
+        check_shape(time, "time", [len(values)], "one for each row")
+        object.__setattr__(self, "values", values)
+        object.__setattr__(self, "time", time)
+        if self.groups is not None:
+            object.__setattr__(self, "groups", labels(self.groups, len(values)))
+        late = np.flatnonzero(~(np.diff(time) > 0.0)) + 1
+        if len(late) or not np.isfinite(time).all():
+            raise ValueError(
+                f"`time` of {self.source} must increase from row to row, but does not at "
+                f"{named_rows(late, 'row')}; sort the rows, leave out repeated ones, and merge "
+                "recordings whose clock starts again one by one."
+            )
+
+    def complete(self) -> TimedColumns:
+        """Return the rows without a missing value."""
+        kept = countable(self.values).all(axis=1)
+        groups = None if self.groups is None else self.groups[kept]
+        return TimedColumns(
+            self.values[kept],
+            self.time[kept],
+            self.names,
+            self.unit,
+            groups,
+            self.source,
+        )
+
+
+def read_columns(
+    path: str | os.PathLike[str],
+    names: Sequence[str],
+    *,
+    time: str,
+    unit: str = "m",
+    sign: ArrayLike = 1,
+    groups: str | None = None,
+    delimiter: str | None = None,
+    header_line: int | None = None,
+    decimal: str = ".",
+    missing: ArrayLike = (),
+) -> TimedColumns:
+    r"""Return columns of a recording that holds only commands, or only tips, with their times.
+
+    Parameters
+    ----------
+    path : path-like
+        A file as for `load_log`.
+    names : sequence of str
+        The columns.
+    time : str
+        Column of the time stamp [s].
+    unit : {"m", "cm", "mm", "um", "in", "rad", "deg", "1"}, default="m"
+        Unit of the columns; lengths become metres and angles radians.
+    sign : 1, -1 or sequence of them, default=1
+        Factor on the columns, as `q_sign` of `load_log`.
+    groups : str or None, default=None
+        Column that names the motion of a row.
+    delimiter, header_line, decimal, missing
+        As for `load_log`; the numbers of `missing` are NaN, zeros only where a whole row is zero.
+
+    Returns
+    -------
+    TimedColumns
+        In SI units. Rows without a time are left out; other missing values are NaN.
+
+    Raises
+    ------
+    ValueError
+        If a column is unknown, a cell is not a number, or the times do not increase.
+
+    Examples
+    --------
+    >>> import pathlib, tempfile
+    >>> from hybridkin.datasets import read_columns
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = pathlib.Path(folder) / "camera.csv"
+    ...     _ = path.write_text("t,X,Y,Z\n0.0,1,2,3\n0.1,1,2,4\n")
+    ...     read_columns(path, ["X", "Y", "Z"], time="t", unit="mm").values[1]
+    array([0.001, 0.002, 0.004])
+    """
+    one_of(unit, "unit", UNITS)
+    factor = np.multiply(real_array(sign, "sign"), UNITS[unit])
+    table = read_table(as_path(path), TextForm(delimiter, header_line, decimal))
+    columns = table.names("names", names)
+    table.check_unit("unit", columns, unit)
+    values = table.values([*columns, time], [time])
+    without_missing(values[:, :-1], missing)
+    timed = countable(values[:, -1])
+    motions = None
+    if groups is not None:
+        motions = table.labels("groups", groups, len(values))[timed]
+    return TimedColumns(
+        values[timed, :-1] * factor,
+        values[timed, -1],
+        tuple(columns),
+        unit,
+        motions,
+        str(path),
+    )
+
+
+class Merged(NamedTuple):
+    """A log merged from two recordings.
+
+    Attributes
+    ----------
+    log : Log
+        The camera rows with the command of their time; `time` is that of the motors.
+    lag : float
+        How much later than the clock of the motors that of the camera is [s].
+    explained : float
+        Share of the variance of the tips that a rough model of the commands explains at this lag,
+        in parts of the log that it was not fitted to.
+    is_estimated : bool
+        Whether the lag was estimated.
+    n_left_out : int
+        Number of camera rows without a tip, or without motor rows around them.
+    """
+
+    log: Log
+    lag: float
+    explained: float
+    is_estimated: bool
+    n_left_out: int
+
+    def __str__(self) -> str:
+        """Return the lag and the rows in words."""
+        how = "estimated from when both move" if self.is_estimated else "given"
+        n_rows = len(self.log.q)
+        return (
+            f"The camera's clock is {self.lag:.6g} s later than that of the motors ({how}); the "
+            f"commands then explain {self.explained:.1%} of the motion of the tip. {n_rows} of "
+            f"{n_rows + self.n_left_out} camera rows have a tip and commands around them."
+        )
+
+
+def merge_logs(
+    motors: TimedColumns,
+    camera: TimedColumns,
+    *,
+    lag: float | None = None,
+    tolerance: float | None = None,
+    hold: bool = False,
+) -> Merged:
+    """Return the log of a camera's tips with the motors' commands of the same time.
+
+    The lag between the two clocks is that at which the commands explain the tips best. It includes
+    the time that the robot takes to follow a command, so backlash and inertia make it longer.
+
+    Parameters
+    ----------
+    motors : TimedColumns
+        Commands or encoder readings, as from `read_columns`.
+    camera : TimedColumns
+        Tip positions [m], three columns for each marker, as from `read_columns`.
+    lag : float or None, default=None
+        How much later than the clock of the motors that of the camera is [s]; 0 if both share one.
+        None: it is estimated, to a small part of a period of the camera.
+    tolerance : float or None, default=None
+        Longest time between two motor rows of which a command is made [s]; camera rows in longer
+        gaps are left out. Default: 5 usual periods of the motor rows; with `hold`, no limit.
+    hold : bool, default=False
+        Whether a command holds until the next one, as in a log of set points. Default: commands are
+        linear between two rows.
+
+    Returns
+    -------
+    Merged
+        The log, the lag, and how well the two recordings fit each other. Without groups of the
+        motors, a new run starts after every gap.
+
+    Raises
+    ------
+    ValueError
+        If the camera has no three columns for each marker, no rows are left, or no lag is clearly
+        the best one: where nothing moves, or a motion repeats.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from hybridkin.datasets import TimedColumns, merge_logs
+    >>> def q(t):
+    ...     return np.stack([np.sin(t), np.sin(1.7 * t), np.sin(0.6 * t**1.2)], axis=1)
+    >>> t = np.arange(0, 20, 0.01)
+    >>> seen = np.arange(2, 15, 0.03)
+    >>> motors = TimedColumns(q(t), t)
+    >>> camera = TimedColumns(0.05 * q(seen) + 0.1, seen + 1234.5)
+    >>> round(merge_logs(motors, camera).lag, 3)
+    1234.5
+    """
+    for name, recording in (("motors", motors), ("camera", camera)):
+        if not isinstance(recording, TimedColumns):
+            raise TypeError(
+                f"`{name}` must be a recording as from `read_columns`, or `TimedColumns`, got "
+                f"{type(recording).__name__}."
+            )
+    if camera.values.shape[1] % 3:
+        raise ValueError(
+            "`camera` must have three columns for each marker, got "
+            f"{camera.values.shape[1]}: {list(camera.names)}."
+        )
+    commands = motors.complete()
+    tips = _measured(camera)
+    if len(commands.time) < 3 or len(tips.time) < 3:
+        raise ValueError(
+            "`motors` and `camera` must have at least 3 complete rows each, got "
+            f"{len(commands.time)} and {len(tips.time)}."
+        )
+    is_estimated = lag is None
+    if lag is None:
+        lag = _estimated_lag(commands, tips, hold)
+    else:
+        lag = number(lag, "lag")
+    time = tips.time - lag
+    kept, runs = _covered(commands, time, _longest_gap(commands, tolerance, hold))
+    if not kept.any():
+        raise ValueError(
+            f"No camera row lies between two motor rows: at the lag of {lag:.6g} s the camera "
+            f"records from {time[0]:.6g} to {time[-1]:.6g} s, the motors from "
+            f"{commands.time[0]:.6g} to {commands.time[-1]:.6g} s; give `lag`, or a larger "
+            "`tolerance`."
+        )
+    q = commands_at(commands, time[kept], hold)
+    x = tips.values[kept]
+    groups = commands.groups
+    if groups is not None:
+        groups = groups[_row_before(commands, time[kept])]
+    log = Log(
+        q,
+        x,
+        groups=groups,
+        time=time[kept],
+        runs=runs[kept],
+        q_names=motors.names,
+        x_names=camera.names,
+        units={"q": _si_unit(motors.unit), "x": "m"},
+        file_units={"q": motors.unit, "x": camera.unit},
+        source=f"{motors.source} and {camera.source}",
+    )
+    explained = _explained(q, x)
+    if is_estimated and explained < _EXPLAINED:
+        raise ValueError(
+            f"The lag between {motors.source} and {camera.source} is not clear: the commands "
+            f"explain at most {explained:.0%} of the motion of the tip, at {lag:.6g} s. Check that "
+            "both record the same motion, or give `lag` (0 if they share a clock)."
+        )
+    n_left_out = len(camera.time) - int(kept.sum())
+    return Merged(log, lag, explained, is_estimated, n_left_out)
+
+
+def commands_at(motors: TimedColumns, time: NDArray, hold: bool = False) -> NDArray:
+    """Return the commands (M, n) of other times (M,): linear between two rows, or held."""
+    if hold:
+        return motors.values[_row_before(motors, time)]
+    columns = [np.interp(time, motors.time, column) for column in motors.values.T]
+    return np.stack(columns, axis=1)
+
+
+def _measured(camera: TimedColumns) -> TimedColumns:
+    """Return the camera rows in which a marker is complete; other markers are NaN."""
+    markers = camera.values.reshape(len(camera.time), -1, 3)
+    complete = countable(markers).all(axis=2)
+    values = np.where(complete.repeat(3, axis=1), camera.values, np.nan)
+    kept = complete.any(axis=1)
+    return TimedColumns(
+        values[kept], camera.time[kept], camera.names, camera.unit, None, camera.source
+    )
+
+
+def _row_before(motors: TimedColumns, time: NDArray) -> NDArray:
+    """Return the motor rows (M,) at or before times; the first row for earlier times."""
+    return np.maximum(np.searchsorted(motors.time, time, side="right") - 1, 0)
+
+
+def _longest_gap(motors: TimedColumns, tolerance: float | None, hold: bool) -> float:
+    if tolerance is None:
+        return np.inf if hold else _GAP * float(np.median(np.diff(motors.time)))
+    if not number(tolerance, "tolerance") > 0.0:
+        raise ValueError(f"`tolerance` must be a positive time [s], got {tolerance!r}.")
+    return tolerance
+
+
+def _covered(
+    motors: TimedColumns, time: NDArray, longest: float
+) -> tuple[NDArray, NDArray]:
+    """Return which times lie between two motor rows of a motion, and their runs."""
+    is_gap = np.diff(motors.time) > longest
+    if motors.groups is not None:
+        is_gap |= motors.groups[1:] != motors.groups[:-1]
+    runs = np.concatenate([[0], np.cumsum(is_gap)])
+    row = _row_before(motors, time)
+    # The last row has none after it, but the camera may take a tip at the very same time.
+    in_gap = np.append(is_gap, False)[row] & (time > motors.time[row])
+    inside = (time >= motors.time[0]) & (time <= motors.time[-1])
+    return inside & ~in_gap, runs[row]
+
+
+def _si_unit(unit: str) -> str:
+    if unit in METRES:
+        return "m"
+    return unit if unit == "1" else "rad"
+
+
+def _estimated_lag(motors: TimedColumns, camera: TimedColumns, hold: bool) -> float:
+    """Return the lag [s] at which the commands explain the tips best."""
+    fits = []
+    for lag, width in _coarse_lags(motors, camera):
+        fits.append(_refined(motors, camera, lag, width, hold))
+    unexplained, lag, width = min(fits)
+    for other, other_lag, _ in fits:
+        if abs(other_lag - lag) > width and other < _RIVAL * unexplained:
+            raise ValueError(
+                f"The lag between {motors.source} and {camera.source} is not clear: lags of "
+                f"{lag:.6g} and {other_lag:.6g} s explain {1.0 - unexplained:.1%} and "
+                f"{1.0 - other:.1%} of the motion of the tip, as where a motion repeats. Give "
+                "`lag` (0 if they share a clock), or record a motion that does not repeat."
+            )
+    return lag
+
+
+def _coarse_lags(
+    motors: TimedColumns, camera: TimedColumns
+) -> list[tuple[float, float]]:
+    """Return lags [s] at which motors and camera move at the same times, and their accuracy.
+
+    The correlation of the speeds of both over every overlap of at least half the shorter recording.
+    """
+    duration = max(np.ptp(motors.time), np.ptp(camera.time))
+    step = max(2.0 * float(np.median(np.diff(camera.time))), duration / _CELLS)
+    q_speed = _speed(motors.values, motors.time, step)
+    x_speed = _speed(_tip(camera.values), camera.time, step)
+    score, shift = _correlation(x_speed, q_speed)
+    peaks = np.flatnonzero(
+        (score >= np.append(score[1:], -np.inf))
+        & (score > np.append(-np.inf, score[:-1]))
+    )
+    peaks = peaks[score[peaks] >= _SURE * score[peaks].max()]
+    best = peaks[np.argsort(-score[peaks])[:_CANDIDATES]]
+    start = camera.time[0] - motors.time[0]
+    return [(start - shift[k] * step, 2.0 * step) for k in best]
+
+
+def _tip(x: NDArray) -> NDArray:
+    """Return the positions (N, 3) of the last marker that is never or least often missing."""
+    markers = x.reshape(len(x), -1, 3)
+    n_known = np.isfinite(markers).all(axis=2).sum(axis=0)
+    last = len(n_known) - 1 - int(np.argmax(n_known[::-1]))
+    return markers[:, last]
+
+
+def _speed(values: NDArray, time: NDArray, step: float) -> NDArray:
+    """Return the root of the speed of rows in cells of equal time, columns by their range.
+
+    The root makes single outliers less heavy.
+    """
+    known = np.isfinite(values).all(axis=1)
+    values = values[known]
+    ranges = np.ptp(values, axis=0)
+    scaled = values / np.where(ranges > 0.0, ranges, 1.0)
+    steps = np.linalg.norm(np.diff(scaled, axis=0), axis=1)
+    way = np.concatenate([[0.0], np.cumsum(steps)])
+    edges = np.arange(time[0], time[-1] + step, step)
+    return np.sqrt(np.diff(np.interp(edges, time[known], way)))
+
+
+def _correlation(a: NDArray, b: NDArray) -> tuple[NDArray, NDArray]:
+    """Return how surely a (k,) follows b (m,), and at which shift of a by cells.
+
+    The score is the coefficient of correlation of the overlapping cells, times the root of their
+    number. The sums over all overlaps are products of Fourier transforms.
+    """
+    size = len(a) + len(b) - 1
+    length = 1 << (size - 1).bit_length()
+
+    def sums(of_a: NDArray, of_b: NDArray) -> NDArray:
+        product = np.fft.rfft(of_b, length) * np.conj(np.fft.rfft(of_a, length))
+        return np.roll(np.fft.irfft(product, length), len(a) - 1)[:size]
+
+    a = a - a.mean()
+    b = b - b.mean()
+    ones_a = np.ones(len(a))
+    ones_b = np.ones(len(b))
+    n = np.rint(sums(ones_a, ones_b)).clip(1.0)
+    sum_a = sums(a, ones_b)
+    sum_b = sums(ones_a, b)
+    covariance = sums(a, b) - sum_a * sum_b / n
+    least = 1e-9 * (np.square(a).sum() + np.square(b).sum()) + np.finfo(float).tiny
+    variance_a = np.maximum(sums(a**2, ones_b) - sum_a**2 / n, least)
+    variance_b = np.maximum(sums(ones_a, b**2) - sum_b**2 / n, least)
+    score = covariance / np.sqrt(variance_a * variance_b) * np.sqrt(n)
+    score[n < _OVERLAP * min(len(a), len(b))] = -np.inf
+    return score, np.arange(size) - (len(a) - 1)
+
+
+def _refined(
+    motors: TimedColumns, camera: TimedColumns, lag: float, width: float, hold: bool
+) -> tuple[float, float, float]:
+    """Return what the best lag nearby leaves unexplained, that lag, and the width of the search."""
+    cell = width / 8.0
+    for _ in range(_WINDOWS):
+        tips = _surely_covered(motors, camera, lag, width)
+        if not len(tips.time):
+            return np.inf, lag, width
+        lags = np.linspace(lag - width, lag + width, 17)
+        errors = [_left_at(seconds, motors, tips, hold) for seconds in lags]
+        best = int(np.argmin(errors))
+        lag = float(lags[best])
+        if 0 < best < len(lags) - 1:
+            break
+    tips = _surely_covered(motors, camera, lag, width)
+    if not len(tips.time):
+        return np.inf, lag, width
+    fit = minimize_scalar(
+        _left_at,
+        args=(motors, tips, hold),
+        bounds=(lag - cell, lag + cell),
+        method="bounded",
+        options={"xatol": 1e-3 * cell},
+    )
+    lag = float(fit.x)  # pyright: ignore[reportAttributeAccessIssue]
+    q = commands_at(motors, tips.time - lag, hold)
+    return 1.0 - _explained(q, tips.values), lag, width
+
+
+def _surely_covered(
+    motors: TimedColumns, camera: TimedColumns, lag: float, width: float
+) -> TimedColumns:
+    """Return some tips within the motor rows at every lag of a window; none if they are too short.
+
+    So every lag of a window is judged by the same rows.
+    """
+    tips = _tip(camera.values)
+    first = camera.time - lag - width
+    inside = (first >= motors.time[0]) & (first + 2.0 * width <= motors.time[-1])
+    rows = np.flatnonzero(inside & np.isfinite(tips).all(axis=1))
+    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), _ROWS)).astype(int)]
+    shortest = _OVERLAP * min(np.ptp(motors.time), np.ptp(camera.time)) - 2.0 * width
+    if len(rows) < 3 or np.ptp(camera.time[rows]) < shortest:
+        rows = rows[:0]
+    return TimedColumns(tips[rows], camera.time[rows])
+
+
+def _left_at(lag: float, motors: TimedColumns, tips: TimedColumns, hold: bool) -> float:
+    """Return the share of the variance of tips that the commands leave at a lag."""
+    return _unexplained(commands_at(motors, tips.time - lag, hold), tips.values)
+
+
+def _unexplained(q: NDArray, x: NDArray) -> float:
+    """Return the share of the variance of tips that a quadratic of the commands leaves."""
+    features = _features(q, squares=True)
+    weights = np.linalg.lstsq(features, x)[0]
+    n_free = max(len(x) - features.shape[1], 1)
+    left = np.square(x - features @ weights).sum() * len(x) / n_free
+    total = np.square(x - x.mean(axis=0)).sum()
+    return float(left / total) if total > 0.0 else 1.0
+
+
+def _explained(q: NDArray, x: NDArray) -> float:
+    """Return the share of the variance of tips that the commands explain in other parts of a log.
+
+    That of ten parts in a row, each from the other nine: a linear model, or a quadratic if that
+    explains more. Smooth motions that have nothing to do with each other agree within one part.
+    """
+    tips = _tip(x)
+    known = np.isfinite(tips).all(axis=1)
+    q = q[known]
+    tips = tips[known]
+    few = np.linspace(0, len(q) - 1, min(len(q), _ROWS)).astype(int)
+    q = q[few]
+    tips = tips[few]
+    total = np.square(tips - tips.mean(axis=0)).sum()
+    if not total > 0.0:
+        return 0.0
+    shares = []
+    for squares in (False, True):
+        features = _features(q, squares)
+        left = 0.0
+        for part in np.array_split(np.arange(len(q)), _PARTS):
+            others = np.delete(np.arange(len(q)), part)
+            weights = np.linalg.lstsq(features[others], tips[others])[0]
+            left += np.square(tips[part] - features[part] @ weights).sum()
+        shares.append(1.0 - float(left / total))
+    return max(*shares, 0.0)
+
+
+def _features(q: NDArray, squares: bool) -> NDArray:
+    """Return 1 and z of commands (N, n), z from -1 to 1; with `squares` also their products."""
+    n = q.shape[1]
+    features = rough_features(q, q)
+    if not squares:
+        return features[:, : 1 + n]
+    first, second = np.triu_indices(n, k=1)
+    if features.shape[1] + len(first) <= min(_FEATURES, len(q) / _ROWS_PER_FEATURE):
+        z = features[:, 1 : 1 + n]
+        features = np.hstack([features, z[:, first] * z[:, second]])
+    return features
