@@ -144,7 +144,7 @@ np.savetxt(
 
 READ = {
     **{"q_unit": "m", "x_unit": "m", "q_sign": 1, "delimiter": None, "drop_invalid": False},
-    **{"header_line": None, "decimal": ".", "missing": ()},
+    **{"header_line": None, "decimal": ".", "missing": (), "unwrap": False},
 }
 
 
@@ -295,7 +295,13 @@ ENTRIES = {
                 "unit": "mm",
                 "sign": [1, 1, -1],
             },
-            **{"groups": "g", "delimiter": None},
+            **{
+                "groups": "g",
+                "delimiter": None,
+                "header_line": None,
+                "decimal": ".",
+                "missing": (),
+            },
         },
     ),
     "datasets.merge_logs": (

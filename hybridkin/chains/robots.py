@@ -91,10 +91,10 @@ class LogFormat:
     groups: str | None = None
     time: str | None = None
     runs: str | None = None
-    unwrap: bool | float | Mapping[str, float] = False
     header_line: int | None = None
     decimal: str = "."
     missing: tuple[float, ...] = ()
+    unwrap: bool | float | Mapping[str, float] = False
 
     @property
     def q_factor(self) -> NDArray:
@@ -115,7 +115,13 @@ class LogFormat:
     def of_tracks(self, target: tuple[str, ...]) -> LogFormat:
         """Return the format of a track.csv, which has the columns of q and targets as tips."""
         return replace(
-            self, x=target, groups="status", header_line=None, decimal=".", missing=()
+            self,
+            x=target,
+            groups="status",
+            header_line=None,
+            decimal=".",
+            missing=(),
+            unwrap=False,
         )
 
     @property

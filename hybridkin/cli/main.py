@@ -533,8 +533,8 @@ def _read(
     )
 
 
-_COLUMNS = ("q", "x", "q_unit", "x_unit", "q_sign", "groups", "runs", "time", "unwrap")
-_FORM = ("header_line", "decimal", "missing")
+_COLUMNS = ("q", "x", "q_unit", "x_unit", "q_sign", "groups", "runs", "time")
+_FORM = ("header_line", "decimal", "missing", "unwrap")
 
 
 def _log_format(

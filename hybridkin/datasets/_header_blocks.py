@@ -23,6 +23,7 @@ _LENGTHS = {  # as Motive writes them
 }
 _AXES = ("X", "Y", "Z", "W")
 _AXIS = re.compile("([RT]?)([XYZW]'*)")  # of Vicon; X' is a speed
+_OF_BODY = re.compile(r"[XYZ]|Roll|Pitch|Yaw|Residual|Rot\[\d\]")  # of Qualisys
 _OF_BODIES = {"R": "rot "}
 
 
@@ -236,7 +237,7 @@ class Qualisys(HeaderBlock):
                     continue
             elif name.endswith(" X") and name[:-2] in objects:
                 body = name[:-2]
-            elif body and not any(name.startswith(f"{other} ") for other in objects):
+            elif body and _OF_BODY.fullmatch(name):
                 name = f"{body} {name}".strip()
             full.append(name)
         return full

@@ -37,16 +37,16 @@ def check_log(
 ) -> LogReport:
     """Return possible errors of a log: sensors, rows, times, motions, units and signs.
 
-    The check looks for NaN and infinite rows, numbers that stand for missing values, a
-    frozen sensor of the tip or of an actuator while the rest moves, columns that never change, rows
-    that occur twice, jumps of the tip, gaps in time and decreasing times, columns with the same
-    values, a tip that lags or drifts, and too few motions for held-out errors; in columns of motors
-    also encoders that wrap, lose turns, or have single readings whole turns off.
+    The check looks for NaN and infinite rows, numbers that stand for missing values, a frozen
+    sensor of the tip or of an actuator while the rest moves, columns that never change, rows that
+    occur twice, jumps of the tip, gaps in time and decreasing times, columns with the same values,
+    a tip that lags or drifts, and too few motions for held-out errors; in columns of motors also
+    encoders that wrap, lose turns, or have single readings whole turns off.
 
-    With a chain it also looks for wrong units, a wrong order or sign
-    of the columns of q, actuators numbered in the other direction, rotated or left-handed axes of
-    the tip, radii that are far off, and an offset or a drift of one actuator. Rows must be in order
-    of time. With several markers, the last one, the tip, is checked in the rows that have it.
+    With a chain it also looks for wrong units, a wrong order or sign of the columns of q, actuators
+    numbered in the other direction, rotated or left-handed axes of the tip, radii that are far off,
+    and an offset or a drift of one actuator. Rows must be in order of time. With several markers,
+    the last one, the tip, is checked in the rows that have it.
 
     Parameters
     ----------

@@ -129,8 +129,8 @@ class Log:
         x_unit: str = "m",
         q_sign: ArrayLike = 1,
         missing: ArrayLike = (),
-        drop_invalid: bool = False,
         unwrap: bool | float | Mapping[str, float] = False,
+        drop_invalid: bool = False,
     ) -> Log:
         """Return the log in a data frame, as `load_log` from a file.
 
@@ -138,7 +138,7 @@ class Log:
         ----------
         df : data frame
             A frame of pandas, polars, modin or narwhals, or a table of pyarrow. Null is missing.
-        q, x, groups, runs, time, q_unit, x_unit, q_sign, missing, drop_invalid, unwrap
+        q, x, groups, runs, time, q_unit, x_unit, q_sign, missing, unwrap, drop_invalid
             As for `load_log`.
 
         Returns
@@ -205,8 +205,8 @@ def load_log(
     header_line: int | None = None,
     decimal: str = ".",
     missing: ArrayLike = (),
-    drop_invalid: bool = False,
     unwrap: bool | float | Mapping[str, float] = False,
+    drop_invalid: bool = False,
 ) -> Log:
     r"""Return actuator vectors and tip positions from a log: a CSV, npz or parquet file.
 
@@ -251,15 +251,15 @@ def load_log(
     missing : sequence of float, default=()
         Numbers in q and x that stand for missing values, such as 9999.999, in the unit of the
         file. Zero means the 0, 0, 0 of a lost marker, not zeros elsewhere.
-    drop_invalid : bool, default=False
-        Leave out rows with a missing, NaN or infinite value, or without the name of their motion,
-        instead of raising an error.
     unwrap : bool, float or mapping of str to float, default=False
         Correct encoders: readings that start again after a period, turns that are lost from some
         row on, and single readings that are whole periods off. The period of the encoders in the
         unit of the file, such as 4096 or 360; a mapping gives those of some columns. True: usual
         periods are tried, and only what the tips confirm is corrected. A column is corrected up
         to a constant number of periods. The rows of a run must be in order of time.
+    drop_invalid : bool, default=False
+        Leave out rows with a missing, NaN or infinite value, or without the name of their motion,
+        instead of raising an error.
 
     Returns
     -------
@@ -360,7 +360,7 @@ class _Columns(NamedTuple):
 
 
 class _Conversion(NamedTuple):
-    """The units and signs of columns, and the numbers that stand for missing values."""
+    """The units and signs of columns, their missing values, and the periods of encoders."""
 
     q_unit: str
     x_unit: str
@@ -416,9 +416,8 @@ def _converted(
     labelled = {argument: names[valid] for argument, names in labelled.items()}
     periods = given_periods(conversion.unwrap, columns.q, q_unit)
     if any(periods):
-        commands = unwrapped(
-            commands, tips[:, -3:], _same_run(labelled, len(tips)), periods
-        )
+        same_run = _same_run(labelled, len(tips))
+        commands = unwrapped(commands, tips[:, -3:], same_run, periods)
     _warn_of_millimetres("q", commands, q_unit)
     _warn_of_millimetres("x", tips, x_unit)
     si_unit = q_unit if q_unit == "1" else "rad"

@@ -130,7 +130,7 @@ def read_columns(
     groups : str or None, default=None
         Column that names the motion of a row.
     delimiter, header_line, decimal, missing
-        As for `load_log`; the numbers of `missing` are NaN, zeros only where a whole row is zero.
+        As for `load_log`; zeros are missing only where a marker is at 0, 0, 0.
 
     Returns
     -------

@@ -128,8 +128,10 @@ class Table(NamedTuple):
             stated = self.units.get(name, unit)
             if stated != unit:
                 raise ValueError(
-                    f"`{argument}` must be {stated!r} for column {name!r}, as {self.statement} in "
-                    f"{str(self.source)!r}, got {unit!r}; give {argument}={stated!r}."
+                    f"`{argument}` must be {stated!r} for column {name!r}, as "
+                    f"{self.statement} in {str(self.source)!r}, got {unit!r}; give "
+                    f"{argument}={stated!r}, on the command line --{argument.replace('_', '-')} "
+                    f"{stated}."
                 )
 
     def values(self, names: list[str], times: Sequence[str]) -> NDArray:
@@ -170,11 +172,10 @@ def without_missing(values: NDArray, missing: ArrayLike, zeros: bool = True) -> 
     """
     numbers = real_array(missing, "missing").ravel()
     values[np.isin(values, numbers[numbers != 0.0])] = np.nan
-    if zeros and (numbers == 0.0).any():
-        width = 3 if values.shape[1] % 3 == 0 else values.shape[1]
-        markers = values.reshape(len(values), -1, width)
+    if zeros and (numbers == 0.0).any() and values.shape[1] % 3 == 0:
+        markers = values.reshape(len(values), -1, 3)
         lost = (markers == 0.0).all(axis=2)
-        values[lost.repeat(width, axis=1)] = np.nan
+        values[lost.repeat(3, axis=1)] = np.nan
 
 
 def _of_objects(values: NDArray) -> NDArray:
