@@ -62,6 +62,8 @@ class Table(NamedTuple):
         written = csv_cell(name).strip()  # as our own tables hold it
         if name not in self.header and written in self.header:
             name = written
+        if name not in self.header:
+            name = name.removeprefix("#").lstrip()  # before the header of a text file
         count = self.header.count(name)
         source = str(self.source)
         if count > 1:
