@@ -295,7 +295,13 @@ ENTRIES = {
                 "unit": "mm",
                 "sign": [1, 1, -1],
             },
-            **{"groups": "g", "delimiter": None, "header_line": None, "decimal": "."},
+            **{
+                "groups": "g",
+                "delimiter": None,
+                "header_line": None,
+                "decimal": ".",
+                "missing": (),
+            },
         },
     ),
     "datasets.merge_logs": (

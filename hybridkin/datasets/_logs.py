@@ -26,7 +26,7 @@ from hybridkin._core.units import METRES, UNITS, duration_in_words
 from hybridkin.datasets._encoders import given_periods, unwrapped
 from hybridkin.datasets._frames import frame_table
 from hybridkin.datasets._log_report import named_rows
-from hybridkin.datasets._tables import UNNAMED, Table
+from hybridkin.datasets._tables import UNNAMED, Table, without_missing
 from hybridkin.datasets._time import seconds_per_unit
 from hybridkin.datasets.table_files import read_table
 
@@ -394,19 +394,6 @@ class _Conversion(NamedTuple):
         """The unit of the actuator columns."""
         return "1" if self.q_unit == "counts" else self.q_unit
 
-    def without_missing(self, commands: NDArray, tips: NDArray) -> None:
-        """Set the missing values among commands (N, n) and tips (N, 3 K) to NaN, in place.
-
-        Zeros are missing only where all three coordinates of a marker are zero.
-        """
-        missing = real_array(self.missing, "missing").ravel()
-        values = missing[missing != 0.0]
-        commands[np.isin(commands, values)] = np.nan
-        tips[np.isin(tips, values)] = np.nan
-        if len(values) < len(missing):
-            markers = tips.reshape(len(tips), -1, 3)
-            markers[(markers == 0.0).all(axis=2)] = np.nan
-
 
 def _converted(
     table: Table, columns: _Columns, conversion: _Conversion, drop_invalid: bool
@@ -428,7 +415,8 @@ def _converted(
     commands = values[:, :n]
     tips = values[:, n : n + len(columns.x)]
     times = values[:, n + len(columns.x) :]
-    conversion.without_missing(commands, tips)
+    without_missing(commands, conversion.missing, zeros=False)
+    without_missing(tips, conversion.missing)
     complete = countable(tips).reshape(len(tips), -1, 3).all(axis=2)
     tips = np.where(complete.repeat(3, axis=1), tips, np.nan)
     valid = countable(commands).all(axis=1) & complete.any(axis=1)
@@ -448,14 +436,10 @@ def _converted(
         )
     commands = commands[valid]
     tips = tips[valid]
+    labelled = {argument: names[valid] for argument, names in labelled.items()}
     periods = given_periods(conversion.unwrap, columns.q, q_unit)
     if any(periods):
-        same_run = np.ones(len(commands) - 1, dtype=bool)
-        for (
-            labels_of_rows
-        ) in labelled.values():  # those of runs, if there are any, come last
-            names_of_rows = labels_of_rows[valid]
-            same_run = names_of_rows[1:] == names_of_rows[:-1]
+        same_run = _same_run(labelled, len(tips))
         commands = unwrapped(commands, tips[:, -3:], same_run, periods)
     _warn_of_millimetres("q", commands, q_unit)
     _warn_of_millimetres("x", tips, x_unit)
@@ -474,8 +458,16 @@ def _converted(
         units={"q": si_unit, "x": "m"},
         file_units={"q": q_unit, "x": x_unit},
         source=str(table.source),
-        **{argument: names[valid] for argument, names in labelled.items()},
+        **labelled,
     )
+
+
+def _same_run(labelled: Mapping[str, NDArray], n_rows: int) -> NDArray:
+    """Return whether each row and the next belong to one run, else motion, shape (n_rows - 1,)."""
+    same = np.ones(n_rows - 1, dtype=bool)
+    for labels_of_rows in labelled.values():  # those of runs come last
+        same = labels_of_rows[1:] == labels_of_rows[:-1]
+    return same
 
 
 def _warn_of_millimetres(name: str, column: NDArray, unit: str) -> None:

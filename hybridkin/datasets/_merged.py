@@ -25,6 +25,7 @@ from hybridkin._core.units import METRES, UNITS
 from hybridkin.datasets._encoders import _features as rough_features
 from hybridkin.datasets._log_report import named_rows
 from hybridkin.datasets._logs import Log
+from hybridkin.datasets._tables import without_missing
 from hybridkin.datasets.table_files import read_table
 
 _GAP = 5.0  # usual periods of the motor rows: longer ones are gaps
@@ -110,6 +111,7 @@ def read_columns(
     delimiter: str | None = None,
     header_line: int | None = None,
     decimal: str = ".",
+    missing: ArrayLike = (),
 ) -> TimedColumns:
     r"""Return columns of a recording that holds only commands, or only tips, with their times.
 
@@ -127,8 +129,8 @@ def read_columns(
         Factor on the columns, as `q_sign` of `load_log`.
     groups : str or None, default=None
         Column that names the motion of a row.
-    delimiter, header_line, decimal
-        As for `load_log`.
+    delimiter, header_line, decimal, missing
+        As for `load_log`; zeros are missing only where a marker is at 0, 0, 0.
 
     Returns
     -------
@@ -156,6 +158,7 @@ def read_columns(
     columns = table.names("names", names)
     table.check_unit("unit", columns, unit)
     values = table.values([*columns, time], [time])
+    without_missing(values[:, :-1], missing)
     timed = countable(values[:, -1])
     motions = None
     if groups is not None:
