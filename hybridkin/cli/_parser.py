@@ -469,7 +469,12 @@ def _verify(command: argparse.ArgumentParser) -> None:
     add = command.add_argument
     _add_model(command)
     add("track", type=Path, metavar="TRACK", help="track.csv or its folder")
-    add("log", type=Path, metavar="MEASURED", help="measured tips, with commands or without")
+    add(
+        "log",
+        type=Path,
+        metavar="MEASURED",
+        help="measured tips, with commands or without",
+    )
     _add_delay(
         command, "each is compared with the command of its time (that of the track)"
     )
