@@ -295,7 +295,13 @@ ENTRIES = {
                 "unit": "mm",
                 "sign": [1, 1, -1],
             },
-            **{"groups": "g", "delimiter": None, "header_line": None, "decimal": "."},
+            **{
+                "groups": "g",
+                "delimiter": None,
+                "missing": [0.0],
+                "header_line": None,
+                "decimal": ".",
+            },
         },
     ),
     "datasets.merge_logs": (

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +27,7 @@ from hybridkin._core.units import METRES, UNITS
 from hybridkin.datasets._encoders import _features as rough_features
 from hybridkin.datasets._log_report import named_rows
 from hybridkin.datasets._logs import Log
+from hybridkin.datasets._tables import Table
 from hybridkin.datasets.table_files import read_table
 
 _GAP = 5.0  # usual periods of the motor rows: longer ones are gaps
@@ -33,8 +36,8 @@ _OVERLAP = 0.5  # of the shorter recording, at least
 _CANDIDATES = 6  # lags of the coarse search that are compared
 _SURE = 0.7  # least score of a candidate, relative to the best
 _ROWS = 2000  # camera rows that are compared, at most
-_FEATURES = 100  # of the rough model, at most
-_ROWS_PER_FEATURE = 5  # at least, for products of commands
+_FEATURES = 250  # of the rough model, at most
+_ROWS_PER_FEATURE = 5  # at least, of polynomials
 _WINDOWS = 30  # of the fine search, at most
 _PARTS = 10  # of a log, of which each is explained by the others
 _EXPLAINED = 0.5  # least share of the motion that the commands explain at the lag
@@ -110,6 +113,7 @@ def read_columns(
     delimiter: str | None = None,
     header_line: int | None = None,
     decimal: str = ".",
+    missing: ArrayLike = (),
 ) -> TimedColumns:
     r"""Return columns of a recording that holds only commands, or only tips, with their times.
 
@@ -127,7 +131,7 @@ def read_columns(
         Factor on the columns, as `q_sign` of `load_log`.
     groups : str or None, default=None
         Column that names the motion of a row.
-    delimiter, header_line, decimal
+    delimiter, header_line, decimal, missing
         As for `load_log`.
 
     Returns
@@ -153,20 +157,34 @@ def read_columns(
     one_of(unit, "unit", UNITS)
     factor = np.multiply(real_array(sign, "sign"), UNITS[unit])
     table = read_table(as_path(path), TextForm(delimiter, header_line, decimal))
+    table.check_unit("unit", table.names("names", names), unit)
+    columns = columns_as_written(table, names, time, groups, missing)
+    return replace(columns, values=columns.values * factor, unit=unit)
+
+
+def columns_as_written(
+    table: Table,
+    names: Sequence[str],
+    time: str,
+    groups: str | None = None,
+    missing: ArrayLike = (),
+) -> TimedColumns:
+    """Return columns of a table with their times, not converted; see `read_columns`."""
     columns = table.names("names", names)
-    table.check_unit("unit", columns, unit)
     values = table.values([*columns, time], [time])
     timed = countable(values[:, -1])
     motions = None
     if groups is not None:
         motions = table.labels("groups", groups, len(values))[timed]
+    time_of_rows = values[timed, -1]
+    values = values[timed, :-1]
+    lost = real_array(missing, "missing").ravel()
+    values[np.isin(values, lost[lost != 0.0])] = np.nan
+    if len(columns) % 3 == 0 and (lost == 0.0).any():
+        markers = values.reshape(len(values), -1, 3)
+        markers[(markers == 0.0).all(axis=2)] = np.nan
     return TimedColumns(
-        values[timed, :-1] * factor,
-        values[timed, -1],
-        tuple(columns),
-        unit,
-        motions,
-        str(path),
+        values, time_of_rows, tuple(columns), "1", motions, str(table.source)
     )
 
 
@@ -199,7 +217,7 @@ class Merged(NamedTuple):
         how = "estimated from when both move" if self.is_estimated else "given"
         n_rows = len(self.log.q)
         return (
-            f"The camera's clock is {self.lag:.6g} s later than that of the motors ({how}); the "
+            f"The camera's clock is {self.lag:.4f} s later than that of the motors ({how}); the "
             f"commands then explain {self.explained:.1%} of the motion of the tip. {n_rows} of "
             f"{n_rows + self.n_left_out} camera rows have a tip and commands around them."
         )
@@ -386,7 +404,7 @@ def _estimated_lag(motors: TimedColumns, camera: TimedColumns, hold: bool) -> fl
                 f"{1.0 - other:.1%} of the motion of the tip, as where a motion repeats. Give "
                 "`lag` (0 if they share a clock), or record a motion that does not repeat."
             )
-    return lag
+    return _polished(motors, camera, lag, width, hold)
 
 
 def _coarse_lags(
@@ -467,30 +485,36 @@ def _refined(
     motors: TimedColumns, camera: TimedColumns, lag: float, width: float, hold: bool
 ) -> tuple[float, float, float]:
     """Return what the best lag nearby leaves unexplained, that lag, and the width of the search."""
-    cell = width / 8.0
+    tips = _surely_covered(motors, camera, lag, width)
+    shifts = np.linspace(-width, width, 17)
     for _ in range(_WINDOWS):
-        tips = _surely_covered(motors, camera, lag, width)
         if not len(tips.time):
             return np.inf, lag, width
-        lags = np.linspace(lag - width, lag + width, 17)
-        errors = [_left_at(seconds, motors, tips, hold) for seconds in lags]
+        errors = [_left_at(shift, lag, motors, tips, hold, 2) for shift in shifts]
         best = int(np.argmin(errors))
-        lag = float(lags[best])
-        if 0 < best < len(lags) - 1:
+        lag += float(shifts[best])
+        if 0 < best < len(shifts) - 1:
             break
-    tips = _surely_covered(motors, camera, lag, width)
-    if not len(tips.time):
-        return np.inf, lag, width
-    fit = minimize_scalar(
-        _left_at,
-        args=(motors, tips, hold),
-        bounds=(lag - cell, lag + cell),
-        method="bounded",
-        options={"xatol": 1e-3 * cell},
-    )
-    lag = float(fit.x)  # pyright: ignore[reportAttributeAccessIssue]
+        tips = _surely_covered(motors, camera, lag, width)
     q = commands_at(motors, tips.time - lag, hold)
     return 1.0 - _explained(q, tips.values), lag, width
+
+
+def _polished(
+    motors: TimedColumns, camera: TimedColumns, lag: float, width: float, hold: bool
+) -> float:
+    """Return the best lag near one of the fine search, of a cubic of the commands."""
+    tips = _surely_covered(motors, camera, lag, width)
+    if not len(tips.time):
+        return lag
+    fit = minimize_scalar(
+        _left_at,
+        args=(lag, motors, tips, hold, 3),
+        bounds=(-width, width),  # its tolerance is relative, and a lag can be years
+        method="bounded",
+        options={"xatol": 1e-4 * width},
+    )
+    return lag + float(fit.x)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _surely_covered(
@@ -511,14 +535,22 @@ def _surely_covered(
     return TimedColumns(tips[rows], camera.time[rows])
 
 
-def _left_at(lag: float, motors: TimedColumns, tips: TimedColumns, hold: bool) -> float:
-    """Return the share of the variance of tips that the commands leave at a lag."""
-    return _unexplained(commands_at(motors, tips.time - lag, hold), tips.values)
+def _left_at(
+    shift: float,
+    lag: float,
+    motors: TimedColumns,
+    tips: TimedColumns,
+    hold: bool,
+    degree: int,
+) -> float:
+    """Return the share of the variance of tips that the commands leave at a shifted lag."""
+    q = commands_at(motors, tips.time - lag - shift, hold)
+    return _unexplained(q, tips.values, degree)
 
 
-def _unexplained(q: NDArray, x: NDArray) -> float:
-    """Return the share of the variance of tips that a quadratic of the commands leaves."""
-    features = _features(q, squares=True)
+def _unexplained(q: NDArray, x: NDArray, degree: int) -> float:
+    """Return the share of the variance of tips that a polynomial of the commands leaves."""
+    features = _features(q, degree)
     weights = np.linalg.lstsq(features, x)[0]
     n_free = max(len(x) - features.shape[1], 1)
     left = np.square(x - features @ weights).sum() * len(x) / n_free
@@ -543,8 +575,8 @@ def _explained(q: NDArray, x: NDArray) -> float:
     if not total > 0.0:
         return 0.0
     shares = []
-    for squares in (False, True):
-        features = _features(q, squares)
+    for degree in (1, 2):
+        features = _features(q, degree)
         left = 0.0
         for part in np.array_split(np.arange(len(q)), _PARTS):
             others = np.delete(np.arange(len(q)), part)
@@ -554,14 +586,18 @@ def _explained(q: NDArray, x: NDArray) -> float:
     return max(*shares, 0.0)
 
 
-def _features(q: NDArray, squares: bool) -> NDArray:
-    """Return 1 and z of commands (N, n), z from -1 to 1; with `squares` also their products."""
+def _features(q: NDArray, degree: int) -> NDArray:
+    """Return the products of up to `degree` of 1 and z for commands (N, n), z from -1 to 1.
+
+    Where these are too many for the rows, products of fewer; at least z^2 where `degree` is 2.
+    """
     n = q.shape[1]
-    features = rough_features(q, q)
-    if not squares:
-        return features[:, : 1 + n]
-    first, second = np.triu_indices(n, k=1)
-    if features.shape[1] + len(first) <= min(_FEATURES, len(q) / _ROWS_PER_FEATURE):
-        z = features[:, 1 : 1 + n]
-        features = np.hstack([features, z[:, first] * z[:, second]])
-    return features
+    rough = rough_features(q, q)
+    if degree == 1:
+        return rough[:, : 1 + n]
+    most = min(_FEATURES, len(q) / _ROWS_PER_FEATURE)
+    if math.comb(n + degree, degree) > most:
+        return rough if degree == 2 else _features(q, degree - 1)
+    factors = rough[:, : 1 + n].T  # of which the first is 1
+    chosen = itertools.combinations_with_replacement(factors, degree)
+    return np.stack([np.prod(product, axis=0) for product in chosen], axis=1)
