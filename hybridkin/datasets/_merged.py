@@ -39,6 +39,9 @@ _ROWS = 2000  # camera rows that are compared, at most
 _FEATURES = 250  # of the rough model, at most
 _ROWS_PER_FEATURE = 5  # at least, of polynomials
 _WINDOWS = 30  # of the fine search, at most
+_DEGREES = (1, 2, 3)  # of the polynomials that explain tips
+_EXACT = 1e-3  # what a right lag can leave unexplained; a wrong one only where a motion repeats
+_RIDGE = 1e-9  # relative to the mean square of a feature
 _PARTS = 10  # of a log, of which each is explained by the others
 _EXPLAINED = 0.5  # least share of the motion that the commands explain at the lag
 _RIVAL = 1.5  # least ratio of what the second best lag leaves to what the best leaves
@@ -326,7 +329,7 @@ def merge_logs(
         file_units={"q": motors.unit, "x": camera.unit},
         source=f"{motors.source} and {camera.source}",
     )
-    explained = _explained(q, x)
+    explained, _ = _explained(q, x)
     if is_estimated and explained < _EXPLAINED:
         raise ValueError(
             f"The lag between {motors.source} and {camera.source} is not clear: the commands "
@@ -396,8 +399,9 @@ def _estimated_lag(motors: TimedColumns, camera: TimedColumns, hold: bool) -> fl
     for lag, width in _coarse_lags(motors, camera):
         fits.append(_refined(motors, camera, lag, width, hold))
     unexplained, lag, width = min(fits)
+    as_good = max(_RIVAL * unexplained, _EXACT)
     for other, other_lag, _ in fits:
-        if abs(other_lag - lag) > width and other < _RIVAL * unexplained:
+        if abs(other_lag - lag) > width and other < as_good:
             raise ValueError(
                 f"The lag between {motors.source} and {camera.source} is not clear: lags of "
                 f"{lag:.6g} and {other_lag:.6g} s explain {1.0 - unexplained:.1%} and "
@@ -497,19 +501,20 @@ def _refined(
             break
         tips = _surely_covered(motors, camera, lag, width)
     q = commands_at(motors, tips.time - lag, hold)
-    return 1.0 - _explained(q, tips.values), lag, width
+    return 1.0 - _explained(q, tips.values)[0], lag, width
 
 
 def _polished(
     motors: TimedColumns, camera: TimedColumns, lag: float, width: float, hold: bool
 ) -> float:
-    """Return the best lag near one of the fine search, of a cubic of the commands."""
+    """Return the best lag near one of the fine search, by a polynomial of the commands."""
     tips = _surely_covered(motors, camera, lag, width)
     if not len(tips.time):
         return lag
+    _, degree = _explained(commands_at(motors, tips.time - lag, hold), tips.values)
     fit = minimize_scalar(
         _left_at,
-        args=(lag, motors, tips, hold, 3),
+        args=(lag, motors, tips, hold, degree),
         bounds=(-width, width),  # its tolerance is relative, and a lag can be years
         method="bounded",
         options={"xatol": 1e-4 * width},
@@ -551,18 +556,18 @@ def _left_at(
 def _unexplained(q: NDArray, x: NDArray, degree: int) -> float:
     """Return the share of the variance of tips that a polynomial of the commands leaves."""
     features = _features(q, degree)
-    weights = np.linalg.lstsq(features, x)[0]
+    weights = _weights(features, x)
     n_free = max(len(x) - features.shape[1], 1)
     left = np.square(x - features @ weights).sum() * len(x) / n_free
     total = np.square(x - x.mean(axis=0)).sum()
     return float(left / total) if total > 0.0 else 1.0
 
 
-def _explained(q: NDArray, x: NDArray) -> float:
+def _explained(q: NDArray, x: NDArray) -> tuple[float, int]:
     """Return the share of the variance of tips that the commands explain in other parts of a log.
 
-    That of ten parts in a row, each from the other nine: a linear model, or a quadratic if that
-    explains more. Smooth motions that have nothing to do with each other agree within one part.
+    That of ten parts in a row, each from the other nine, by a polynomial of the best degree, and
+    that degree. Smooth motions that have nothing to do with each other agree within one part.
     """
     tips = _tip(x)
     known = np.isfinite(tips).all(axis=1)
@@ -573,17 +578,25 @@ def _explained(q: NDArray, x: NDArray) -> float:
     tips = tips[few]
     total = np.square(tips - tips.mean(axis=0)).sum()
     if not total > 0.0:
-        return 0.0
+        return 0.0, 1
     shares = []
-    for degree in (1, 2):
+    for degree in _DEGREES:
         features = _features(q, degree)
         left = 0.0
         for part in np.array_split(np.arange(len(q)), _PARTS):
             others = np.delete(np.arange(len(q)), part)
-            weights = np.linalg.lstsq(features[others], tips[others])[0]
+            weights = _weights(features[others], tips[others])
             left += np.square(tips[part] - features[part] @ weights).sum()
         shares.append(1.0 - float(left / total))
-    return max(*shares, 0.0)
+    best = int(np.argmax(shares))
+    return max(shares[best], 0.0), _DEGREES[best]
+
+
+def _weights(features: NDArray, x: NDArray) -> NDArray:
+    """Return the weights (k, 3) of least squares; a tiny ridge keeps rows at rest solvable."""
+    gram = features.T @ features
+    ridge = _RIDGE * np.trace(gram) / len(gram)
+    return np.linalg.solve(gram + ridge * np.eye(len(gram)), features.T @ x)
 
 
 def _features(q: NDArray, degree: int) -> NDArray:
