@@ -20,10 +20,11 @@ FLOORS = [
     {"calibration"},
     {"chains", "learning", "ik"},
     {"native"},
-    {"_core", "datasets", "plots"},
+    {"_core", "causes", "datasets", "plots"},
 ]
 BESIDE = {
-    "datasets": {"_core", "chains"},
+    "causes": {"_core", "chains", "native"},
+    "datasets": {"_core", "chains", "causes"},
     "plots": {"_core", "chains"},
     "_core": set(),
 }

@@ -298,9 +298,9 @@ ENTRIES = {
             **{
                 "groups": "g",
                 "delimiter": None,
-                "missing": [0.0],
                 "header_line": None,
                 "decimal": ".",
+                "missing": (),
             },
         },
     ),

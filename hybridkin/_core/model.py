@@ -316,6 +316,13 @@ class ForwardModel(PortableModule):
         """Return x (N, m) of inner coordinates z (N, C) and dx/dz (N, m, C)."""
         return self.forward_and_jacobian(z)
 
+    def compliance_columns(self, q: Tensor) -> Tensor:
+        """Return A (N, 3 K, C) at rows q (N, n): a force w at the tip moves it along A A' w.
+
+        By default the actuators give way, all by as much.
+        """
+        return self.forward_and_jacobian(q)[1]
+
 
 class PoseModel(ForwardModel):
     """A forward model of the tip position that can also return the tip pose."""

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import NamedTuple, TextIO
 
 DECIMALS = (".", ",")
-_DELIMITERS = (",", ";", "\t")
+_DELIMITERS = (",", ";", "\t")  # else spaces
 _MARKS = {  # first bytes of a file
     b"\xef\xbb\xbf": "utf-8-sig",
     b"\xff\xfe": "utf-16",
@@ -74,6 +74,8 @@ class TextForm:
             delimiter = max(candidates, key=unquoted.count)
             if delimiter in unquoted:
                 return delimiter
+        if any(" " in line.strip() for line in lines[:1]):
+            return " "
         return _DELIMITERS[0]
 
 
@@ -115,7 +117,9 @@ class TextFile(NamedTuple):
         """Yield the rows that are not blank."""
         try:
             with self.open() as file:
-                reader = csv.reader(file, delimiter=delimiter)
+                # Several spaces separate two cells only.
+                several = delimiter == " "
+                reader = csv.reader(file, delimiter=delimiter, skipinitialspace=several)
                 for cells in reader:
                     if any(map(str.strip, cells)):
                         yield Row(reader.line_num, cells)

@@ -34,6 +34,12 @@ class LogUnit(NamedTuple):
         return f"{change / self.size:.3g} {self.name}"
 
 
+SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+"""Seconds per unit, for the units of time that logs accept beside frames."""
+
+FRAMES = "frames"
+"""The unit of times that count frames; their rate is given besides."""
+
 LONGEST_PULL = 4.0
 """Largest plausible tendon displacement, in backbone lengths."""
 
@@ -68,6 +74,29 @@ _KILOMETRES = Unit("kilometres", "km", 1e-3, "multiply by 1000")
 # Of rough ratios up to 170.
 _BOTH = Unit("centimetres or inches", "cm", 30.0, "divide by 100, or by 39.37")
 _DEGREES = Unit("degrees", "deg", 180.0 / math.pi, "take numpy.radians of them")
+
+
+_DURATIONS = (  # seconds from which a name is used, and seconds per unit of that name
+    (0.0, 1e-6, "us"),
+    (1e-3, 1e-3, "ms"),
+    (1.0, 1.0, "s"),
+    (180.0, 60.0, "min"),
+    (3.0 * 3600.0, 3600.0, "h"),
+    (72.0 * 3600.0, 86400.0, "days"),
+)
+_YEAR = 365.25 * 86400.0  # [s]
+
+
+def duration_in_words(seconds: float) -> str:
+    """Return a duration [s] in a unit that reads well; more than a year is doubted."""
+    if seconds == 0.0:
+        return "0 s"
+    if seconds > _YEAR:
+        return f"{seconds:.3g} s ({seconds / _YEAR:.3g} years: are these seconds?)"
+    for least, unit, name in reversed(_DURATIONS):
+        if abs(seconds) >= least:
+            return f"{seconds / unit:.4g} {name}"
+    return f"{seconds:.4g} s"
 
 
 def _nearest(ratio: float, *units: Unit) -> Unit:

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from hybridkin._core.arrays import LARGEST
-from hybridkin._core.model import ForwardModel
-from hybridkin.calibration.measured import folds
+from hybridkin.calibration.hysteresis_log import HysteresisLog
 from hybridkin.chains.creep import CreepOperator
 from hybridkin.chains.hysteresis import HysteresisOperator
 from hybridkin.chains.play import PlayOperator
@@ -25,82 +24,9 @@ _FACTORS = np.array([0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0])
 _ROUNDS = 4
 _LEAST_NOISE = 1e-5  # relative to the spread of the tips
 _COMMON = 0.5  # prior correlation of the weights of two actuators
+_BLOCK = 5_000_000  # largest number of entries that creep follows at once
 _MOST_LATE = 0.95  # largest share of a change that comes late
 _LEAST_GAIN = 1e-6  # of creep
-
-
-@dataclass(frozen=True)
-class HysteresisLog:
-    """Commands in order of time, and the measured tips by which their hysteresis is found.
-
-    Attributes
-    ----------
-    model : ForwardModel
-        The mechanical model, calibrated without hysteresis.
-    q : ndarray of shape (N, n)
-        Commands, the rows of each run in order of time [unit of q].
-    x : ndarray of shape (N, m)
-        Measured tips, NaN where a marker is missing [m].
-    counts : ndarray of shape (N,)
-        How many times each row counts.
-    groups : ndarray of shape (N,)
-        Which rows are held out together.
-    runs : ndarray of shape (N,)
-        Which rows follow each other in time.
-    time : ndarray of shape (N,)
-        Times, ascending in each run [s].
-    """
-
-    model: ForwardModel
-    q: NDArray
-    x: NDArray
-    counts: NDArray
-    groups: NDArray
-    runs: NDArray
-    time: NDArray
-
-    @cached_property
-    def rows(self) -> NDArray:
-        """The rows whose errors count."""
-        return np.flatnonzero(which_count(self.x, self.counts))
-
-    @cached_property
-    def folds(self) -> list[tuple[NDArray, NDArray]]:
-        """Training and held-out rows, as places in `rows`."""
-        return folds(self.rows, self.groups[self.rows])
-
-    @cached_property
-    def times(self) -> NDArray:
-        """Time constants to try [s]: from the median step to the median length of a run."""
-        steps = []
-        lengths = []
-        for name in np.unique(self.runs):
-            times = self.time[self.runs == name]
-            steps.append(np.diff(times))
-            lengths.append(times[-1] - times[0])
-        positive = np.concatenate(steps)
-        positive = positive[positive > 0.0]
-        if not len(positive):
-            return np.empty(0)
-        least = np.median(positive)
-        return np.geomspace(least, max(np.median(lengths), 2.0 * least), 4)
-
-    def by_group(self, distances: NDArray) -> NDArray:
-        """Return the mean distance of every group, of the distances of `rows`."""
-        _, group = np.unique(self.groups[self.rows], return_inverse=True)
-        counts = self.counts[self.rows]
-        return np.bincount(group, counts * distances) / np.bincount(group, counts)
-
-
-def which_count(x: NDArray, counts: NDArray) -> NDArray:
-    """Return which rows (N,) count: not zero times, and with a marker that was measured.
-
-    Parameters
-    ----------
-    x, counts : ndarray of shapes (N, m) and (N,)
-        As in `HysteresisLog`.
-    """
-    return (counts > 0.0) & ~np.isnan(x).all(axis=1)
 
 
 class HysteresisFit(NamedTuple):
@@ -147,11 +73,9 @@ class HysteresisProblem:
         self.widths = np.zeros(1)
         if width > 0.0:
             self.widths = width * _FACTORS
-        plays = [PlayOperator(w).apply_by_group(log.q, log.runs) for w in self.widths]
-        changes = np.stack([*-np.diff(plays, axis=0), plays[-1]], axis=1)
-        self.changes = changes[log.rows]  # (C, K + 1, n), of which u is a weighted sum
         self.times = log.times if creep else np.empty(0)
-        self.late = self._late(changes)
+        # (C, K + 1, n), of which u is a weighted sum, and what creep does with them
+        self.changes, self.late = self._changes()
         n = log.q.shape[1]
         one_backlash = _FACTORS[: len(self.widths) - 1] >= 1.0
         self.start = np.outer(one_backlash, np.ones(n))
@@ -161,19 +85,54 @@ class HysteresisProblem:
         roots = np.sqrt(counts)[:, None]
         self.roots = np.where(np.isnan(self.measured), 0.0, roots)
         self.center = np.average(log.q[log.rows], axis=0, weights=counts)
-        ranges = np.ptp(log.q, axis=0)
-        self.scale = np.where(ranges > 0.0, ranges, 1.0)
+        self.scale = log.ranges
 
-    def _late(self, changes: NDArray) -> NDArray:
-        """Return S(c) - c (C, J, K + 1, n) of changes c, with the slow state S of each time."""
-        flat = changes.reshape(len(changes), -1)
-        late = np.empty((len(self.log.rows), len(self.times), *changes.shape[1:]))
-        for place, time in enumerate(self.times):
-            half = CreepOperator([0.5], [time])  # y - u = (S(u) - u) / 2
-            crept = half.apply_by_group(flat, self.log.runs, self.log.time)
-            difference = 2.0 * (crept - flat)
-            late[:, place] = difference.reshape(changes.shape)[self.log.rows]
-        return late
+    def _changes(self) -> tuple[NDArray, NDArray]:
+        """Return changes c (C, K + 1, n), and S(c) - c (C, J, K + 1, n) with the slow states S.
+
+        The rows that do not count move the plays and slow states, one after the other.
+        """
+        log = self.log
+        order = log.order
+        rows = log.q[order.order]
+        steps = order.steps(log.time)
+        counted = np.argsort(order.order)[log.rows]
+        n = rows.shape[1]
+        n_changes = len(self.widths)
+        changes = np.empty((len(counted), n_changes, n))
+        late = np.empty((len(counted), len(self.times), n_changes, n))
+        at_once = max(1, _BLOCK // rows.size)
+        block: list[NDArray] = []
+        play = PlayOperator(self.widths[0]).followed(rows, steps)
+        for k in range(n_changes):
+            wider = np.zeros_like(
+                play
+            )  # what is left of the widest one is the last change
+            if k + 1 < n_changes:
+                wider = PlayOperator(self.widths[k + 1]).followed(rows, steps)
+            block.append(play - wider)
+            play = wider
+            changes[:, k] = block[-1][counted]
+            if len(block) < at_once and k + 1 < n_changes:
+                continue
+            side_by_side = np.concatenate(block, axis=1)
+            for j, time in enumerate(self.times):
+                of_block = self._late(side_by_side, steps, time)[counted]
+                part = late[:, j, k + 1 - len(block) : k + 1]
+                part[:] = of_block.reshape(part.shape)
+            block.clear()
+        return changes, late
+
+    def _late(self, change: NDArray, steps: NDArray, time: float) -> NDArray:
+        """Return S(c) - c (N, n) of changes c in the order of runs, with the slow state S.
+
+        Rows that were left out lie on a straight line between two others, in equal steps. A command
+        in between, held from one of the two to the other, leads to the same S.
+        """
+        held_back = _held_back(steps / time, self.log.recorded)
+        held = change - held_back[:, None] * np.diff(change, axis=0, prepend=change[:1])
+        half = CreepOperator([0.5], [time])  # y - u = (S(u) - u) / 2
+        return 2.0 * half.followed(held, steps) - held - change
 
     def operator(self, fit: HysteresisFit) -> HysteresisOperator | None:
         """Return the operator of fitted slopes and gains; None without hysteresis."""
@@ -281,6 +240,25 @@ class HysteresisProblem:
             prior.mean,
             n_rows=counts.max(axis=1).sum(),
         )
+
+
+def _held_back(steps: NDArray, spans: NDArray) -> NDArray:
+    """Return the share (N,) of a change that is not held, if it came in several equal steps.
+
+    Of K equal steps, slow states lag in the end by one of them over exp(x / K) - 1, with the time x
+    of all in time constants, as far as they have forgotten where they began.
+
+    Parameters
+    ----------
+    steps : ndarray of shape (N,)
+        Time since the row before, in time constants; zero or less: nothing is held back.
+    spans : ndarray of shape (N,) or ()
+        Number K of steps of the change.
+    """
+    passed = np.where(steps > 0.0, steps, 1.0)
+    with np.errstate(over="ignore"):
+        share = 1.0 / (spans * np.expm1(passed / spans)) - 1.0 / np.expm1(passed)
+    return np.where((steps > 0.0) & (spans > 1.0), share, 0.0)
 
 
 class _Prior(NamedTuple):

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
-from hybridkin.calibration.hysteresis_fit import HysteresisLog, HysteresisProblem
+from hybridkin.calibration.hysteresis_fit import HysteresisProblem
+from hybridkin.calibration.hysteresis_log import HysteresisLog
 from hybridkin.chains.hysteresis import HysteresisOperator
 
 _CLOSE = 0.002  # tolerance of a refined width, relative to it
@@ -86,6 +87,7 @@ def find_hysteresis(log: HysteresisLog) -> HysteresisOperator | None:
     log : HysteresisLog
         The measured rows.
     """
+    log = log.thinned()
     strokes = np.subtract(*np.percentile(log.q, (95, 5), axis=0))
     widest = float(np.ptp(log.q, axis=0).max())
     widths = [0.0, widest]

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from hybridkin._core.arrays import Numbers, check_shape, labels, real_array
 from hybridkin._core.commands import Commands
 from hybridkin.calibration.calibrate import CalibrationResult, calibrate, fit_geometry
-from hybridkin.calibration.hysteresis_fit import HysteresisLog
+from hybridkin.calibration.hysteresis_log import HysteresisLog
 from hybridkin.calibration.hysteresis_search import search_width
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
@@ -150,7 +150,7 @@ def fit_play(
         runs=runs,
         time=np.arange(len(x), dtype=np.float64),
     )
-    search = search_width(log, tried)
+    search = search_width(log.thinned(), tried)
     gain = search.gain
     width = search.best.width if gain.clear else 0.0
     y = PlayOperator(width).apply_by_group(q, runs)

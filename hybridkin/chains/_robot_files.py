@@ -17,7 +17,7 @@ import torch
 from hybridkin._core.arrays import shaped
 from hybridkin._core.rotations import rotation
 from hybridkin._core.text_rows import DECIMALS
-from hybridkin._core.units import METRES, UNITS
+from hybridkin._core.units import FRAMES, METRES, SECONDS, UNITS
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
 from hybridkin.chains.elastic_tendons import ElasticTendonChain
@@ -154,6 +154,8 @@ _ROWS: list[tuple[str, str, str, _Test]] = [
     ("log", "header_line", *_WHOLE),
     ("log", "decimal", *_among(*DECIMALS)),
     ("log", "missing", "hold numbers", _many(_is_number)),
+    ("log", "time_unit", *_among(*SECONDS, FRAMES)),
+    ("log", "rate", "be a positive number", _is_positive),
     ("log", "q_sign", "be 1 or -1, or a list of them", _one_or_many(_among(1, -1)[1])),
     (
         "limits",

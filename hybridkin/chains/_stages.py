@@ -31,16 +31,19 @@ def follow_in_numpy(
             parts.append(_Creep(stage, inside, rounding))
         first = last
     results = np.empty_like(rows)
+    passed = np.maximum(steps, 0.0)
     for t, row in enumerate(rows):
+        if steps[t] < 0.0:
+            state[:] = row
         if lead:
             for part in parts[::-1]:
-                row = part.lead(row, steps[t])
+                row = part.lead(row, passed[t])
             state[0] = row
             results[t] = row
         else:
             state[0] = row
             for part in parts:
-                part.follow(steps[t])
+                part.follow(passed[t])
             results[t] = state[-1]
     return results
 

@@ -30,6 +30,7 @@ from hybridkin.chains._arcs import (
 )
 from hybridkin.chains._checks import arc_geometry
 from hybridkin.chains._paths import bend_matrix, path_starts, reading_matrix
+from hybridkin.chains.chain import ActuatorLayout
 from hybridkin.chains.markers import MarkedChain
 
 if TYPE_CHECKING:
@@ -39,6 +40,7 @@ ALIASES = {"turns": "angles", "tool": "offsets", "gain": "gains"}
 """Parameters of `calibrate` that change a part of an entry of the geometry, and that entry."""
 
 Change = Callable[[Tensor], Tensor]
+_RANK = 1e-9  # of the largest singular value: smaller ones are zero
 _LONGEST = 10.0  # largest plausible length of an extensible segment [m]
 _REACHES = 50.0  # and in sizes of the robot
 STRUCTURE = {"actuators_per_segment": list, "markers": list, "routing": str}
@@ -167,6 +169,40 @@ class ArcChain(MarkedChain):
     def rest(self) -> Tensor:
         """The q (n,) at which tendons are not displaced and chambers have length 0."""
         return torch.zeros_like(self.gains)
+
+    @property
+    def actuator_layout(self) -> ActuatorLayout:
+        """Rest, kind and segment of every actuator; pressures have no effect at zero."""
+        absolute = self.absolute.cpu().numpy()
+        signed = ~absolute
+        rest = as_array(self.rest.detach())
+        if not self.in_metres:
+            signed = np.ones_like(absolute)
+            rest = np.where(absolute, 0.0, rest)
+        segments = []
+        first = 0
+        for count in self.actuators_per_segment:
+            segments.append([*range(first, first + count)])
+            first += count
+        return ActuatorLayout(
+            rest, absolute, signed, segments, self._still_directions()
+        )
+
+    def _still_directions(self) -> NDArray:
+        """Return the directions of q (n, k) that no arcs of the robot move, in orthonormal columns.
+
+        The backbone of an inextensible segment keeps its length.
+        """
+        if self.stage is not None:
+            return np.zeros((self.n_actuators, 0))
+        readings = as_array(self._readings().detach())
+        fixed = np.append(~np.array(self.extensible), np.zeros(2 * self.n_segments))
+        moved = readings[:, fixed == 0.0]
+        axes, sizes, _ = np.linalg.svd(moved)
+        rank = int((sizes > _RANK * sizes[0]).sum())
+        still = as_array(self.gains.detach())[:, None] * axes[:, rank:]
+        balance, _ = np.linalg.qr(still)
+        return balance
 
     def metres(self, q: Tensor) -> Tensor:
         """Return q (..., n) in metres: lengths, or changes of length."""
@@ -540,6 +576,17 @@ class ArcChain(MarkedChain):
         if len(self.markers) > 1:
             columns = self.by_arcs(columns)
         return self._in_measuring_frame(x), self._turned(columns)
+
+    def compliance_columns(self, q: Tensor) -> Tensor:
+        """Return A (N, 3 K, 2 m) at rows q (N, n): a force w at the tip moves it along A A' w.
+
+        The bendings of the m arcs give way by the moment times their length.
+        """
+        arcs, _ = self.coordinates(q)
+        _, columns = self.from_coordinates_and_jacobian(arcs)
+        m = arcs.shape[1] // 3
+        roots = arcs[:, :m].abs().sqrt().repeat(1, 2)
+        return columns[..., m:] * roots[:, None]
 
     def _coordinates_to_markers(self, z: Tensor) -> Tensor:
         """Return coordinates (C, ...) as arcs up to each marker, (3 m, K, ...)."""

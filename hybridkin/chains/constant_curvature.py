@@ -28,8 +28,11 @@ from hybridkin.chains.arc_chain import (
     each_marker,
     frame_numbers,
 )
+from hybridkin.chains.chain import Chain
 
 __all__ = ["ConstantCurvatureChain"]
+
+_SOFTER = (0.03, 0.3)  # stiffness of a bend over that of the tendons that bend it
 
 _EXTENSIBLE = (
     ("radii", "base"),
@@ -237,6 +240,35 @@ class ConstantCurvatureChain(ArcChain):
     def rest(self) -> Tensor:
         """The q (n,) at which tendons are not displaced and chambers have length 0."""
         return self.actuator_zeros
+
+    def softer(self) -> list[Chain]:
+        """Return the same robot with tendons that stretch and go slack, for some stiffnesses.
+
+        Tendons in balance bend both alike; a single tendon does not. Empty for chambers.
+        """
+        from hybridkin.chains.elastic_tendons import ElasticTendonChain
+
+        if self.stage is not None or self.absolute.any():
+            return []
+        angles = self.angles.detach().split(self.actuators_per_segment)
+        zeros = (self.gains * self.rest).detach()
+        chains = []
+        for stiffness in _SOFTER:
+            chain = ElasticTendonChain(
+                self.radii.detach(),
+                self.lengths.detach(),
+                n_actuators=self.actuators_per_segment,
+                angles=[*angles],
+                routing=self.routing,
+                bending_stiffness=stiffness * self.radii.detach().square(),
+                tendon_zeros=zeros,
+                gains=self.gains.detach(),
+                rest_bends=self.rest_bends.detach(),
+                offsets=self.offsets.detach(),
+                base=self.base.detach(),
+            )
+            chains.append(chain._marked(self.markers))
+        return chains
 
     def consistency(self, q: Tensor) -> Tensor:
         """Return by how much the actuator lengths of each segment contradict each other.

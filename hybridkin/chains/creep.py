@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -95,13 +97,11 @@ class CreepOperator(HysteresisOperator):
         gains = np.broadcast_to(self.gains.reshape(size, -1), (size, n))
         return [Stage(-size, (gains, self.times))]
 
-    def _inside(self, q: NDArray, steps: NDArray | None) -> NDArray:
-        """Return the slow states (T, J, n)."""
-        slow = []
+    def _each_inside(self, rows: NDArray, steps: NDArray) -> Iterator[NDArray]:
+        """Yield the slow states (N, n)."""
         for time in self.times:
-            half, _ = CreepOperator([0.5], [time]).apply(q, dt=steps)
-            slow.append(2.0 * half - q)
-        return np.stack(slow, axis=1)
+            half = CreepOperator([0.5], [time])
+            yield 2.0 * half.followed(rows, steps) - rows
 
 
 def _are_shares(gains: NDArray) -> bool:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -19,6 +19,7 @@ from hybridkin._core.arrays import (
     real_array,
 )
 from hybridkin._core.kernel_numbers import HK_CREEP_ROUNDING
+from hybridkin._core.runs import RunOrder
 from hybridkin._core.units import LogUnit
 from hybridkin.chains._stages import follow_in_numpy
 from hybridkin.native.hysteresis import Stage, follow, stage_numbers
@@ -162,9 +163,10 @@ class HysteresisOperator(ABC):
             times.
         """
         rows = real_array(q, "q")
+        motions = self._motions(rows, groups, time)
         effective = np.empty_like(rows)
-        for motion, steps in _motions(rows, groups, time):
-            effective[motion], _ = self.apply(rows[motion], dt=steps)
+        moved = self.followed(motions.rows, motions.steps)
+        effective[motions.order] = _like(moved, rows, rows.dtype)
         return _like(effective, q, rows.dtype)
 
     def inner_states(
@@ -174,20 +176,63 @@ class HysteresisOperator(ABC):
 
         The arguments are those of `apply_by_group`. A single backlash has no such states.
         """
-        states = [self._inside(q[:1], None)[:0]]
-        order = [np.arange(0)]
-        for motion, steps in _motions(q, groups, time):
-            states.append(self._inside(q[motion], steps))
-            order.append(motion)
-        return np.concatenate(states)[np.argsort(np.concatenate(order))]
+        states = [*self.each_inner_state(q, groups, time)]
+        if not states:
+            return np.empty((len(q), 0, q.shape[1]))
+        return np.stack(states, axis=1)
+
+    def each_inner_state(
+        self, q: NDArray, groups: ArrayLike, time: ArrayLike | None = None
+    ) -> Iterator[NDArray]:
+        """Yield the inner states one by one, each after every row (N, n); see `inner_states`.
+
+        All of them at once would take a multiple of the memory of a long log.
+        """
+        motions = self._motions(q, groups, time)
+        for state in self._each_inside(motions.rows, motions.steps):
+            in_place = np.empty_like(state)
+            in_place[motions.order] = state
+            yield in_place
 
     @abstractmethod
     def stages(self, n: int) -> list[Stage]:
         """Return the operator of n actuators as stages, for kernels."""
 
-    def _inside(self, q: NDArray, steps: NDArray | None) -> NDArray:
-        """Return the inner states (T, R, n) of a motion, see `inner_states`."""
-        return np.empty((len(q), 0, q.shape[1]))
+    def _each_inside(self, rows: NDArray, steps: NDArray) -> Iterator[NDArray]:
+        """Yield the inner states (N, n) of motions in a row; the arguments are of `followed`."""
+        yield from ()
+
+    def followed(self, rows: NDArray, steps: NDArray) -> NDArray:
+        """Return the effective changes (N, n) of motions in a row.
+
+        Parameters
+        ----------
+        rows : ndarray of shape (N, n)
+            Commands, finite, in float64.
+        steps : ndarray of shape (N,)
+            Time since the row before [s]; `BEGINS` where a motion begins.
+        """
+        if not len(rows):
+            return rows
+        stages = self.stages(rows.shape[1])
+        state = np.empty((stage_numbers(stages).n_rows, rows.shape[1]))
+        return _kernel()(stages, rows, steps, state, False)
+
+    def _motions(
+        self, q: NDArray, groups: ArrayLike, time: ArrayLike | None
+    ) -> _Motions:
+        """Return the motions of a log in a row; the arguments are those of `apply_by_group`."""
+        check_shape(q, "q", ("N", "n"))
+        names = labels(groups, len(q))
+        rows = self._checked(q, "q")
+        runs = RunOrder.of(names)
+        if time is None:
+            if self.creeps and not runs.first.all():
+                raise _no_times()
+            times = np.zeros(len(q))
+        else:
+            times = checked_times(time, names)
+        return _Motions(rows[runs.order], runs.order, runs.steps(times))
 
     @property
     @abstractmethod
@@ -204,28 +249,26 @@ class HysteresisOperator(ABC):
     ) -> tuple[Any, Any]:
         """Return effective changes (or with `lead` commands), and the last state."""
         given = real_array(motion, name)
-        rows = np.array(given, np.float64, order="C")
-        check_shape(rows, name, ("T", self._size))
-        n = rows.shape[1]
-        if not n:
-            raise ValueError(f"`{name}` must hold at least one actuator, got none.")
-        rows = _finite(rows, name)
+        rows = self._checked(given, name)
         if dt is None:
             dt = 0.0
             if self.creeps and (len(rows) > 1 or state is not None):
-                raise ValueError(
-                    "the times of the rows [s] must be given, as the actuators creep: `dt` or "
-                    "`time` of an operator, Commands(q, runs, time) of a model, --time of "
-                    "`hybridkin`."
-                )
+                raise _no_times()
         steps = _checked_steps(dt, len(rows))
-        stages = self.stages(n)
+        stages = self.stages(rows.shape[1])
         last = self._start(rows, name, state, stage_numbers(stages).n_rows)
-        follow_rows = follow if available() else follow_in_numpy
         rounding = HK_CREEP_ROUNDING * float(np.finfo(given.dtype).eps)
         if len(rows):
-            rows = follow_rows(stages, rows, steps, last, lead, rounding)
+            rows = _kernel()(stages, rows, steps, last, lead, rounding)
         return _like(rows, motion, given.dtype), _like(last, motion, given.dtype)
+
+    def _checked(self, given: NDArray, name: str) -> NDArray:
+        """Return rows (T, n) in float64, which must be finite, with the actuators in memory."""
+        rows = np.array(given, np.float64, order="C")
+        check_shape(rows, name, ("T", self._size))
+        if not rows.shape[1]:
+            raise ValueError(f"`{name}` must hold at least one actuator, got none.")
+        return _finite(rows, name)
 
     def _start(
         self, rows: NDArray, name: str, state: Numbers | None, n_rows: int
@@ -241,19 +284,35 @@ class HysteresisOperator(ABC):
         return _finite(start, "state")
 
 
-def _motions(
-    q: NDArray, groups: ArrayLike, time: ArrayLike | None
-) -> Iterator[tuple[NDArray, NDArray | None]]:
-    """Yield the rows of each motion, and the time since the row before of each row [s]."""
-    check_shape(q, "q", ("N", "n"))
-    names = labels(groups, len(q))
-    times = None if time is None else checked_times(time, names)
-    for name in np.unique(names):
-        rows = np.flatnonzero(names == name)
-        steps = None
-        if times is not None:
-            steps = np.diff(times[rows], prepend=times[rows[:1]])
-        yield rows, steps
+class _Motions(NamedTuple):
+    """The motions of a log in a row, as kernels follow them.
+
+    Attributes
+    ----------
+    rows : ndarray of shape (N, n)
+        Commands, motion after motion [unit of q].
+    order : ndarray of int of shape (N,)
+        Their rows in the log.
+    steps : ndarray of shape (N,)
+        Time since the row before [s]; `BEGINS` where a motion begins.
+    """
+
+    rows: NDArray
+    order: NDArray[np.intp]
+    steps: NDArray
+
+
+def _kernel() -> Callable[..., NDArray]:
+    """Return what follows rows: the compiled core, or without it NumPy."""
+    return follow if available() else follow_in_numpy
+
+
+def _no_times() -> ValueError:
+    """Return the error for commands without times of actuators that creep."""
+    return ValueError(
+        "the times of the rows [s] must be given, as the actuators creep: `dt` or `time` of an "
+        "operator, Commands(q, runs, time) of a model, --time of `hybridkin`."
+    )
 
 
 def checked_times(time: ArrayLike, names: NDArray) -> NDArray:
@@ -270,12 +329,13 @@ def checked_times(time: ArrayLike, names: NDArray) -> NDArray:
     check_shape(times, "time", (len(names),), "one time for each row")
     if not np.isfinite(times).all():
         raise ValueError("`time` must be finite, got NaN or infinity.")
-    for name in np.unique(names).tolist():
-        if (np.diff(times[names == name]) < 0.0).any():
-            raise ValueError(
-                f"`time` must not decrease within a motion, but does in {name!r:.80}. Sort its "
-                "rows by time, or give other motions other names."
-            )
+    late = RunOrder.of(names).late(times)
+    if len(late):
+        name = names[late].tolist()[0]
+        raise ValueError(
+            f"`time` must not decrease within a motion, but does in {name!r:.80}. Sort its "
+            "rows by time, or give other motions other names."
+        )
     return times
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -89,10 +91,10 @@ class PrandtlIshlinskiiOperator(HysteresisOperator):
         half = np.broadcast_to(half_widths(self.widths)[:, None], slopes.shape)
         return [Stage(len(half), (half, slopes))]
 
-    def _inside(self, q: NDArray, steps: NDArray | None) -> NDArray:
-        """Return the plays (T, K, n)."""
-        plays = [PlayOperator(width).apply(q)[0] for width in self.widths]
-        return np.stack(plays, axis=1)
+    def _each_inside(self, rows: NDArray, steps: NDArray) -> Iterator[NDArray]:
+        """Yield the plays (N, n)."""
+        for width in self.widths:
+            yield PlayOperator(width).followed(rows, steps)
 
 
 def _are_valid(numbers: NDArray, dimensions: tuple[int, ...]) -> bool:

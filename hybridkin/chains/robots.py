@@ -76,7 +76,11 @@ class LogFormat:
     unwrap : bool, float or mapping of str to float
         Periods of encoders to correct, see `datasets.load_log`.
     groups, runs, time : str or None
-        Columns of the motion of each row, of its run (see `Commands`), and of its time stamp [s].
+        Columns of the motion of each row, of its run (see `Commands`), and of its time stamp.
+    time_unit : {"s", "ms", "us", "ns", "frames"}
+        Unit of the time stamps.
+    rate : float or None
+        Frames per second, if `time_unit` is "frames" [1/s].
     header_line, decimal, missing
         Form of text files, and numbers that stand for missing values; as for
         `datasets.load_log`.
@@ -95,6 +99,8 @@ class LogFormat:
     decimal: str = "."
     missing: tuple[float, ...] = ()
     unwrap: bool | float | Mapping[str, float] = False
+    time_unit: str = "s"
+    rate: float | None = None
 
     @property
     def q_factor(self) -> NDArray:

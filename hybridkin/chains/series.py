@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,10 +81,8 @@ class HysteresisSeries(HysteresisOperator):
         """Return the stages of all operators."""
         return [stage for operator in self.operators for stage in operator.stages(n)]
 
-    def _inside(self, q: NDArray, steps: NDArray | None) -> NDArray:
-        """Return the inner states (T, R, n) of all operators."""
-        states = []
+    def _each_inside(self, rows: NDArray, steps: NDArray) -> Iterator[NDArray]:
+        """Yield the inner states (N, n) of all operators."""
         for operator in self.operators:
-            states.append(operator._inside(q, steps))
-            q, _ = operator.apply(q, dt=steps)
-        return np.concatenate(states, axis=1)
+            yield from operator._each_inside(rows, steps)
+            rows = operator.followed(rows, steps)

@@ -9,11 +9,13 @@ import re
 import sys
 from collections.abc import Callable, Sequence
 from importlib.resources import files
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
 
 from hybridkin._core.text_rows import TextForm
 from hybridkin._core.texts import toml_value, visible
-from hybridkin._core.units import METRES
+from hybridkin._core.units import METRES, UNITS
 from hybridkin.cli._terminal import write
 from hybridkin.cli._values import (
     count,
@@ -25,6 +27,9 @@ from hybridkin.cli._values import (
     positive,
     signs,
 )
+
+if TYPE_CHECKING:
+    from hybridkin.workflow import MeasuredLog
 
 _NEEDED = object()  # the default of what must be given
 _Answers = dict[str, Any]
@@ -43,6 +48,8 @@ class _Question(NamedTuple):
 
 
 _KINDS = "tendons, elastic-tendons (they can go slack) or chambers (of measured length or pressure)"
+_AT_ZERO = 0.05  # of the range: first values this near to zero are zero
+_ALIKE = 0.05  # of the range: first values that differ by less are of one posture
 _EACH = "[mm]; one value, or one for each segment"
 _LENGTHS = ", ".join(METRES)
 _UNIT = f"unit of the actuators: {_LENGTHS}; deg or rad; another name, as counts or bar"
@@ -232,6 +239,38 @@ def _is_tip(three: Sequence[str]) -> bool:
     return len({"#".join(name.lower().rsplit(axis, 1)) for name, axis in axes}) == 1
 
 
+def with_zeros(answers: _Answers, log: MeasuredLog) -> tuple[_Answers, str]:
+    """Return the answers with the zeros of tendons from a log, and words for it.
+
+    They are the median of the first rows of all motions, if these are alike.
+    """
+    unit = answers["q_unit"]
+    is_length = unit in METRES
+    if _has_chambers(answers) or (answers["kind"] != "tendons" and not is_length):
+        return answers, ""
+    span = np.ptp(log.q, axis=0)
+    first = np.zeros(1, dtype=int)
+    if log.named:
+        _, first = np.unique(log.motions, return_index=True)
+    starts = log.q[first]
+    zeros = np.median(starts, axis=0)
+    if (np.abs(zeros) <= _AT_ZERO * span).all():
+        return answers, ""
+    if (np.median(np.abs(starts - zeros), axis=0) > _ALIKE * span).any():
+        words = (
+            "The actuators do not start at 0, and the motions do not start alike: give `zeros` of "
+            "every [[segment]], their values at the straight robot."
+        )
+        return answers, words
+    words = (
+        "The actuators do not start at 0: `zeros` are the median of the first rows of the motions "
+        f"({len(first)}). Check that the robot is straight there."
+    )
+    if not is_length:
+        zeros = zeros / UNITS.get(unit, 1.0)  # in the unit of the log
+    return {**answers, "zeros": [float(f"{zero:.6g}") for zero in zeros]}, words
+
+
 def description(answers: _Answers, name: str) -> str:
     """Return the robot description of the answers, every key with a comment."""
     template = (files("hybridkin.cli") / "robot.toml").read_text(encoding="utf-8")
@@ -263,8 +302,10 @@ def _segments(answers: _Answers) -> list[_Answers]:
         values: _Answers = {key: column[k] for key, column in columns.items()}
         values |= {"actuators": n_actuators, "clockwise": False, "angles": None}
         values["zeros"] = None
+        of_segment = slice(k * n_actuators, (k + 1) * n_actuators)
+        if "zeros" in answers:
+            values["zeros"] = answers["zeros"][of_segment]
         if all_angles:
-            of_segment = slice(k * n_actuators, (k + 1) * n_actuators)
             values |= dict.fromkeys(("actuators", "clockwise", "angle"))
             values["angles"] = angles[of_segment]
         if per_turn is not None:

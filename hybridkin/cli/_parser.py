@@ -16,7 +16,7 @@ from typing import Any, NoReturn
 
 import hybridkin
 from hybridkin._core.text_rows import DECIMALS
-from hybridkin._core.units import METRES, UNITS
+from hybridkin._core.units import FRAMES, METRES, SECONDS, UNITS
 from hybridkin.cli._init import QUESTIONS
 from hybridkin.cli._terminal import write
 from hybridkin.cli._values import (
@@ -131,8 +131,8 @@ def _init(command: argparse.ArgumentParser) -> None:
 
     The file has the geometry of the robot and the columns and units of its logs, each with a
     comment. `fit` can read it at once. On a terminal the command asks for what the options do not
-    say. With --log it proposes the columns by their names and checks the log against the
-    description, as `fit` does.
+    say. With --log it proposes the columns by their names, the zeros of tendons by the first rows of
+    the motions, and checks the log against the description, as `fit` does.
 
     Some examples:
       hybridkin init robot.toml --log log.csv
@@ -307,7 +307,7 @@ def _fit(command: argparse.ArgumentParser) -> None:
         help='backlash (play) of the actuators in the "auto" hybrid: its total width in the unit '
         "of q; auto: backlash, friction and creep, found in every fold (auto if the log shows any)",
     )
-    few = "use at most N rows, every k-th of a longer log; 0: all rows (2000)"
+    few = "use the tips of at most N rows, spread over motions; 0: of all rows (2000)"
     number = between(-1, float("inf"), int)
     add("--max-rows", type=number, default=2000, metavar="N", help=few)
     add(
@@ -494,21 +494,29 @@ def _verify(command: argparse.ArgumentParser) -> None:
     """Compare what a track promised with what the robot did.
 
     Compares the error that the model promised with that of the measured tips, in parts of the path,
-    and says how much of the mean squared error each likely cause explains: backlash, a moved base,
-    commands outside the log or off its plane.
+    and names the likely cause of a larger one: unit or axes of the tips, a late camera, a moved
+    base, the zero, gain, sign or place of an actuator, a slip, a dead actuator, a payload, backlash,
+    creep, misread rows, commands outside the log. It says how large the cause is, what explains as
+    much, and which motion tells them apart.
 
     Some examples:
       hybridkin verify model track measured.csv
       hybridkin verify model track measured.csv --time stamp --out verification
 
-    MEASURED has the columns of the log of the model, one row for each row of the track. With other
-    rows, --time names the column of the time: its first row is the first row of the track. Where
+    MEASURED has the columns of the log of the model, or those of the tip alone, one row for each row
+    of the track. With other rows, --time names the column of the time: its first row is the first
+    row of the track. Where
     the tips agree clearly better with earlier commands, the report says how late the camera is.
     """
     add = command.add_argument
     _add_model(command)
     add("track", type=Path, metavar="TRACK", help="track.csv or its folder")
-    add("log", type=Path, metavar="MEASURED", help="commands and measured tips")
+    add(
+        "log",
+        type=Path,
+        metavar="MEASURED",
+        help="measured tips, with commands or without",
+    )
     _add_delay(
         command, "each is compared with the command of its time (that of the track)"
     )
@@ -692,7 +700,10 @@ def _add_log(command: argparse.ArgumentParser) -> None:
     )
     text = "column that names the run, motions without a break between them; or none"
     add("--runs", metavar="COLUMN", help=text)
-    add("--time", metavar="COLUMN", help="column of the time [s]; or none")
+    add("--time", metavar="COLUMN", help="column of the time; or none")
+    add("--time-unit", choices=(*SECONDS, FRAMES), help="unit of the time (s)")
+    text = "frames per second, for --time-unit frames"
+    add("--rate", type=positive, metavar="HZ", help=text)
     _add_text_form(log)
     text = "leave out motions by name, such as '*tendon*'; may be repeated"
     add("--exclude", action="append", default=[], metavar="PATTERN", help=text)

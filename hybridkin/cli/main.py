@@ -25,16 +25,16 @@ import hybridkin  # its folders are opened when used: help comes at once
 from hybridkin._core.files import check_outputs, write_file
 from hybridkin._core.texts import visible
 from hybridkin._core.turns import one_thread
-from hybridkin._core.units import METRES
+from hybridkin._core.units import FRAMES, METRES
 from hybridkin.cli import _demo as demo
-from hybridkin.cli._init import answered, description
+from hybridkin.cli._init import answered, description, with_zeros
 from hybridkin.cli._parser import failed, parser
 from hybridkin.cli._terminal import Stages, write
 
 if TYPE_CHECKING:
     from hybridkin.chains.chain import Chain
     from hybridkin.chains.robots import Limits, LogFormat
-    from hybridkin.datasets import LogReport
+    from hybridkin.datasets import Log, LogReport
     from hybridkin.ik.trajectories import Trajectory
     from hybridkin.workflow import (
         Counts,
@@ -320,7 +320,7 @@ def _counts(arguments: argparse.Namespace, loaded: LoadedModel) -> Counts | None
 def _verify(arguments: argparse.Namespace, stages: Stages) -> _Result:
     loaded = _model_of(arguments)
     log_format = _log_format(arguments, loaded.log_format(), arguments.model)
-    log = _read(arguments, replace(log_format, groups=None), stages)
+    log = _measured_track(arguments, replace(log_format, groups=None), stages)
     report = hybridkin.workflow.verify_track(
         loaded,
         arguments.track,
@@ -330,6 +330,19 @@ def _verify(arguments: argparse.Namespace, stages: Stages) -> _Result:
         force=arguments.force,
     )
     return report, int(report.record.kept is False)
+
+
+def _measured_track(
+    arguments: argparse.Namespace, log_format: LogFormat, stages: Stages
+) -> Log:
+    """Return the measured tips of a track, with the commands where the file has them."""
+    columns = hybridkin.datasets.log_columns(arguments.log, arguments.delimiter)
+    # Columns of an array in an npz file are called name[0], name[1], ...
+    held = {name.split("[")[0] for name in columns}
+    if held & {name.split("[")[0] for name in log_format.q}:
+        return _read(arguments, log_format, stages)
+    stages.note("The file holds no commands: they are those of the track.")
+    return hybridkin.workflow.read_tips(arguments.log, log_format, arguments.delimiter)
 
 
 def _animate(arguments: argparse.Namespace, stages: Stages) -> _Result:
@@ -402,15 +415,16 @@ def _init(arguments: argparse.Namespace, stages: Stages) -> _Result:
     robot = _robot_of(text)
     log_format: LogFormat = robot.log
     check = None
+    about_zeros = ""
     log = answers["log"]
     if log is not None:
-        check = workflow.read_log(
-            log,
-            log_format,
-            chain=robot.chain,
-            base_is_free=robot.base_is_free,
-            delimiter=arguments.delimiter,
-        ).report
+        measured = _log_of_init(arguments, log, robot)
+        answers, about_zeros = with_zeros(answers, measured)
+        if "zeros" in answers:
+            text = description(answers, out.stem)
+            robot = _robot_of(text)
+            measured = _log_of_init(arguments, log, robot)
+        check = measured.report
         _note(check, stages)
     record = {"columns": log_format, "log_check": check}
     report = workflow.Report(f"{robot.name}: {robot.n_actuators} actuators", record)
@@ -430,10 +444,23 @@ def _init(arguments: argparse.Namespace, stages: Stages) -> _Result:
         look=shlex.join(look),
         fit=shlex.join(fit),
     )
+    if about_zeros:
+        report.text(about_zeros)
     check_outputs([out], "init", lambda _: False, force=arguments.force)
     write_file(out, partial(Path.write_text, data=text, encoding="utf-8"))
     report.paths = [out]
     return report, int(check is not None and not check.ok)
+
+
+def _log_of_init(arguments: argparse.Namespace, log: Path, robot: Any) -> MeasuredLog:
+    """Return the log of a new description, read and checked."""
+    return hybridkin.workflow.read_log(
+        log,
+        robot.log,
+        chain=robot.chain,
+        base_is_free=robot.base_is_free,
+        delimiter=arguments.delimiter,
+    )
 
 
 def _robot_of(text: str) -> Any:
@@ -558,6 +585,7 @@ def _read(
 
 _COLUMNS = ("q", "x", "q_unit", "x_unit", "q_sign", "groups", "runs", "time")
 _FORM = ("header_line", "decimal", "missing", "unwrap")
+_TIME = ("time_unit", "rate")
 
 
 def _log_format(
@@ -565,7 +593,9 @@ def _log_format(
 ) -> LogFormat:
     """Return how the log is written: as described, with what the options say instead."""
     entries = {}
-    for name in (*_COLUMNS, *_FORM):
+    if arguments.time_unit not in (None, FRAMES):
+        entries["rate"] = None  # that of the description is one of frames
+    for name in (*_COLUMNS, *_TIME, *_FORM):
         value = vars(arguments)[name]
         if value is not None:
             entries[name] = None if value == "none" else value

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from numbers import Real
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,13 +100,13 @@ def given_periods(
                 "got True."
             )
         return [usual] * len(names)
-    by_name = unwrap
-    if not isinstance(unwrap, Mapping):
-        by_name = dict.fromkeys(names, unwrap)
+    by_name: Mapping[str, Any] = dict.fromkeys(names, unwrap)
+    if isinstance(unwrap, Mapping):
+        by_name = unwrap
     unknown = {*by_name} - {*names}
     for name, period in by_name.items():
         is_number = isinstance(period, Real) and not isinstance(period, bool)
-        good = is_number and 0.0 < period < np.inf
+        good = is_number and 0.0 < float(period) < np.inf
         if unknown or not good:
             raise ValueError(
                 "`unwrap` must be true, a positive period in the unit of the file, or such a "
@@ -291,8 +292,11 @@ def _believed(
     doubtful = []
     for fault in faults:
         steps = np.abs(np.diff(fault.mended(q)[:, fault.column]))
-        sudden = steps.max() <= _SUDDEN * fault.period and calm[fault.rows].all()
-        (believed if sudden else doubtful).append(fault)
+        is_small = bool(steps.max() <= _SUDDEN * fault.period)
+        if is_small and calm[fault.rows].all():
+            believed.append(fault)
+        else:
+            doubtful.append(fault)
     certain = q
     for fault in believed:
         certain = fault.mended(certain)
@@ -323,8 +327,8 @@ def _error_in_rows(q: NDArray, x: NDArray, fault: EncoderFault) -> float:
 
     It is infinite if the model does not explain these rows better without the glitch.
     """
-    known = np.isfinite(x).all(axis=1)
-    rows = fault.rows[known[fault.rows]]
+    unknown = np.flatnonzero(np.isnan(x).any(axis=1))
+    rows = np.setdiff1d(fault.rows, unknown)
     usual = np.setdiff1d(_some_measured(x), rows)
     weights = np.linalg.lstsq(_features(q[usual], q[usual]), x[usual])[0]
     errors = []

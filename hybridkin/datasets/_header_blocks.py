@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from hybridkin._core.text_rows import Row, is_number
-from hybridkin._core.units import METRES
+from hybridkin._core.units import METRES, UNITS
 
 TIME = "Time (Seconds)"
 """Name of the times that follow from the rate of a file."""
@@ -22,7 +22,9 @@ _LENGTHS = {  # as Motive writes them
     "inches": "in",
 }
 _AXES = ("X", "Y", "Z", "W")
+_SIGNS_OF_UNITS = {*UNITS, "s", "ms", "us", "ns", "bar", "kPa", "Pa", "N"} - {"1"}
 _AXIS = re.compile("([RT]?)([XYZW]'*)")  # of Vicon; X' is a speed
+_OF_BODY = re.compile(r"[XYZ]|Roll|Pitch|Yaw|Residual|Rot\[\d\]")  # of Qualisys
 _OF_BODIES = {"R": "rot "}
 
 
@@ -67,7 +69,7 @@ class HeaderBlock(ABC):
 
 
 class Plain(HeaderBlock):
-    """Names of columns in the first row."""
+    """Names of columns in the first row, perhaps behind "#", and units in the second."""
 
     def recognises(self, rows: Sequence[Row]) -> bool:
         """Return True."""
@@ -75,8 +77,24 @@ class Plain(HeaderBlock):
 
     def header(self, rows: Sequence[Row]) -> Header:
         """Return the names."""
-        names = [cell.strip() for cell in rows[0].cells]
-        return Header(rows[0].line, names, slice(1, None))
+        first, *others = [cell.strip() for cell in rows[0].cells]
+        names = [first.lstrip("# "), *others]
+        if not first.strip("# ") and len(others) == len(_filled_cells(rows[-1])):
+            names = others  # a "#" that spaces set apart
+        if not _holds_units(rows[1:2]):
+            return Header(rows[0].line, names, slice(1, None))
+        units = {}
+        for name, cell in zip(names, rows[1].cells, strict=False):
+            unit = _bare(cell)
+            if unit in UNITS and unit != "1":
+                units[name] = unit
+        return Header(
+            rows[0].line,
+            names,
+            slice(2, None),
+            units,
+            f"line {rows[1].line} holds the units",
+        )
 
 
 class Motive(HeaderBlock):
@@ -236,13 +254,27 @@ class Qualisys(HeaderBlock):
                     continue
             elif name.endswith(" X") and name[:-2] in objects:
                 body = name[:-2]
-            elif body and not any(name.startswith(f"{other} ") for other in objects):
+            elif body and _OF_BODY.fullmatch(name):
                 name = f"{body} {name}".strip()
             full.append(name)
         return full
 
 
 KINDS: tuple[HeaderBlock, ...] = (Motive(), Vicon(), Qualisys(), Plain())
+
+
+def _holds_units(rows: Sequence[Row]) -> bool:
+    """Return whether a row below names has no number, but the sign of a unit."""
+    for row in rows:
+        cells = [_bare(cell) for cell in row.cells]
+        no_numbers = not any(cell and is_number(cell) for cell in cells)
+        return no_numbers and any(cell in _SIGNS_OF_UNITS for cell in cells)
+    return False
+
+
+def _bare(cell: str) -> str:
+    """Return the text of a cell without spaces and brackets."""
+    return cell.strip().strip("[]()").strip()
 
 
 def _first_cell(row: Row) -> str:

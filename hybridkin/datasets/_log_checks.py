@@ -111,7 +111,11 @@ def check_log(
         if chain is not None and chain.takes_lengths:
             findings += geometry_findings(rows.log, chain, base_is_free)
         if not any(finding.kind in (*MISREAD, "encoder") for finding in findings):
-            findings += residual_findings(rows.log, chain, rows.same_motion)
+            residual = [*residual_findings(rows.log, chain, rows.same_motion)]
+            if any(finding.kind == "lag" for finding in residual):
+                # A tip of another time is not what the nominal model explains.
+                findings = [f for f in findings if f.kind != "geometry"]
+            findings += residual
     findings.sort(key=lambda finding: SEVERITIES.index(finding.severity))
     ranges = np.stack([columns.min(axis=0), columns.max(axis=0)], axis=1)
     return LogReport(

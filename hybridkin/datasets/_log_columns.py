@@ -9,8 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hybridkin._core.clock import clock_doubt
 from hybridkin._core.directions import in_terms, moved_directions
 from hybridkin._core.distinct import distinct_rows
+from hybridkin._core.runs import RunOrder
+from hybridkin._core.units import FRAMES, duration_in_words
+from hybridkin.chains.reversals import Coarseness
 from hybridkin.datasets._log_report import LogFinding, named_rows
 from hybridkin.datasets._logs import Log, column_names
 
@@ -74,12 +78,9 @@ class LogRows:
         return groups[1:] == groups[:-1]
 
     @property
-    def same_run(self) -> NDArray:
-        """Whether each row and the next follow without a break, shape (N - 1,)."""
-        runs = self.log.runs
-        if runs is None:
-            return self.same_motion
-        return runs[1:] == runs[:-1]
+    def runs(self) -> NDArray:
+        """The run of every row, without such a column its motion (N,)."""
+        return self.log.commands.run_of_rows
 
 
 def frozen_tip(rows: LogRows) -> Iterator[LogFinding]:
@@ -288,29 +289,68 @@ def jumps(rows: LogRows) -> Iterator[LogFinding]:
 
 
 def times(rows: LogRows) -> Iterator[LogFinding]:
-    """Yield rows whose time does not increase, and gaps in time, within a motion or run."""
-    if rows.log.time is None:
+    """Yield a wrong unit of time, rows whose time does not increase in a run, and gaps.
+
+    Times may restart with each run.
+    """
+    time = rows.log.time
+    if time is None:
         return
-    step = np.diff(rows.log.time)
-    late = np.flatnonzero((rows.same_motion | rows.same_run) & (step <= 0)) + 1
+    doubt = clock_doubt(time, rows.runs)
+    if doubt.unit:
+        message = f"{doubt.reason}, which are hardly seconds."
+        if doubt.certain:
+            message = f"{doubt.reason}: these are no seconds."
+        severity = "warning"
+        if doubt.unit == FRAMES:
+            severity = "note"
+        advice = f"{doubt.way_out}."
+        yield rows.finding("time", message, advice, severity=severity)
+    order = RunOrder.of(rows.runs)
+    steps = order.steps(time)
+    late = np.sort(order.order[(steps <= 0.0) & ~order.first])
     if len(late):
         message = f"times do not increase at {len(late)} rows ({rows.named(late)})."
-        advice = "sort the rows by time in each motion; backlash and lag depend on the order."
+        advice = (
+            "sort the rows by time in each run; backlash and lag depend on the order. If times "
+            "restart with each recording, name it: --runs COLUMN, or runs = in [log]."
+        )
         yield rows.finding("time", message, advice, late)
-    increasing = step[rows.same_motion & (step > 0)]
-    if len(increasing) < 10:
+    if (steps > 0.0).sum() < 10:
         return
-    usual = np.median(increasing)
-    gaps = np.flatnonzero(rows.same_motion & (step > _GAP * usual)) + 1
+    usual = np.median(steps[steps > 0.0])
+    is_gap = steps > _GAP * usual
+    gaps = np.sort(order.order[is_gap])
     if len(gaps):
         message = (
-            f"{len(gaps)} gaps in time within a motion, up to {step[gaps - 1].max():.4g} s; the "
-            f"usual step is {usual:.4g} s ({rows.named(gaps)})."
+            f"{len(gaps)} gaps in time within a run, up to "
+            f"{duration_in_words(steps[is_gap].max())}; the usual step is "
+            f"{duration_in_words(usual)} ({rows.named(gaps)})."
         )
         advice = (
             "rows were lost or the robot waited; if it was touched, name two motions."
         )
         yield rows.finding("time", message, advice, gaps)
+
+
+def reversals(rows: LogRows) -> Iterator[LogFinding]:
+    """Yield a finding if actuators reverse at more than a third of the rows of a run."""
+    log = rows.log
+    if log.groups is None and log.runs is None:
+        return
+    coarse = Coarseness.of(log.q, rows.runs)
+    if coarse.shows_reversals:
+        return
+    name, _ = rows.columns("q")[int(coarse.share.argmax())]
+    message = (
+        f"actuator {name!r} reverses at {100.0 * coarse.share.max():.0f} % of the rows within "
+        "runs: what the actuators do between the rows is not in the log."
+    )
+    advice = (
+        "this is right for postures at rest; to find backlash, friction or creep, record rows "
+        "closer in time, also those without a measured tip."
+    )
+    yield rows.finding("reversals", message, advice, severity="note")
 
 
 def few_rows(rows: LogRows) -> Iterator[LogFinding]:
@@ -351,6 +391,7 @@ COLUMN_CHECKS: tuple[Callable[[LogRows], Iterator[LogFinding]], ...] = (
     same_commands,
     jumps,
     times,
+    reversals,
     few_rows,
     motions,
 )

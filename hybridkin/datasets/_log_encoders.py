@@ -25,7 +25,8 @@ def encoder_findings(rows: LogRows) -> Iterator[LogFinding]:
     names = column_names(log, "q")
     readings = log.q / np.multiply(log.q_sign, UNITS.get(q_unit, 1.0))
     periods = [periods_of(q_unit)] * len(names)
-    for fault in encoder_faults(readings, log.x, rows.same_run, periods):
+    same_run = rows.runs[1:] == rows.runs[:-1]
+    for fault in encoder_faults(readings, log.x, same_run, periods):
         where = rows.named(fault.rows)
         period = f"{fault.period:.10g}"
         name = names[fault.column]

@@ -13,7 +13,19 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from hybridkin._core.directions import in_terms
 from hybridkin._core.units import METRES
+from hybridkin.causes.alignment import Alignment, FreeBase, FreeOrigin
+from hybridkin.causes.commands import FirstRow, Size, Zero, ZeroDrift
+from hybridkin.causes.comparison import (
+    READINGS,
+    VALUES,
+    CauseComparison,
+    Explanation,
+    compare_causes,
+)
+from hybridkin.causes.evidence import Actuators, Evidence
+from hybridkin.causes.motion import Motion
 from hybridkin.datasets._log_order import (
     SIMPLE,
     base_turn,
@@ -27,6 +39,7 @@ from hybridkin.datasets._logs import Log, column_names
 
 if TYPE_CHECKING:
     from hybridkin.chains.arc_chain import ArcChain
+    from hybridkin.chains.chain import ActuatorLayout
 
 _FACTORS = (1e-3, 1e-2, 1e-1, 10.0, 100.0, 1000.0)
 _ROWS = 500  # enough to distinguish a robot from its mirror image
@@ -49,8 +62,15 @@ _GOOD = 0.55  # relative error of another reading
 _ENOUGH = 0.85  # explained part of the variance
 _TWIST = 120.0  # [deg] least rotation of a base about its axis
 _TILT = 45.0  # [deg] largest tilt of a base
-_BENDS = (0.25, 0.4, 0.5, 0.65, 1.5, 2.0, 2.5, 4.0)  # tried factors on all bends
-_SHIFTS = (-2.0, -1.0, -0.5, -0.25, 0.25, 0.5, 1.0, 2.0)  # in standard deviations
+_FAR_FEWER = (
+    0.6  # error of many changes relative to that of one, from which they are named
+)
+_WORTH = 0.3  # relative error from which columns of q and x may be exchanged
+_UNBALANCED = 0.1  # the same, from which tendons are not in balance
+_MOST_FLIPPED = 3  # signs that balance can correct
+_BALANCED = (
+    0.02  # of the spread of the tendons: motion along a direction that counts as none
+)
 _SHIFTED = 0.87  # relative error; for clean logs, simulated and real, it was above 0.89
 _ADVICE = {
     "axes": "check order and signs of the columns of x, which must be right-handed, and [base] of "
@@ -59,11 +79,14 @@ _ADVICE = {
     'actuators lie, and the unit of q; or list "radii" in `calibrate`.',
     "offset": "correct its zero, or list the zeros (`actuator_zeros` or `tendon_zeros`) in "
     "`calibrate`.",
+    "zeros": "set `zeros` in every [[segment]] to the values of the straight robot; `hybridkin "
+    "init` proposes them.",
     "drift": "look for a slipping spool or sensor; fit the parts of the log separately.",
     "geometry": "check which columns are q and x, their order, the zero of each actuator, the "
     "angles, the routing, the lengths and, if it is not fitted, [base].",
-    "whole": "subtract from each column its value at the straight robot; or, for chambers that "
-    "stretch, remove `length` from every [[segment]].",
+    "whole": "subtract from each column its value at the straight robot, or give these values as "
+    "`zeros` of every [[segment]], which `hybridkin init` proposes; or, for chambers that stretch, "
+    "remove `length` from every [[segment]].",
     "changes": "if the log holds changes of length, add the length at rest to each; or, for a "
     "robot with tendons on a backbone of fixed length, give `length` in every [[segment]].",
 }
@@ -76,7 +99,12 @@ def geometry_findings(
     findings = [*_negated_zeros(log, chain)]
     if findings:
         return findings
-    comparison = _Comparison(*_in_metres(log, chain), base_is_free)
+    layout = chain.actuator_layout
+    rest = chain.metres(torch.from_numpy(layout.rest)).detach().cpu().numpy()
+    layout = layout._replace(rest=rest)
+    log, chain = _in_metres(log, chain)
+    layout = layout._replace(balance=chain.actuator_layout.balance)
+    comparison = _Comparison(log, chain, layout, base_is_free)
     checks = _CHECKS_OF_VALUES
     if comparison.comparable:
         checks += _CHECKS_OF_MOTION
@@ -106,9 +134,12 @@ class _Comparison:
     Relative errors are those of `misses`.
     """
 
-    def __init__(self, log: Log, chain: ArcChain, base_is_free: bool) -> None:
+    def __init__(
+        self, log: Log, chain: ArcChain, layout: ActuatorLayout, base_is_free: bool
+    ) -> None:
         self.log = log
         self.chain = chain
+        self.layout = layout
         self.base_is_free = base_is_free
         self.q_names = column_names(log, "q")
         self.radii = chain.radii.detach().cpu().double().numpy()
@@ -151,39 +182,66 @@ class _Comparison:
         """A better way to read the columns of q, and its relative error."""
         return better_way(self.chain, self.q, self.x, self.base_is_free)
 
-    @cached_property
-    def best_change(self) -> tuple[str, str, float]:
-        """The kind of the change of q that helps most, in words, and the error over that without.
-
-        The changes are a factor on all bends, as from wrong radii, and an offset or a drift of one
-        actuator.
-        """
+    def _evidence(self, alignment: Alignment) -> Evidence:
+        """Return the few rows as evidence."""
+        n_rows = len(self.few_q)
         q = self.few_q
-        kinds = []
-        changed = []
-        straight = np.zeros_like(q)
-        for columns in self.segments:
-            straight[:, columns] = q[:, columns].mean(axis=1, keepdims=True)
-        straight[:, self.pulled] = 0.0
-        for factor in _BENDS:
-            kinds.append(("size", f"its bends are {factor:g} times as large"))
-            changed.append(straight + factor * (q - straight))
-        growth = (
-            ("offset", "is off", np.ones(len(q))),
-            ("drift", "drifts", np.linspace(0.0, 1.0, len(q))),
+        per_unit = np.full(q.shape[1], 1e-3)
+        return Evidence(
+            motion=Motion.of(q, None, None),
+            rows=np.arange(n_rows),
+            x=self.few_x,
+            model=self.chain,
+            bodies=[self.chain],
+            actuators=Actuators(self.q_names, "mm", per_unit, self.layout),
+            inside=np.ones(n_rows, dtype=bool),
+            off_plane=np.zeros_like(q),
+            promised=0.0,
+            low=q.min(axis=0),
+            high=q.max(axis=0),
+            alignment=alignment,
         )
-        for kind, verb, shape in growth:
-            for i, shift in itertools.product(range(q.shape[1]), _SHIFTS):
-                far = 1e3 * abs(shift) * self.q[:, i].std()
-                problem = f"actuator {self.q_names[i]!r} {verb} by about {far:.1g} mm"
-                kinds.append((kind, problem))
-                shifted = q.copy()
-                shifted[:, i] += shift * q[:, i].std() * shape
-                changed.append(shifted)
-        errors = misses(self.chain, np.array(changed), self.few_x, True)
-        kind, problem = kinds[int(np.argmax(errors < SIMPLE * errors.min()))]
-        ratio = errors.min() / self.error(q, self.few_x)
-        return kind, problem, float(ratio)
+
+    def imbalance(self, q: NDArray) -> float:
+        """Return how far rows q (N, n) move where tendons in balance do not, of all motion."""
+        balance = self.layout.balance
+        moved = q - q.mean(axis=0)
+        size = max(float(np.linalg.norm(moved)), np.finfo(float).tiny)
+        return float(np.linalg.norm(moved @ balance)) / size
+
+    def keeps_balance(self, way: NDArray) -> bool:
+        """Return whether tendons are as much in balance with another way to read the columns."""
+        declared = max(self.imbalance(self.q), _BALANCED)
+        return self.imbalance(self.q @ way) < 2.0 * declared
+
+    def read(self, q: NDArray, way: NDArray) -> NDArray:
+        """Return rows q (N, n) that are read in another way; rest stays rest."""
+        return self.layout.rest + (q - self.layout.rest) @ way
+
+    @cached_property
+    def reading(self) -> tuple[NDArray, float]:
+        """The best single change of how the columns are read, and its relative error."""
+        alignment = FreeBase() if self.base_is_free else FreeOrigin()
+        compared = compare_causes(self._evidence(alignment), READINGS)
+        best = np.eye(self.q.shape[1], dtype=int)
+        least = self.declared_error
+        for explanation in compared.explanations:
+            way = explanation.cause.way(compared.evidence).astype(int)
+            error = self.error(self.read(self.q, way), self.x, self.base_is_free)
+            if error * SIMPLE < least and self.keeps_balance(way):
+                best = way
+                least = error
+        return best, least
+
+    @cached_property
+    def values(self) -> CauseComparison:
+        """Wrong values compared: the size of the bends, zeros, drifts."""
+        return compare_causes(self._evidence(FreeBase()), VALUES)
+
+    @property
+    def better_values(self) -> float:
+        """The error with the best wrong value, relative to that without."""
+        return self.values.best.mean / self.values.nothing.mean
 
     def better(self, error: float, reading: str) -> str:
         """Return a message that another reading explains more of the motion."""
@@ -371,6 +429,8 @@ def _turned_axes(comparison: _Comparison) -> Iterator[LogFinding]:
 def _exchanged_columns(comparison: _Comparison) -> Iterator[LogFinding]:
     """Yield a column of q and one of x that explain far more if they are exchanged."""
     least = comparison.better_way[1]
+    if least < _WORTH:
+        return
     exchanges = []
     for i, j in itertools.product(range(comparison.q.shape[1]), range(3)):
         q = comparison.few_q.copy()
@@ -386,12 +446,71 @@ def _exchanged_columns(comparison: _Comparison) -> Iterator[LogFinding]:
         yield LogFinding("exchanged", "warning", message, "exchange these two columns.")
 
 
+def _unbalanced(comparison: _Comparison) -> Iterator[LogFinding]:
+    """Yield the fewest changes with which the tendons of a log are in balance, as never without."""
+    if comparison.imbalance(comparison.q) < _UNBALANCED:
+        return
+    for ways in _few_changes(comparison.layout):
+        balanced = []
+        for way in ways:
+            if comparison.imbalance(comparison.few_q @ way) < _BALANCED:
+                error = comparison.error(comparison.few_q @ way, comparison.few_x)
+                balanced.append((error, len(balanced), way))
+        if balanced:
+            break
+    else:
+        return
+    way = min(balanced)[-1]
+    names = comparison.q_names
+    of_log = in_terms(way @ comparison.layout.balance, names).split("; ")
+    of_tendons = in_terms(comparison.layout.balance, names).split("; ")
+    never = "; ".join(term for term in of_log if term not in of_tendons)
+    wanted = "; ".join(term for term in of_tendons if term not in of_log)
+    kind, causes, advice = _reading_in_words(comparison, way)
+    message = (
+        f"the log has no motion along {never}, but tendons that do not pull against each other "
+        f"have none along {wanted}, as with {causes}."
+    )
+    yield LogFinding(kind, "warning", message, advice)
+
+
+def _few_changes(layout: ActuatorLayout) -> Iterator[list[NDArray]]:
+    """Yield the ways with one change that balance can show, then those with more signs."""
+    n = len(layout.rest)
+    declared = np.eye(n, dtype=int)
+    single = []
+    for one, other in itertools.combinations(layout.segments, 2):
+        for i, j in itertools.product(one, other):
+            order = np.arange(n)
+            order[[i, j]] = [j, i]
+            single.append(declared[:, order])
+    for n_flipped in range(1, _MOST_FLIPPED + 1):
+        ways = single if n_flipped == 1 else []
+        for flipped in itertools.combinations(range(n), n_flipped):
+            signs = np.ones(n, dtype=int)
+            signs[[*flipped]] = -1
+            ways = [*ways, np.diag(signs)]
+        yield ways
+
+
 def _misread_columns(comparison: _Comparison) -> Iterator[LogFinding]:
     """Yield another numbering, order or signs of the columns of q that explain far more."""
-    way, error = comparison.better_way
-    ratio = comparison.best_change[2]
-    if error >= min(comparison.good_error, ratio * comparison.declared_error):
+    way, error = comparison.reading
+    limit = min(
+        comparison.good_error, comparison.better_values * comparison.declared_error
+    )
+    many, error_of_many = comparison.better_way
+    if error_of_many < _FAR_FEWER * error and comparison.keeps_balance(many):
+        way = many
+        error = error_of_many
+    if error >= limit:
         return
+    kind, causes, advice = _reading_in_words(comparison, way)
+    yield LogFinding(kind, "warning", comparison.better(error, causes), advice)
+
+
+def _reading_in_words(comparison: _Comparison, way: NDArray) -> tuple[str, str, str]:
+    """Return the kind of another way to read the columns of q, what is wrong, and advice."""
     log = comparison.log
     chain = comparison.chain
     order = np.abs(way).argmax(axis=0).tolist()
@@ -423,8 +542,7 @@ def _misread_columns(comparison: _Comparison) -> Iterator[LogFinding]:
             flipped = ", ".join(repr(names[i]) for i in np.flatnonzero(sign < 0))
         causes.append(f"the sign of {flipped} flipped")
         advice.append(_sign_advice(log, way))
-    message = comparison.better(error, " and ".join(causes))
-    yield LogFinding(kind, "warning", message, " ".join(advice))
+    return kind, " and ".join(causes), " ".join(advice)
 
 
 def _turned_base(comparison: _Comparison) -> Iterator[LogFinding]:
@@ -443,13 +561,31 @@ def _turned_base(comparison: _Comparison) -> Iterator[LogFinding]:
 
 
 def _changed_values(comparison: _Comparison) -> Iterator[LogFinding]:
-    """Yield wrong radii, or the offset or drift of one actuator, that explain far more."""
-    kind, problem, ratio = comparison.best_change
-    if ratio < (_FAR_BETTER if kind == "size" else _SHIFTED):
+    """Yield wrong radii, zeros or the drift of one actuator, that explain far more."""
+    compared = comparison.values
+    best = compared.best
+    if best is compared.nothing:
+        return
+    kind, largest, words = _VALUES[type(best.cause)]
+    ratio = comparison.better_values
+    if ratio < largest:
+        problem = words(comparison, best)
         message = (
             f"the error of the nominal model falls to {100 * ratio:.0f} % if {problem}."
         )
         yield LogFinding(kind, "warning", message, _ADVICE[kind])
+
+
+def _in_words(comparison: _Comparison, best: Explanation) -> str:
+    """Return how large a wrong value is."""
+    return best.cause.amount(comparison.values.evidence, best.parameters)
+
+
+def _shift_in_words(comparison: _Comparison, best: Explanation) -> str:
+    """Return the actuator with another zero, and how far it is off or drifts."""
+    verb = "is off" if isinstance(best.cause, Zero) else "drifts"
+    far = 1e3 * abs(float(best.parameters[0]))
+    return f"actuator {comparison.q_names[best.cause.actuator]!r} {verb} by about {far:.1g} mm"
 
 
 def _unexplained(comparison: _Comparison) -> Iterator[LogFinding]:
@@ -477,11 +613,20 @@ def _sign_advice(log: Log, way: NDArray) -> str:
     return f"set q_sign = {sign[0]} in [log] of the robot description, or --q-sign={sign[0]}."
 
 
+_VALUES = {
+    Size: ("size", _FAR_BETTER, _in_words),
+    Zero: ("offset", _SHIFTED, _shift_in_words),
+    ZeroDrift: ("drift", _SHIFTED, _shift_in_words),
+    FirstRow: ("zeros", _FAR_BETTER, _in_words),
+}
+"""Kind of the finding, largest relative error that is worth a word, and words of a wrong value."""
+
 _Check = Callable[[_Comparison], Iterator[LogFinding]]
 _CHECKS_OF_VALUES: tuple[_Check, ...] = (_no_lengths, _wrong_units, _only_lengthened)
 _CHECKS_OF_MOTION: tuple[_Check, ...] = (
     _turned_axes,
     _exchanged_columns,
+    _unbalanced,
     _misread_columns,
     _turned_base,
     _changed_values,

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from hybridkin._core.stored import plain
 from hybridkin._core.texts import visible
+from hybridkin._core.units import duration_in_words
 
 SEVERITIES = ("error", "warning", "note")
 MISREAD = ("units", "order", "sign", "numbering", "axes", "size")
@@ -26,8 +27,9 @@ class LogFinding:
     Attributes
     ----------
     kind : str
-        "invalid", "missing", "frozen tip", "frozen actuator", "constant", "duplicates",
-        "same command", "jumps", "time", "motions", "rows", "same column", "drift", "lag", "offset",
+        "invalid", "missing", "encoder", "frozen tip", "frozen actuator", "constant", "duplicates",
+        "same command", "jumps", "time", "reversals", "motions", "rows", "same column", "drift",
+        "lag", "offset",
         "units", "order", "sign", "numbering", "axes", "size" or "geometry".
     severity : {"error", "warning", "note"}
         "error": a fit would be worthless; "warning": check it; "note": information.
@@ -140,7 +142,7 @@ class LogReport:
             f"{self.n_actuators} actuators"
         )
         if self.duration is not None:
-            head += f", {self.duration:.4g} s"
+            head += f", {duration_in_words(self.duration)}"
         scale, unit = _SHOWN_IN.get(self.q_unit, (1.0, ""))
         low = scale * self.q_range.min()
         high = scale * self.q_range.max()

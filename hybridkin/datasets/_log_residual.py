@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from hybridkin._core.spread import spread
 from hybridkin.datasets._log_report import LogFinding
 from hybridkin.datasets._logs import Log
 
@@ -20,6 +21,7 @@ _LAGS = 10  # largest lag of the tip in rows, in both directions
 # simulated logs and recordings of real robots without drift or lag it was above 0.89.
 _DRIFT = 0.8
 _LAG = 0.6
+_MOST = 50_000  # rows of a fit
 
 
 def residual_findings(
@@ -84,7 +86,13 @@ def _features(q: NDArray, chain: ArcChain | None) -> NDArray:
 
 
 def _left(features: NDArray, x: NDArray) -> float:
-    """Return the rms residual of x by least squares over the rms of x about its mean."""
+    """Return the rms residual of x by least squares over the rms of x about its mean.
+
+    Of a long log some rows are enough, spread over it.
+    """
+    rows = spread(len(x), _MOST)
+    features = features[rows]
+    x = x[rows]
     weights, *_ = np.linalg.lstsq(features, x, rcond=None)
     residual = x - features @ weights
     centred = x - x.mean(axis=0)

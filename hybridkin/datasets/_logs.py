@@ -22,11 +22,12 @@ from hybridkin._core.arrays import (
 )
 from hybridkin._core.commands import Commands
 from hybridkin._core.text_rows import TextForm
-from hybridkin._core.units import METRES, UNITS
+from hybridkin._core.units import METRES, UNITS, duration_in_words
 from hybridkin.datasets._encoders import given_periods, unwrapped
 from hybridkin.datasets._frames import frame_table
 from hybridkin.datasets._log_report import named_rows
-from hybridkin.datasets._tables import UNNAMED, Table
+from hybridkin.datasets._tables import UNNAMED, Table, without_missing
+from hybridkin.datasets._time import seconds_per_unit
 from hybridkin.datasets.table_files import read_table
 
 
@@ -105,14 +106,17 @@ class Log:
         if self.groups is not None:
             head += f", {len(np.unique(self.groups))} motions"
         names = ", ".join(column_names(self, "q"))
-        values = f"{self.q.min():.4g} to {self.q.max():.4g} {self.units['q']}"
+        values = "no commands"
+        if self.q.size:
+            values = f"{self.q.min():.4g} to {self.q.max():.4g} {self.units['q']}"
         lines = [
             head,
             f"{self.q.shape[1]} actuators: {names}; {values}",
             f"tips within {span} {self.units['x']}",
         ]
         if self.time is not None:
-            lines.append(f"time from {self.time[0]:.6g} to {self.time[-1]:.6g} s")
+            duration = duration_in_words(float(np.ptp(self.time)))
+            lines.append(f"time from {self.time[0]:.6g} s, {duration} long")
         return "\n  ".join(lines)
 
     @classmethod
@@ -125,6 +129,8 @@ class Log:
         *,
         runs: str | None = None,
         time: str | None = None,
+        time_unit: str = "s",
+        rate: float | None = None,
         q_unit: str = "m",
         x_unit: str = "m",
         q_sign: ArrayLike = 1,
@@ -138,7 +144,9 @@ class Log:
         ----------
         df : data frame
             A frame of pandas, polars, modin or narwhals, or a table of pyarrow. Null is missing.
-        q, x, groups, runs, time, q_unit, x_unit, q_sign, missing, unwrap, drop_invalid
+        q, x, groups, runs, time, time_unit, rate
+            As for `load_log`.
+        q_unit, x_unit, q_sign, missing, unwrap, drop_invalid
             As for `load_log`.
 
         Returns
@@ -164,7 +172,9 @@ class Log:
         """
         table = frame_table(df, "data frame")
         columns = _Columns.of(table, q, x, time, {"groups": groups, "runs": runs})
-        conversion = _Conversion(q_unit, x_unit, q_sign, missing, unwrap)
+        conversion = _Conversion(
+            q_unit, x_unit, q_sign, missing, unwrap, time_unit, rate
+        )
         return _converted(table, columns, conversion, drop_invalid)
 
     @property
@@ -198,6 +208,8 @@ def load_log(
     *,
     runs: str | None = None,
     time: str | None = None,
+    time_unit: str = "s",
+    rate: float | None = None,
     q_unit: str = "m",
     x_unit: str = "m",
     q_sign: ArrayLike = 1,
@@ -219,6 +231,7 @@ def load_log(
     q : sequence of str
         Columns of the actuator vector, in the order of the robot model. In an npz file an array
         (N,) is a column; ``"name[2]"`` is column 2 of an array (N, k), ``"name"`` all its columns.
+        Empty: a recording of a camera alone.
     x : sequence of 3 str, or of 3 K
         Columns of the tip position, or of the positions of K markers, the last of which is the tip.
         A row without some markers is kept, with NaN for these.
@@ -228,8 +241,12 @@ def load_log(
         Column that names the run of a row, for models with hysteresis, see `Commands`. Default:
         every motion is a run.
     time : str or None, default=None
-        Column of the time stamp [s]. In npz and parquet files also dates, which become seconds
-        since 1970 (UTC), and durations.
+        Column of the time stamp. In npz and parquet files also dates, which become seconds since
+        1970 (UTC), and durations.
+    time_unit : {"s", "ms", "us", "ns", "frames"}, default="s"
+        Unit of the time stamps in the file; dates and durations have their own.
+    rate : float or None, default=None
+        Frames per second, for ``time_unit="frames"`` [1/s].
     q_unit : {"m", "cm", "mm", "um", "in", "rad", "deg", "1", "counts"}, default="m"
         Unit of the actuator columns in the file; lengths become metres and angles radians. "1" is
         not converted: counts or pressures, for a chain with `gains`. "counts" is another name of
@@ -301,7 +318,7 @@ def load_log(
     """
     table = read_table(as_path(path), TextForm(delimiter, header_line, decimal))
     columns = _Columns.of(table, q, x, time, {"groups": groups, "runs": runs})
-    conversion = _Conversion(q_unit, x_unit, q_sign, missing, unwrap)
+    conversion = _Conversion(q_unit, x_unit, q_sign, missing, unwrap, time_unit, rate)
     return _converted(table, columns, conversion, drop_invalid)
 
 
@@ -345,7 +362,9 @@ class _Columns(NamedTuple):
         labels: Mapping[str, str | None],
     ) -> Self:
         """Return the names as the table has them."""
-        of_q = table.names("q", q)
+        of_q = []
+        if not isinstance(q, (list, tuple)) or q:
+            of_q = table.names("q", q)
         of_x = table.names("x", x)
         if len(of_x) % 3:
             raise ValueError(
@@ -367,24 +386,13 @@ class _Conversion(NamedTuple):
     q_sign: ArrayLike
     missing: ArrayLike
     unwrap: bool | float | Mapping[str, float]
+    time_unit: str
+    rate: float | None
 
     @property
     def unit_of_q(self) -> str:
         """The unit of the actuator columns."""
         return "1" if self.q_unit == "counts" else self.q_unit
-
-    def without_missing(self, commands: NDArray, tips: NDArray) -> None:
-        """Set the missing values among commands (N, n) and tips (N, 3 K) to NaN, in place.
-
-        Zeros are missing only where all three coordinates of a marker are zero.
-        """
-        missing = real_array(self.missing, "missing").ravel()
-        values = missing[missing != 0.0]
-        commands[np.isin(commands, values)] = np.nan
-        tips[np.isin(tips, values)] = np.nan
-        if len(values) < len(missing):
-            markers = tips.reshape(len(tips), -1, 3)
-            markers[(markers == 0.0).all(axis=2)] = np.nan
 
 
 def _converted(
@@ -397,6 +405,8 @@ def _converted(
     factor = _checked_factor(n, q_unit, x_unit, conversion.q_sign)
     table.check_unit("q_unit", columns.q, q_unit)
     table.check_unit("x_unit", columns.x, x_unit)
+    stamps = table.column(columns.times[0]) if columns.times else ()
+    seconds = seconds_per_unit(stamps, conversion.time_unit, conversion.rate)
     values = table.values([*columns.q, *columns.x, *columns.times], columns.times)
     labelled = {
         argument: table.labels(argument, name, len(values))
@@ -405,7 +415,8 @@ def _converted(
     commands = values[:, :n]
     tips = values[:, n : n + len(columns.x)]
     times = values[:, n + len(columns.x) :]
-    conversion.without_missing(commands, tips)
+    without_missing(commands, conversion.missing, zeros=False)
+    without_missing(tips, conversion.missing)
     complete = countable(tips).reshape(len(tips), -1, 3).all(axis=2)
     tips = np.where(complete.repeat(3, axis=1), tips, np.nan)
     valid = countable(commands).all(axis=1) & complete.any(axis=1)
@@ -425,14 +436,10 @@ def _converted(
         )
     commands = commands[valid]
     tips = tips[valid]
+    labelled = {argument: names[valid] for argument, names in labelled.items()}
     periods = given_periods(conversion.unwrap, columns.q, q_unit)
     if any(periods):
-        same_run = np.ones(len(commands) - 1, dtype=bool)
-        for (
-            labels_of_rows
-        ) in labelled.values():  # those of runs, if there are any, come last
-            names_of_rows = labels_of_rows[valid]
-            same_run = names_of_rows[1:] == names_of_rows[:-1]
+        same_run = _same_run(labelled, len(tips))
         commands = unwrapped(commands, tips[:, -3:], same_run, periods)
     _warn_of_millimetres("q", commands, q_unit)
     _warn_of_millimetres("x", tips, x_unit)
@@ -442,7 +449,7 @@ def _converted(
     return Log(
         commands * factor,
         tips * METRES[x_unit],
-        time=times[valid, 0] if columns.times else None,
+        time=seconds * times[valid, 0] if columns.times else None,
         line=places[valid],
         invalid_lines=places[~valid],
         q_names=columns.q,
@@ -451,12 +458,22 @@ def _converted(
         units={"q": si_unit, "x": "m"},
         file_units={"q": q_unit, "x": x_unit},
         source=str(table.source),
-        **{argument: names[valid] for argument, names in labelled.items()},
+        **labelled,
     )
+
+
+def _same_run(labelled: Mapping[str, NDArray], n_rows: int) -> NDArray:
+    """Return whether each row and the next belong to one run, else motion, shape (n_rows - 1,)."""
+    same = np.ones(n_rows - 1, dtype=bool)
+    for labels_of_rows in labelled.values():  # those of runs come last
+        same = labels_of_rows[1:] == labels_of_rows[:-1]
+    return same
 
 
 def _warn_of_millimetres(name: str, column: NDArray, unit: str) -> None:
     """Warn if metres are declared but values (N, k) look like millimetres."""
+    if not column.size:
+        return
     span = (np.nanmax(column, axis=0) - np.nanmin(column, axis=0)).max()
     middle = np.nanmedian(np.abs(column))
     if unit == "m" and (middle > 10 or span > 5):

@@ -27,7 +27,7 @@ from hybridkin._core.units import METRES, UNITS
 from hybridkin.datasets._encoders import _features as rough_features
 from hybridkin.datasets._log_report import named_rows
 from hybridkin.datasets._logs import Log
-from hybridkin.datasets._tables import Table
+from hybridkin.datasets._tables import Table, without_missing
 from hybridkin.datasets.table_files import read_table
 
 _GAP = 5.0  # usual periods of the motor rows: longer ones are gaps
@@ -135,7 +135,7 @@ def read_columns(
     groups : str or None, default=None
         Column that names the motion of a row.
     delimiter, header_line, decimal, missing
-        As for `load_log`.
+        As for `load_log`; zeros are missing only where a marker is at 0, 0, 0.
 
     Returns
     -------
@@ -175,17 +175,13 @@ def columns_as_written(
     """Return columns of a table with their times, not converted; see `read_columns`."""
     columns = table.names("names", names)
     values = table.values([*columns, time], [time])
+    without_missing(values[:, :-1], missing)
     timed = countable(values[:, -1])
     motions = None
     if groups is not None:
         motions = table.labels("groups", groups, len(values))[timed]
     time_of_rows = values[timed, -1]
     values = values[timed, :-1]
-    lost = real_array(missing, "missing").ravel()
-    values[np.isin(values, lost[lost != 0.0])] = np.nan
-    if len(columns) % 3 == 0 and (lost == 0.0).any():
-        markers = values.reshape(len(values), -1, 3)
-        markers[(markers == 0.0).all(axis=2)] = np.nan
     return TimedColumns(
         values, time_of_rows, tuple(columns), "1", motions, str(table.source)
     )

@@ -10,8 +10,9 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from hybridkin._core.arrays import real_array
 from hybridkin._core.text_rows import cell_advice, number_of
 from hybridkin._core.texts import csv_cell
 
@@ -61,6 +62,8 @@ class Table(NamedTuple):
         written = csv_cell(name).strip()  # as our own tables hold it
         if name not in self.header and written in self.header:
             name = written
+        if name not in self.header:
+            name = name.removeprefix("#").lstrip()  # before the header of a text file
         count = self.header.count(name)
         source = str(self.source)
         if count > 1:
@@ -161,6 +164,20 @@ class Table(NamedTuple):
                 f"{longest} characters; check the file."
             )
         return np.array(labels)
+
+
+def without_missing(values: NDArray, missing: ArrayLike, zeros: bool = True) -> None:
+    """Set the missing values among columns (N, k) to NaN, in place.
+
+    Zeros are missing only where all three coordinates of a marker are zero, and not without
+    `zeros`.
+    """
+    numbers = real_array(missing, "missing").ravel()
+    values[np.isin(values, numbers[numbers != 0.0])] = np.nan
+    if zeros and (numbers == 0.0).any() and values.shape[1] % 3 == 0:
+        markers = values.reshape(len(values), -1, 3)
+        lost = (markers == 0.0).all(axis=2)
+        values[lost.repeat(3, axis=1)] = np.nan
 
 
 def _of_objects(values: NDArray) -> NDArray:

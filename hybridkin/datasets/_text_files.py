@@ -127,6 +127,11 @@ class _Rows:
         while n_cells > n_named and not row.cells[n_cells - 1].strip():
             n_cells -= 1
         advice = "name every column once, and write an empty cell for a missing value"
+        if n_cells == n_named - 1:
+            advice = (
+                "delete the name without a column, or write an empty cell for a missing "
+                "value"
+            )
         if n_cells == n_named + 1:
             advice = (
                 "if the rows begin with an index without a name, save the table without it "

@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridkin._core.model import as_forward_model
-from hybridkin.calibration.hysteresis_fit import HysteresisLog, which_count
+from hybridkin.calibration.hysteresis_log import HysteresisLog, which_count
 from hybridkin.calibration.hysteresis_search import find_hysteresis
 from hybridkin.chains.hysteresis import HysteresisOperator
 from hybridkin.chains.play import PlayOperator
+from hybridkin.chains.reversals import Coarseness
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._spec import Spec
 from hybridkin.learning.elm_cv import ELMRegressorCV
@@ -26,6 +27,7 @@ class Past(NamedTuple):
     state: NDArray
 
 
+_MISSED = 0.5  # largest part of a width by which rows can miss reversals
 _PLAIN: dict[str, Any] = {"relevance_rounds": 0, "max_hidden": 0, "random_state": 0}
 
 
@@ -44,10 +46,14 @@ def play_of(spec: Spec, rows: Rows) -> tuple[HysteresisOperator | None, list[str
         return None, []
     ranges = np.ptp(rows.X, axis=0)
     if isinstance(play, str):
-        chosen = choose_hysteresis(spec.calibrated(replace(rows, groups=None)), rows)
+        measured = replace(rows, groups=None).take(rows.counted)
+        chosen = choose_hysteresis(spec.calibrated(measured), rows)
+        if chosen is None:
+            return None, []
+        coarse = coarse_in_words(chosen, rows)
         single = isinstance(chosen, PlayOperator)
         if not single or chosen.width < 0.95 * ranges.max():
-            return chosen, []
+            return chosen, coarse
         return chosen, [
             f"play='auto' found a backlash of {chosen.width:.3g}, as wide as the range of "
             "`X`: the log gives no upper limit. Record larger motions, or give the width as `play`."
@@ -64,6 +70,35 @@ def play_of(spec: Spec, rows: Rows) -> tuple[HysteresisOperator | None, list[str
     return operator, [
         f"`play` {play!r} must be less than the range of `X`, {ranges}: else an actuator never "
         "moves. Give `play` in the unit of `X`, for lengths metres."
+    ]
+
+
+def coarse_in_words(operator: HysteresisOperator, rows: Rows) -> list[str]:
+    """Return a warning if the rows of a log are too far apart to show reversals, else nothing.
+
+    Parameters
+    ----------
+    operator : HysteresisOperator
+        What was found.
+    rows : Rows
+        The log, with the rows of each run in order of time.
+    """
+    log = Coarseness.of(rows.X, rows.run_of_rows)
+    hint = "Record rows closer in time, also those without a measured tip."
+    if not log.shows_reversals:
+        return [
+            f"play='auto' found {operator.kind}, but actuators reverse at up to "
+            f"{100.0 * log.share.max():.0f} % of the rows: what they do between the rows is not in "
+            f"the log. {hint}"
+        ]
+    missed = log.missed - _MISSED * operator.width
+    if not np.any((missed > 0.0) & (operator.width > 0.0)):
+        return []
+    actuator = int(np.argmax(missed))
+    width = np.broadcast_to(operator.width, missed.shape)[actuator]
+    return [
+        f"play='auto' found {operator.kind} of {width:.3g}, but actuator {actuator} reverses about "
+        f"{log.missed[actuator]:.3g} beyond the recorded rows. {hint}"
     ]
 
 
@@ -119,7 +154,7 @@ def moved_without(spec: Spec, log: Rows, held_out: NDArray) -> Rows:
     held_out : ndarray of int
         Places of measured rows that do not count.
     """
-    measured = np.flatnonzero(log.counts > 0.0)
+    measured = log.counted
     weights = log.counts.copy()
     weights[measured[held_out]] = 0.0
     operator, _ = play_of(spec, replace(log, weights=weights).in_runs())

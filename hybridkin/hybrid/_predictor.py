@@ -298,9 +298,12 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if self.play_ is None or states_of_log is None:
             return np.ones(len(commands), dtype=bool)
         rows = check_inputs(self, commands.q)
-        states = self.play_.inner_states(rows, commands.run_of_rows, commands.time)
-        seen = states_of_log.moved(-self.change_.shift)
-        return seen.beyond(states).max(axis=(1, 2), initial=0.0) <= 0.0
+        low, high = states_of_log.moved(-self.change_.shift)
+        seen = np.ones(len(commands), dtype=bool)
+        states = self.play_.each_inner_state(rows, commands.run_of_rows, commands.time)
+        for k, state in enumerate(states):
+            seen &= ((low[k] <= state) & (state <= high[k])).all(axis=1)
+        return seen
 
     @property
     def _states_of_log(self) -> TrainingRange | None:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Self
 
+from hybridkin._core.runs import RunOrder
 from hybridkin.hybrid._rows import Rows
 
 _MARGIN = 0.1  # of states beyond those of the log, relative to the range of a command
@@ -40,25 +41,48 @@ class TrainingRange(NamedTuple):
         return np.maximum(np.maximum(self.low - q, q - self.high), 0.0)
 
 
-def state_range(states: NDArray, log: Rows) -> TrainingRange:
-    """Return the range of states of hysteresis (N, R, n) in which a log has tested a model.
+def state_range(states: NDArray, measured: Rows, size: NDArray) -> TrainingRange:
+    """Return the range of states of hysteresis in which a log has tested a model.
 
     It is that of the measured rows with a margin: a tenth of the range of the commands, or as far
     as 98 % of the rows are from the states of other groups.
+
+    Parameters
+    ----------
+    states : ndarray of shape (K, R, n)
+        What is inside of the hysteresis after each row that counts [unit of q].
+    measured : Rows
+        These rows.
+    size : ndarray of shape (n,)
+        Range of the commands [unit of q].
     """
-    measured = log.counts > 0.0
-    size = np.ptp(log.X, axis=0)
     size = np.where(size > 0.0, size, 1.0)
     margin = _MARGIN
-    names = log.run_of_rows if log.groups is None else log.groups
-    distances = []
-    for name in np.unique(names):
-        group = names == name
-        other_rows = states[measured & ~group]
-        if len(other_rows) and states.size:
-            beyond = TrainingRange.of(other_rows).beyond(states[measured & group])
-            distances.append((beyond / size).max(axis=(1, 2)))
-    if distances:
-        margin = max(margin, np.quantile(np.concatenate(distances), _TESTED))
-    low, high = TrainingRange.of(states[measured])
+    names = measured.groups
+    if names is None:
+        names = measured.run_of_rows
+    others = _ranges_of_others(states, names)
+    if states.size and others.low.size:
+        beyond = (others.beyond(states) / size).max(axis=(1, 2))
+        margin = max(margin, np.quantile(beyond, _TESTED))
+    low, high = TrainingRange.of(states)
     return TrainingRange(low - margin * size, high + margin * size)
+
+
+def _ranges_of_others(states: NDArray, names: NDArray) -> TrainingRange:
+    """Return for each row (K, ...) the range of the rows of other groups; empty for one group."""
+    groups = RunOrder.of(names)
+    if len(groups.starts) < 2:
+        return TrainingRange(states[:0], states[:0])
+    group = np.empty(len(states), dtype=int)
+    group[groups.order] = np.cumsum(groups.first) - 1
+    in_order = states[groups.order]
+    low = np.minimum.reduceat(in_order, groups.starts)
+    high = np.maximum.reduceat(in_order, groups.starts)
+    return TrainingRange(_least_of_others(low)[group], -_least_of_others(-high)[group])
+
+
+def _least_of_others(values: NDArray) -> NDArray:
+    """Return for each of G groups the least value (G, ...) of the others."""
+    two = np.partition(values, 1, axis=0)[:2]
+    return np.where(values == two[0], two[1], two[0])

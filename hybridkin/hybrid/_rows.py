@@ -81,6 +81,11 @@ class Rows:
             residual=_some(self.residual, rows),
         )
 
+    @property
+    def counted(self) -> NDArray[np.intp]:
+        """The rows that count (K,); others only move the actuators."""
+        return np.flatnonzero(self.counts > 0.0)
+
     def marker(self, k: int) -> Self:
         """Return the rows in which marker k was measured, with only its positions as tips."""
         columns = slice(3 * k, 3 * k + 3)

@@ -15,6 +15,7 @@ from sklearn.utils.validation import check_is_fitted
 from torch import nn
 
 from hybridkin._core.arrays import labels, number, table
+from hybridkin._core.clock import check_seconds
 from hybridkin._core.commands import Commands
 from hybridkin._core.distinct import targets_that_count
 from hybridkin._core.model import PoseModel, as_forward_model
@@ -506,7 +507,9 @@ class HybridForwardModel(HybridPredictor):
         weights = cast("NDArray | None", weights)
         rows = Rows(X, y, weights, groups, commands.runs, commands.time)
         if rows.time is not None and self.play is not None:
-            checked_times(rows.time, rows.run_of_rows)
+            times = checked_times(rows.time, rows.run_of_rows)
+            if reset:  # a fit may find creep, which depends on the unit of time
+                check_seconds(times, rows.run_of_rows)
         return rows
 
     def _missing_markers(self, y: Any, advice: str) -> NDArray[np.bool_]:

@@ -115,8 +115,8 @@ def fit_to_log(
     if play is not None:
         spec = replace(spec, commanded=commands.directions)
         chosen = replace(chosen, commanded=commands.directions)
-        states = state_range(play.inner_states(log.X, log.run_of_rows, log.time), log)
-        measured = log.take(np.flatnonzero(log.counts > 0.0))
+        measured = log.take(log.counted)
+        states = state_range(_states(play, log), measured, np.ptp(log.X, axis=0))
         moved = partial(moved_without, chosen, log)
         rows = log.effective(play).distinct()
     fitted = fit_hybrid(chosen, rows)
@@ -140,6 +140,14 @@ def fit_to_log(
         radius=radius,
         messages=tuple(dict.fromkeys(messages)),
     )
+
+
+def _states(play: HysteresisOperator, log: Rows) -> NDArray:
+    """Return the inner states (K, R, n) of hysteresis after the rows that count."""
+    states = [np.empty((len(log.counted), 0, log.X.shape[1]))]
+    for state in play.each_inner_state(log.X, log.run_of_rows, log.time):
+        states.append(state[log.counted, None])
+    return np.concatenate(states, axis=1)
 
 
 def _by_motion(log: Rows, rows: Rows, play: HysteresisOperator | None) -> Rows:

@@ -94,7 +94,7 @@ def follow(
     rows : ndarray of shape (T, n)
         Commands, or effective changes if `lead`; contiguous float64, at most 1e75 in size.
     steps : ndarray of shape (T,)
-        Time since the row before [s].
+        Time since the row before [s]; a negative one begins a run, without hysteresis.
     state : ndarray of shape (R, n)
         The state before the first row, contiguous.
     lead : bool

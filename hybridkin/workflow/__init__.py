@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from hybridkin.workflow.path import scaled_path, shape_path
     from hybridkin.workflow.planning import next_rows
     from hybridkin.workflow.track import TrackRecord, track_path
-    from hybridkin.workflow.verify import Verification, verify_track
+    from hybridkin.workflow.verify import Verification, read_tips, verify_track
 
 __all__ = [
     "LOG_SUFFIXES",
@@ -50,6 +50,7 @@ __all__ = [
     "open_model",
     "path_limits",
     "read_log",
+    "read_tips",
     "scaled_path",
     "shape_path",
     "track_path",
@@ -88,6 +89,7 @@ _NAMES_OF = {
     ),
     "verify": (
         "Verification",
+        "read_tips",
         "verify_track",
     ),
 }

@@ -16,6 +16,7 @@ from sklearn.pipeline import Pipeline, make_pipeline
 from sklearn.preprocessing import MinMaxScaler, PolynomialFeatures
 
 from hybridkin._core.arrays import whole
+from hybridkin._core.commands import Commands
 from hybridkin._core.model import ForwardModel
 from hybridkin._core.turns import one_thread
 from hybridkin.calibration.calibrate import CalibrationResult, fit_geometry
@@ -73,7 +74,8 @@ class FitSettings:
         It requires `auto`, and named motions in order of time. "detect": "auto" if the log allows
         it and backlash lowers the held-out errors of a network, else None.
     max_rows : int or None
-        Largest number of rows; of a longer log every k-th row is used. None: all rows.
+        Largest number of rows whose measurements count; of a longer log some motions are used, and
+        some rows of each. All rows of these motions move the actuators. None: all rows count.
     """
 
     loss: str = "linear"
@@ -269,9 +271,21 @@ def with_play_detected(
     in_order = rows.named and not rows.n_late
     if mechanical.start is not None and settings.auto and in_order:
         model = HybridForwardModel(mechanical.model, "drop", play="auto")
-        fitted = fit_to_log(*prepared(model, rows.commands, rows.x, rows.motions))
+        fitted = fit_to_log(*prepared(model, *columns_to_fit(model, rows)))
         play = None if fitted.play is None else "auto"
     return replace(settings, play=play)
+
+
+def columns_to_fit(
+    model: HybridForwardModel, rows: MeasuredLog
+) -> tuple[Commands, NDArray, NDArray, NDArray]:
+    """Return commands, tips, motions and counts of the rows of a log that a model needs.
+
+    Rows that do not count move the actuators; a model without hysteresis does not need them.
+    """
+    if model.play is None:
+        rows = rows.measured
+    return rows.commands, rows.x, rows.motions, rows.counts
 
 
 class FittedModels(NamedTuple):
@@ -307,7 +321,7 @@ def fit_to_all(
         progress_of_fit(0, 1)
         if name == AUTO:  # it will be saved
             model.set_params(coverage=settings.coverage)
-        spec, log = prepared(model, rows.commands, rows.x, rows.motions)
+        spec, log = prepared(model, *columns_to_fit(model, rows))
         spec = replace(spec, progress=progress_of_fit, compared=True)
         fits[name] = fit_to_log(spec, log, mechanical.geometry)
     return FittedModels(mechanical, models, fits)
@@ -350,7 +364,8 @@ def compare_by_group(
     Comparison
         Errors [m] by model and row, the fold of each row, and the choices of each fold.
     """
-    parts = folds(rows.q, rows.motions, settings.n_folds)
+    measured = rows.measured
+    parts = folds(measured.q, measured.motions, settings.n_folds)
     starts = {name: fit.start for name, fit in fitted.fits.items()}
     jobs = []
     for train, test in parts:
@@ -358,13 +373,14 @@ def compare_by_group(
             delayed(_one_fold)(
                 robot,
                 settings,
-                rows.rows(train),
-                rows.rows(test),
+                rows,
+                rows.counted[train],
+                rows.counted[test],
                 fitted.mechanical,
                 starts,
             )
         )
-    most = max(1, len(rows.q) // _ROWS_PER_PROCESS[settings.auto])
+    most = max(1, len(measured.q) // _ROWS_PER_PROCESS[settings.auto])
     # Otherwise torch and BLAS start threads in every process, which wait for each other.
     workers = Parallel(
         n_jobs=min(effective_n_jobs(n_jobs or 1), len(parts), most),
@@ -389,7 +405,7 @@ def compare_by_group(
     autos = [result.auto for result in results if result.auto is not None]
     if autos:
         candidates = np.array([tips[_in_table(name)] for name in autos[0].names])
-        tips[AUTO], words = _blended(rows, fold, candidates, autos)
+        tips[AUTO], words = _blended(measured, fold, candidates, autos)
         for of_fold, chosen in zip(choices, words, strict=True):
             of_fold[AUTO] = chosen
     if settings.play is None:  # it is the calibrated model
@@ -397,7 +413,7 @@ def compare_by_group(
     in_order = {}
     for name in sorted(tips, key=lambda name: _KINDS.index(name.partition(",")[0])):
         in_order[name] = tips[name]
-    return Comparison(in_order, rows.x, fold, distance, choices)
+    return Comparison(in_order, measured.x, fold, distance, choices)
 
 
 class _AutoOfFold(NamedTuple):
@@ -422,32 +438,37 @@ class _FoldResult(NamedTuple):
 def _one_fold(
     robot: RobotDescription,
     settings: FitSettings,
-    train: MeasuredLog,
-    test: MeasuredLog,
+    rows: MeasuredLog,
+    training_rows: NDArray,
+    test_rows: NDArray,
     of_all: Mechanical,
     starts: dict[str, FitStart],
 ) -> _FoldResult:
     """Return the predictions of every model for test rows after a fit to training rows."""
-    mechanical = Mechanical.of(robot, train, settings.loss, of_all)
+    train = rows.counting(training_rows)
+    test = rows.counting(test_rows)
+    trained = train.measured
+    tested = test.measured
+    mechanical = Mechanical.of(robot, trained, settings.loss, of_all)
     tips = {}
     if robot.chain is not None:
-        nominal = _nominal(robot, robot.chain, train, settings.loss)
-        tips[NOMINAL] = evaluate(nominal, test.q)[0]
+        nominal = _nominal(robot, robot.chain, trained, settings.loss)
+        tips[NOMINAL] = evaluate(nominal, tested.q)[0]
     choices = {}
     auto = None
     for name, model in models_to_save(robot, mechanical, settings).items():
-        spec, log = prepared(model, train.commands, train.x, train.motions)
+        spec, log = prepared(model, *columns_to_fit(model, train))
         spec = spec.starting_at(starts[name])
         fitted = fit_to_log(spec, log, mechanical.geometry)
         model = with_fit(model, fitted)
         candidates = fitted.error.candidates
         outside = fitted.error.outside
         if outside is None or candidates is None:
-            tips[name] = evaluate(model.module_, test.q)[0]
+            tips[name] = evaluate(model.module_, tested.q)[0]
             if name in (DATA_ELM, HYBRID_ELM):
                 choices[name] = choice_in_words(model, train.q_unit)
             continue
-        q = model.effective(test.commands)
+        q = model.effective(test.commands)[test.counted]
         for candidate, module in candidates.items():
             tips[_in_table(candidate)] = evaluate(module, q)[0]
         auto = _AutoOfFold(
@@ -456,7 +477,7 @@ def _one_fold(
             fitted.geometry,
             memory_in_words(model, train.q_unit),
         )
-    distance = held_out_distances(train.q, train.motions, test.q)
+    distance = held_out_distances(trained.q, trained.motions, tested.q)
     return _FoldResult(tips, distance, choices, auto)
 
 

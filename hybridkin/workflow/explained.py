@@ -24,7 +24,7 @@ def explained_in_words(
     held_out : dict of str to HeldOutErrors
         Errors of every model on held-out motions.
     rows : MeasuredLog
-        The fitted rows.
+        The fitted rows, and those that only move the actuators.
     model : HybridForwardModel
         The model that is fitted to them.
     """
@@ -39,13 +39,15 @@ def explained_in_words(
     )
     if model.play_ is not None:
         words += f", and {AUTO}, with hysteresis, {millimetres(held_out[AUTO].mean)}"
-    x = rows.x[:, -3:]
+    log = rows.measured
+    x = log.x[:, -3:]
     measured = np.isfinite(x).all(axis=1)
-    inputs = {"functions of q": rows.q}
+    inputs = {"functions of q": log.q}
     if model.play_ is not None:
-        inputs["those of what the actuators do"] = model.effective(rows.commands)
+        moved = model.effective(rows.commands)[rows.counted]
+        inputs["those of what the actuators do"] = moved
     for name, q in inputs.items():
-        floor = repeatability(q[measured], x[measured], rows.motions[measured])
+        floor = repeatability(q[measured], x[measured], log.motions[measured])
         least = "cannot be told from this log"
         if floor is not None:
             least = f"is about {millimetres(floor)}"

@@ -25,6 +25,7 @@ from hybridkin.workflow.compare import (
     Comparison,
     FitSettings,
     Mechanical,
+    columns_to_fit,
     compare_by_group,
     fit_to_all,
     with_play_detected,
@@ -98,12 +99,15 @@ def fit_log(
     _check(complete, robot, settings)
     complete.check(force)
     rows = complete.thinned(settings.max_rows)
+    measured = rows.measured
     progress("calibration", 0, 1)
-    mechanical = Mechanical.of(robot, rows, settings.loss)
-    messages = [*mechanical.messages, *_suspicions(complete, mechanical)]
+    mechanical = Mechanical.of(robot, measured, settings.loss)
+    messages = [*mechanical.messages, *_suspicions(measured, mechanical)]
     for message in messages:
         warnings.warn(message, stacklevel=2)
     settings = with_play_detected(settings, rows, mechanical)
+    if settings.play is None:
+        rows = measured
     fitted = fit_to_all(rows, robot, settings, mechanical, progress)
     compared = compare_by_group(
         rows, robot, settings, fitted, n_jobs=n_jobs, progress=progress
@@ -113,18 +117,21 @@ def fit_log(
     fit = fitted.fits[saved]
     if settings.coverage is not None and not settings.auto:
         model.set_params(coverage=settings.coverage)
-        fit = fit_to_log(*prepared(model, rows.commands, rows.x, rows.motions))
+        fit = fit_to_log(*prepared(model, *columns_to_fit(model, measured)))
     fit = fit.of_all_rows(complete.q, complete.x)
     model = with_fit(model, fit.expecting(float(compared.errors[saved].mean())))
     progress("writing the report", 0, 1)
     held_out = {}
     for name, errors in compared.errors.items():
-        held_out[name] = HeldOutErrors.of_motions(errors, rows.motions, compared.fold)
+        held_out[name] = HeldOutErrors.of_motions(
+            errors, measured.motions, compared.fold
+        )
     record = FitRecord(
         log=Path(log.source).name,
         robot=robot.name,
-        rows=len(rows.q),
+        rows=len(measured.q),
         n_whole=len(complete.q),
+        thinned=rows.thinned_in_words(complete),
         n_motions=len(np.unique(complete.motions)),
         split=complete.split,
         excluded=complete.excluded,
@@ -138,7 +145,7 @@ def fit_log(
         else Counts.of_log(robot.log.to_log(complete.q)),
         choices_by_fold=compared.choices,
         log_check=complete.report,
-        worst=largest_errors(compared, rows.motions),
+        worst=largest_errors(compared, measured.motions),
         markers=errors_of_markers(compared.markers[saved]),
         auto=model.cv_results_,
         words=[
@@ -147,7 +154,7 @@ def fit_log(
         ],
         tried=mechanical.tried,
         calibrated=mechanical.parameters,
-        calibration=_calibration(mechanical, rows, settings.loss, messages),
+        calibration=_calibration(mechanical, measured, settings.loss, messages),
     )
     report = Report(f"{robot.name}: hybrid model of {record.log}", record)
     write_comparison(report)

@@ -100,6 +100,8 @@ class FitRecord(Training):
         What models chose in each fold.
     log_check : LogReport
         Findings of the check of the log.
+    thinned : str
+        Which rows of a long log were fitted, in words; empty: all.
     worst : list of MotionErrors
         The motions of largest errors.
     markers : list of Errors
@@ -121,6 +123,7 @@ class FitRecord(Training):
     command: str = "fit"
     choices_by_fold: Sequence[Mapping[str, str]]
     log_check: LogReport
+    thinned: str
     worst: Sequence[MotionErrors]
     markers: Sequence[Errors]
     auto: CvResults | None
@@ -141,8 +144,8 @@ def write_comparison(report: Report[FitRecord]) -> None:
     record = report.record
     write_check(report, record.log_check)
     thinned = ""
-    if record.n_whole != record.rows:
-        thinned = f" (of {record.n_whole}, evenly thinned)"
+    if record.thinned:
+        thinned = f" ({record.thinned})"
     report.text(
         "## Errors on held-out motions",
         f"{record.rows} rows{thinned}, {record.n_motions} {record.split}. Each of "

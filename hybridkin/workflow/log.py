@@ -9,8 +9,10 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import Self
 
 from hybridkin._core.commands import Commands
+from hybridkin._core.runs import RunOrder
 from hybridkin._core.units import LogUnit
 from hybridkin.chains import robots
 from hybridkin.chains.arc_chain import ArcChain
@@ -52,12 +54,15 @@ class MeasuredLog(Log):
         Findings of the check of the whole log.
     named : bool
         Whether the log names its motions; else they are ten parts of it.
+    counts : ndarray of shape (N,)
+        1 where the measurement of a row counts; 0 where a row only moves the actuators [1].
     excluded : tuple of str
         Patterns of the motions that were left out.
     """
 
     report: LogReport
     named: bool
+    counts: NDArray
     excluded: tuple[str, ...] = ()
 
     @property
@@ -89,10 +94,7 @@ class MeasuredLog(Log):
         """Number of rows that are earlier than the row above of the same run."""
         if self.time is None:
             return 0
-        runs = self.commands.run_of_rows
-        order = np.argsort(runs, kind="stable")
-        same = runs[order][1:] == runs[order][:-1]
-        return int((same & (np.diff(self.time[order]) < 0)).sum())
+        return len(RunOrder.of(self.commands.run_of_rows).late(self.time))
 
     def check_order(self, why: str) -> None:
         """Raise if rows of a run are not in order of time; `why` begins the message."""
@@ -113,11 +115,64 @@ class MeasuredLog(Log):
         misread = _check(self, calibrated).misread
         return [f"{f.message} {f.advice}" for f in misread if f.kind not in kinds]
 
-    def thinned(self, max_rows: int | None) -> MeasuredLog:
-        """Return every k-th row, so that at most `max_rows` remain; None: all rows."""
+    def rows(self, chosen: NDArray | slice) -> Self:
+        """Return a log of some of the rows."""
+        return replace(super().rows(chosen), counts=self.counts[chosen])
+
+    @property
+    def counted(self) -> NDArray[np.intp]:
+        """The rows that count (K,)."""
+        return np.flatnonzero(self.counts)
+
+    @property
+    def measured(self) -> Self:
+        """The log of the rows that count alone, for models without hysteresis."""
+        return self if self.counts.all() else self.rows(self.counted)
+
+    def counting(self, rows: NDArray) -> Self:
+        """Return the log in which only some rows count; those before them in a run move actuators.
+
+        Parameters
+        ----------
+        rows : ndarray of int of shape (K,)
+            The rows that count.
+        """
+        counts = np.zeros(len(self.q))
+        counts[rows] = 1.0
+        # Reading a description loads no calibration.
+        from hybridkin.calibration.hysteresis_log import needed_rows
+
+        needed = needed_rows(self.commands.run_of_rows, rows)
+        return replace(self, counts=counts).rows(needed)
+
+    def thinned(self, max_rows: int | None) -> Self:
+        """Return the log with at most `max_rows` rows that count; None: all of them.
+
+        If there are many motions, only a spread part of them counts, else some rows of each. All
+        rows of these motions move the actuators, so hysteresis sees every reversal. Parts of a log
+        without named motions have no hysteresis: there the other rows are left out.
+        """
         if max_rows is None or len(self.q) <= max_rows:
             return self
-        return self.rows(slice(None, None, -(-len(self.q) // max_rows)))
+        from hybridkin.calibration.measured import thinned
+
+        rows = thinned(self.motions, max_rows)
+        return self.counting(rows) if self.named else self.rows(rows)
+
+    def thinned_in_words(self, complete: MeasuredLog) -> str:
+        """Return how a complete log was thinned to this one; empty if it was not."""
+        measured = self.measured
+        if len(measured.q) == len(complete.q):
+            return ""
+        n_motions = len(np.unique(measured.motions))
+        n_whole = len(np.unique(complete.motions))
+        words = f"of {len(complete.q)}, spread over "
+        if n_motions < n_whole:
+            words += f"{n_motions} of "
+        words += f"{n_whole} {complete.split}"
+        if len(self.q) > len(measured.q):
+            words += f"; hysteresis follows all {len(self.q)} rows up to them"
+        return words
 
 
 def read_log(
@@ -228,4 +283,6 @@ def _with_motions(
     columns = dict(vars(log))
     if not named:
         columns["groups"] = np.arange(n) * _BLOCKS // n
-    return MeasuredLog(**columns, report=report, named=named, excluded=excluded)
+    return MeasuredLog(
+        **columns, report=report, named=named, counts=np.ones(n), excluded=excluded
+    )

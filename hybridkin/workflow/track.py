@@ -14,7 +14,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 import hybridkin
-from hybridkin._core.units import METRES
+from hybridkin._core.units import METRES, duration_in_words
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.robots import LogFormat
 from hybridkin.datasets import Log, load_log, log_columns
@@ -86,6 +86,8 @@ class TrackRecord:
         The limits that were kept.
     delay : float
         How much later than its command a tip will be read [s], for `verify_track`.
+    period : float
+        Time from row to row that the commands are computed for [s].
     """
 
     command: str = "track"
@@ -105,6 +107,7 @@ class TrackRecord:
     lead_in: int
     limits: PathLimits
     delay: float = 0.0
+    period: float = _DT
 
 
 def _write(report: Report[TrackRecord], loaded: LoadedModel, better: str) -> None:
@@ -126,6 +129,10 @@ def _write(report: Report[TrackRecord], loaded: LoadedModel, better: str) -> Non
         f"{record.lead_in} rows, with the status LEAD_IN, move from the start of the robot to the "
         "path.",
         unit=log.q_unit,
+    )
+    report.text(
+        f"Period: {duration_in_words(record.period)} from row to row. Send the commands at these "
+        "times: lag and creep are those of this pace."
     )
     if loaded.play is not None:
         report.text(
@@ -300,6 +307,7 @@ def track_path(
         lead_in=n_lead,
         limits=domain.limits,
         delay=delay,
+        period=_period(whole),
     )
     report = Report(f"{loaded.name}: a path of {len(path)} points", record)
     _write(report, loaded, better)

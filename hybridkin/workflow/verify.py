@@ -8,17 +8,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 
 from hybridkin._core.arrays import as_array, number
 from hybridkin._core.commands import Commands
-from hybridkin._core.rotations import rigid_motion
-from hybridkin.chains.play import PlayOperator
-from hybridkin.datasets import Log
+from hybridkin.causes.alignment import Alignment
+from hybridkin.causes.comparison import CauseComparison, compare_causes
+from hybridkin.causes.evidence import Actuators, Evidence
+from hybridkin.causes.motion import Motion
+from hybridkin.causes.separation import separating_motion
+from hybridkin.chains.chain import ActuatorLayout
+from hybridkin.chains.robots import LogFormat
+from hybridkin.datasets import Log, load_log, log_columns
 from hybridkin.hybrid.other_units import check_tips
-from hybridkin.native.library import evaluate
 from hybridkin.workflow.delay import Delay, at_times, estimated_delay
 from hybridkin.workflow.errors import Errors, ExpectedErrors
 from hybridkin.workflow.model import LoadedModel
@@ -26,20 +28,11 @@ from hybridkin.workflow.report import Report, check_out, millimetres, percent
 from hybridkin.workflow.track import LEAD_IN, read_track
 
 _KEPT = 1.5  # largest mean error of a kept promise, relative to the promised one
-_LIKELY = 0.5  # least share of the mean squared error that a likely cause explains
 _OFF = 0.01  # least distance from the plane of the log, as a share of the range of the commands
-_ROUNDS = 3  # of the fit of backlash
-_NARROW = 1e-3  # least width of backlash, as a share of the range
 _SHORT = 0.5  # range of a short path, as a share of that of the log
 _DIFFERENT = 0.1  # of the range: commands of a log that differ from those of the track
+_SHOWN = 0.05  # least share of the error that is worth a line of the report
 _COLUMNS = ("rows", "promised", "promised_p95", "mean", "p95", "max")
-
-_REMEDIES = {
-    "backlash": "fit named motions in order of time that reverse the actuators",
-    "moved base": "measure where the base is, or call `model.adapt(q, x)` with this log",
-    "outside the log": "add motions there to the log (`hybridkin next`), or move the path inside",
-    "off the plane of the log": "add motions off the plane to the log, or send commands in it",
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,9 +56,19 @@ class Verification:
     kept : bool or None
         Whether the mean error is at most 1.5 times the promised one; None without a promise.
     causes : dict of str to float
-        Share of the mean squared error that each cause explains.
+        Share of the squared error that each cause explains on rows that it was not fitted to.
     cause : str or None
-        The cause with the largest share above 0.5, if the promise is not kept.
+        The simplest cause within the noise of the best, if the promise is not kept and it clearly
+        explains more than half.
+    also : list of str
+        The other causes that explain as much.
+    amount : str
+        How large the cause is, and which actuator or rows, in words; "" without a cause.
+    remedy : str
+        What to do; "" without a cause.
+    separate : str
+        The motion that tells the cause from the first of the others; "" if there are none, or no
+        simple motion does.
     range : float or None
         Largest range of an actuator relative to the log; None without a log.
     delay : float
@@ -82,6 +85,10 @@ class Verification:
     kept: bool | None
     causes: Mapping[str, float]
     cause: str | None
+    also: list[str]
+    amount: str
+    remedy: str
+    separate: str
     range: float | None
     delay: float
     later: Delay | None
@@ -100,16 +107,24 @@ class Verification:
             f"{millimetres(path.p95)}, max {millimetres(path.max)}."
         )
         report.errors(self.parts, _COLUMNS)
-        shares = [[cause, f"{100 * v:.0f}"] for cause, v in self.causes.items()]
-        report.table(["cause", "explains [%]"], shares)
+        shares = []
+        for cause in sorted(self.causes, key=self.causes.__getitem__, reverse=True):
+            if self.causes[cause] >= _SHOWN:
+                shares.append([cause, f"{100 * self.causes[cause]:.0f}"])
+        if shares:
+            report.table(["cause", "explains [%]"], shares)
         if self.kept:
             report.text("The promise is kept.")
         elif self.cause is None:
             report.text(
-                "None of these explains the error; check load, friction and delay."
+                "None of the known causes explains the error; check load and friction."
             )
         else:
-            report.text(f"Likely cause: {self.cause}. To do: {_REMEDIES[self.cause]}.")
+            report.text(
+                f"Likely cause: {self.cause}. {{amount}}. To do: {self.remedy}.",
+                amount=self.amount[:1].upper() + self.amount[1:],
+            )
+            self._write_others(report)
         later = self.later
         if later is not None and later.is_clear:
             report.text(
@@ -126,6 +141,22 @@ class Verification:
                 "them apart."
             )
 
+    def _write_others(self, report: Report) -> None:
+        """Add the causes that explain as much, and how to tell them apart."""
+        if not self.also:
+            return
+        report.text(f"On this path these explain as much: {', '.join(self.also)}.")
+        if self.separate:
+            report.text(
+                f"To tell {self.cause} and {self.also[0]} apart: {{motion}}.",
+                motion=self.separate,
+            )
+        else:
+            report.text(
+                f"No simple motion in the range of the log tells {self.cause} and {self.also[0]} "
+                "apart."
+            )
+
 
 def verify_track(
     loaded: LoadedModel,
@@ -138,10 +169,11 @@ def verify_track(
 ) -> Report[Verification]:
     """Compare the error that a track promised with the error of the robot, and find the cause.
 
-    The error is the distance of the measured tip from the tip of the model. Four causes are tried,
-    each alone: backlash (every actuator lags behind its command, by the direction of its motion), a
-    rigid motion of the base, larger errors outside the log than inside, and an error that is linear
-    in the distance of the commands from the plane of the log.
+    The error is the distance of the measured tip from the tip of the model. Causes are compared as
+    models: each is a small change with few parameters (unit or axes of the tips, a lag, a moved
+    base, the zero, gain, sign or place of an actuator, a payload, backlash, ...), fitted to parts
+    of the path and judged by the other parts. The simplest within the noise of the best is named,
+    and what else explains as much.
 
     Parameters
     ----------
@@ -150,8 +182,9 @@ def verify_track(
     track : str or Path
         ``track.csv`` of `track_path`, or its folder.
     log : Log
-        Tips measured while these commands ran, with the commands. Rows belong to those of the track
-        if there are as many; else by the time since the first row.
+        Tips measured while these commands ran. Rows belong to those of the track if there are as
+        many; else by the time since the first row. The commands are compared with those of the
+        track; a log of a camera alone has none, with q of shape (N, 0).
     out : str or Path, optional
         Folder to write into. Default: nothing is written.
     delay : float, optional
@@ -172,7 +205,8 @@ def verify_track(
     """
     if out is not None:
         check_out(out, "verify", force=force)
-    loaded.check_columns(log.q)
+    if log.q.shape[1]:
+        loaded.check_columns(log.q)
     sent = read_track(track, loaded.log_format())
     motion = loaded.effective(Commands(sent.q, time=sent.time))
     rows = _rows_of(log, sent)
@@ -205,19 +239,31 @@ def verify_track(
     kept = None
     if promised is not None:
         kept = bool(parts["path"].mean <= _KEPT * parts["path"].promised)
-    causes = _explained(loaded, motion, rows, x)
-    likely = max(causes, key=causes.__getitem__)
+    compared = compare_causes(_evidence(loaded, sent, motion, rows, x, promised))
     cause = None
-    if not kept and causes[likely] > _LIKELY:
-        cause = likely
+    also = []
+    amount = ""
+    remedy = ""
+    separate = ""
+    likely = compared.likely
+    if not kept and likely is not compared.nothing:
+        cause = likely.name
+        also = [explanation.name for explanation in compared.also]
+        amount = likely.cause.amount(compared.evidence, likely.parameters)
+        remedy = likely.cause.remedy
+        separate = _separation(compared)
     record = Verification(
         model=str(loaded.path),
         track=str(track),
         log=log.source,
         parts=parts,
         kept=kept,
-        causes=causes,
+        causes=compared.shares,
         cause=cause,
+        also=also,
+        amount=amount,
+        remedy=remedy,
+        separate=separate,
         range=_share_of_range(loaded, q),
         delay=delay,
         later=later,
@@ -266,6 +312,8 @@ def _rows_of(log: Log, sent: Log) -> NDArray:
             )
         passed = log.time - log.time[0] + sent.time[0]
         rows = np.rint(np.interp(passed, sent.time, np.arange(len(sent.q)))).astype(int)
+    if not log.q.shape[1]:
+        return rows
     far = np.abs(log.q - sent.q[rows]).mean() / np.ptp(sent.q, axis=0).max()
     if not far < _DIFFERENT:
         raise ValueError(
@@ -311,26 +359,65 @@ def _share_of_range(loaded: LoadedModel, q: NDArray) -> float | None:
     return float((np.ptp(q, axis=0)[moved] / widths[moved]).max(initial=0.0))
 
 
-def _explained(
-    loaded: LoadedModel, motion: NDArray, rows: NDArray, x: NDArray
-) -> dict[str, float]:
-    """Return the share of the mean squared error that each cause explains."""
+def _evidence(
+    loaded: LoadedModel,
+    sent: Log,
+    motion: NDArray,
+    rows: NDArray,
+    x: NDArray,
+    promised: ExpectedErrors | None,
+) -> Evidence:
+    """Return the evidence of measured tips x (N, 3) at rows (N,) of a motion (T, n)."""
+    order = np.argsort(rows, kind="stable")
+    rows = rows[order]
     q = motion[rows]
-    tips, J = evaluate(loaded.module, q, jacobian=True)
-    residual = x - tips
-    off = _off_plane(loaded, q)
-    linear = off @ np.linalg.lstsq(off, residual)[0]
-    remaining = {
-        "backlash": _without_backlash(motion, rows, J, residual),
-        "moved base": np.square(x - _moved(tips, x)).sum(),
-        "outside the log": _as_inside(loaded, q - off, residual),
-        "off the plane of the log": np.square(residual - linear).sum(),
-    }
-    whole = max(np.square(residual).sum(), np.finfo(float).tiny)
-    return {
-        cause: max(0.0, 1.0 - float(squares / whole))
-        for cause, squares in remaining.items()
-    }
+    bodies = [loaded.module]
+    layout = ActuatorLayout.independent(loaded.n_actuators)
+    if loaded.chain is not None:
+        chain = loaded.chain.tip_model
+        bodies = [chain, *chain.softer()]
+        layout = loaded.chain.actuator_layout
+    off_plane = _off_plane(loaded, q)
+    low = motion.min(axis=0)
+    high = motion.max(axis=0)
+    if loaded.hybrid is not None:
+        low, high = loaded.hybrid.training_range_
+    expected = 0.0
+    if promised is not None:
+        expected = float(promised.mean.mean())
+    return Evidence(
+        motion=Motion.of(motion, sent.time, None),
+        rows=rows,
+        x=x[order],
+        model=loaded.module,
+        bodies=bodies,
+        actuators=_actuators(loaded.log_format(), layout),
+        inside=loaded.domain_distance(q - off_plane) <= 1.0,
+        off_plane=off_plane,
+        promised=expected,
+        low=low,
+        high=high,
+        alignment=Alignment(),
+    )
+
+
+def _actuators(log: LogFormat, layout: ActuatorLayout) -> Actuators:
+    """Return the actuators with the words of a log."""
+    n = len(layout.rest)
+    unit = "" if log.q_unit == "1" else log.q_unit
+    per_unit = np.broadcast_to(log.q_factor, (n,)).astype(float)
+    return Actuators(log.q, unit, per_unit, layout)
+
+
+def _separation(compared: CauseComparison) -> str:
+    """Return the motion that tells the likely cause from the first of the others, in words."""
+    if not compared.also:
+        return ""
+    separation = separating_motion(compared.evidence, compared.likely, compared.also[0])
+    if not separation.words:
+        return ""
+    far = millimetres(separation.difference, ".2g")
+    return f"{separation.words} (the tips then differ by up to {far})"
 
 
 def _off_plane(loaded: LoadedModel, q: NDArray) -> NDArray:
@@ -342,37 +429,35 @@ def _off_plane(loaded: LoadedModel, q: NDArray) -> NDArray:
     return np.where(np.abs(off).max() > _OFF * np.ptp(q, axis=0).max(), off, 0.0)
 
 
-def _without_backlash(
-    motion: NDArray, rows: NDArray, J: NDArray, residual: NDArray
-) -> float:
-    """Return the sum of squares that the most likely backlash of every actuator leaves.
+def read_tips(
+    path: str | Path, log_format: LogFormat, delimiter: str | None = None
+) -> Log:
+    """Return the tips of a file of a camera, which holds none of the commands.
 
-    The tip errors are linear in the widths if the shape of the lag, from -1/2 to 1/2, is known. It
-    is that of the widths of the round before.
+    Parameters
+    ----------
+    path : str or Path
+        CSV, npz or parquet file.
+    log_format : LogFormat
+        Columns and units of the robot's logs; its time is used where the file has such a column.
+    delimiter : str or None, default=None
+        As for `datasets.load_log`.
+
+    Returns
+    -------
+    Log
+        With q of shape (N, 0).
     """
-    least = _NARROW * np.ptp(motion, axis=0).max()
-    left = 0.0
-    widths = np.zeros(motion.shape[1])
-    for _ in range(_ROUNDS):
-        widths = np.maximum(widths, least)
-        lag = (PlayOperator(widths).apply(motion)[0] - motion) / widths
-        per_width = (J * lag[rows, None]).reshape(-1, len(widths))
-        widths, left = nnls(per_width, residual.ravel())
-    return left**2
-
-
-def _moved(tips: NDArray, x: NDArray) -> NDArray:
-    """Return tips (N, 3) after the rigid motion that brings them nearest to x."""
-    motion = rigid_motion(torch.from_numpy(tips), torch.from_numpy(x)).numpy()
-    return tips @ motion[:3, :3].T + motion[:3, 3]
-
-
-def _as_inside(loaded: LoadedModel, q: NDArray, residual: NDArray) -> float:
-    """Return the sum of squares if the errors were everywhere as inside the log."""
-    squares = np.square(residual).sum(axis=1)
-    inside = loaded.domain_distance(q) <= 1.0
-    if inside.any():
-        return len(q) * squares[inside].mean()
-    if loaded.held_out is None:
-        return squares.sum()
-    return len(q) * loaded.held_out.mean**2
+    columns = {*log_columns(path, delimiter)}
+    time = log_format.time if log_format.time in columns else None
+    reading = {
+        **log_format.reading,
+        "q": (),
+        "q_unit": "m",
+        "q_sign": 1,
+        "groups": None,
+        "runs": None,
+        "time": time,
+    }
+    reading.pop("unwrap", None)
+    return load_log(path, **reading, delimiter=delimiter, drop_invalid=True)

@@ -168,7 +168,7 @@ def test_pauses_between_motions_are_no_gaps():
     short.time[101:] += 2.0
     (gap,) = (f for f in findings(short, None) if f.kind == "time")
     assert gap.rows.tolist() == [101]
-    assert "up to 2.1 s; the usual step is 0.1 s" in gap.message
+    assert "up to 2.1 s; the usual step is 100 ms" in gap.message
 
 
 def test_a_usual_step_is_one_within_motions():

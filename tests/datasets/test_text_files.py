@@ -361,3 +361,35 @@ def test_paths_have_any_separator(tmp_path, separator, header, end):
     if separator != ",":
         path = write(tmp_path, (header + rows).replace(",", separator).replace(".", ","))
         assert_allclose(trajectories.from_csv(path).x, TIPS[:, :3])
+
+
+# small things
+
+
+@pytest.mark.parametrize("row", ["mm,mm,mm,cm,cm,cm", "[mm],[mm],[mm],[cm],[cm],[cm]"])
+def test_a_row_of_units_is_read(tmp_path, row):
+    path = write(tmp_path, plain(change=lambda rows: [row, *rows]))
+    log = load_log(path, **COLUMNS, q_unit="mm", x_unit="cm")
+    assert_allclose(log.x, 0.01 * load_log(write(tmp_path, plain()), **COLUMNS).x)
+    path = write(tmp_path, plain(change=lambda rows: [row, *rows]))
+    with pytest.raises(ValueError, match="`x_unit` must be 'cm' for column 'X', as line 2"):
+        load_log(path, **COLUMNS, q_unit="mm", x_unit="mm")
+
+
+def test_a_row_of_words_is_no_row_of_units(tmp_path):
+    path = write(tmp_path, plain(change=lambda rows: ["u,v,w,x,y,z", *rows]))
+    with pytest.raises(ValueError, match=r"Line 2 .* a number is needed, got 'u'"):
+        load_log(path, **COLUMNS)
+
+
+@pytest.mark.parametrize("separator", [" ", "  ", "\t", ","])
+@pytest.mark.parametrize("comments", ["# ", "#", ""])
+def test_tables_as_numpy_saves_them(tmp_path, separator, comments):
+    values = np.arange(6.0 * N).reshape(N, 6) / 1e3
+    header = separator.join(["a", "b", "c", "X", "Y", "Z"])
+    path = tmp_path / "log.txt"
+    np.savetxt(path, values, delimiter=separator, header=header, comments=comments)
+    log = load_log(path, **COLUMNS)
+    assert_allclose(np.hstack([log.q, log.x]), values)
+    if comments:
+        assert_allclose(load_log(path, ["# a", "b"], COLUMNS["x"]).q, values[:, :2])

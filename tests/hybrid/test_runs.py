@@ -241,14 +241,18 @@ def test_the_range_of_states_is_tested_by_other_groups():
     groups = np.repeat([0, 1, 2, 3], 10)
     states = np.repeat([0.0, 0.1, 0.6, 9.0], 10)[:, None, None]
     log = Rows(q, q, np.where(groups == 3, 0.0, 1.0), groups)  # the last one is not measured
-    low, high = state_range(states, log)
+
+    def ranges(log):
+        return state_range(states[log.counted], log.take(log.counted), np.ptp(q, axis=0))
+
+    low, high = ranges(log)
     assert_allclose([low.item(), high.item()], [0.0 - 0.5, 0.6 + 0.5])
     one_run = replace(log, runs=np.zeros(40))
-    assert_allclose(state_range(states, one_run), (low, high))
+    assert_allclose(ranges(one_run), (low, high))
     by_run = replace(log, groups=None, runs=groups.astype(float))
-    assert_allclose(state_range(states, by_run), (low, high))
+    assert_allclose(ranges(by_run), (low, high))
     alone = replace(log, groups=np.zeros(40))
-    assert_allclose(np.ravel(state_range(states, alone)), [0.0 - 0.1, 0.6 + 0.1])
+    assert_allclose(np.ravel(ranges(alone)), [0.0 - 0.1, 0.6 + 0.1])
 
 
 @pytest.mark.slow

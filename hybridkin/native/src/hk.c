@@ -145,18 +145,22 @@ HK_API int32_t hk_evaluate_row(const hk_row *row, const real *q, int32_t asked, 
 }
 
 /* Rows (rows, n) through hysteresis, see hysteresis.h: commands, or with `lead` what the actuators are
-   to do, `seconds` (rows) after the row before. The results are what they do, or the commands. */
+   to do, `seconds` (rows) after the row before. At negative ones the state begins anew, without
+   hysteresis. The results are what they do, or the commands. */
 HK_API void hk_hysteresis_rows(int64_t rows, int32_t n, int32_t lead, real rounding,
                                const int32_t *code, const real *numbers, const real *seconds,
                                const real *given, real *state, real *results) {
     const hk_hysteresis h = {code, numbers, n, rounding};
-    const real *y = state + (code[HK_STATE_ROWS] - 1) * n;
+    const int size = code[HK_STATE_ROWS] * n;
+    const real *y = state + size - n;
     for (int64_t r = 0; r < rows; r++, given += n, results += n) {
+        const real passed = seconds[r] < R(0.0) ? R(0.0) : seconds[r];
+        for (int i = 0; i < size && seconds[r] < R(0.0); i++) state[i] = given[i % n];
         for (int j = 0; j < n; j++) *(lead ? results + j : state + j) = given[j];
         if (lead)
-            hk_hysteresis_command(&h, seconds[r], results, state);
+            hk_hysteresis_command(&h, passed, results, state);
         else
-            hk_hysteresis_apply(&h, seconds[r], state);
+            hk_hysteresis_apply(&h, passed, state);
         for (int j = 0; j < n && !lead; j++) results[j] = y[j];
     }
 }
