@@ -42,8 +42,10 @@ _WINDOWS = 30  # of the fine search, at most
 _DEGREES = (1, 2, 3)  # of the polynomials that explain tips
 _EXACT = 1e-3  # what a right lag can leave unexplained; a wrong one only where a motion repeats
 _RIDGE = 1e-9  # relative to the mean square of a feature
-_PARTS = 10  # of a log, of which each is explained by the others
-_EXPLAINED = 0.5  # least share of the motion that the commands explain at the lag
+_PARTS = (
+    3  # of a log, each explained by the others; short ones agree with anything smooth
+)
+_EXPLAINED = 0.8  # least share of the motion that the commands explain at the lag
 _RIVAL = 1.5  # least ratio of what the second best lag leaves to what the best leaves
 
 
@@ -243,7 +245,7 @@ def merge_logs(
         Tip positions [m], three columns for each marker, as from `read_columns`.
     lag : float or None, default=None
         How much later than the clock of the motors that of the camera is [s]; 0 if both share one.
-        None: it is estimated, to a small part of a period of the camera.
+        None: it is estimated, to a few milliseconds.
     tolerance : float or None, default=None
         Longest time between two motor rows of which a command is made [s]; camera rows in longer
         gaps are left out. Default: 5 usual periods of the motor rows; with `hold`, no limit.
@@ -426,7 +428,7 @@ def _coarse_lags(
     peaks = peaks[score[peaks] >= _SURE * score[peaks].max()]
     best = peaks[np.argsort(-score[peaks])[:_CANDIDATES]]
     start = camera.time[0] - motors.time[0]
-    return [(start - shift[k] * step, 2.0 * step) for k in best]
+    return [(float(start - shift[k] * step), float(2.0 * step)) for k in best]
 
 
 def _tip(x: NDArray) -> NDArray:
@@ -562,7 +564,7 @@ def _unexplained(q: NDArray, x: NDArray, degree: int) -> float:
 def _explained(q: NDArray, x: NDArray) -> tuple[float, int]:
     """Return the share of the variance of tips that the commands explain in other parts of a log.
 
-    That of ten parts in a row, each from the other nine, by a polynomial of the best degree, and
+    That of three parts in a row, each from the other two, by a polynomial of the best degree, and
     that degree. Smooth motions that have nothing to do with each other agree within one part.
     """
     tips = _tip(x)

@@ -41,7 +41,7 @@ def test_lag_of_any_size_is_found(seed):
     lag = [0.0, 0.034, -3.2, 55.0, 1.7e9][seed % 5]
     motors, camera, q = recordings(seed, lag)
     merged = merge_logs(motors, camera)
-    assert abs(merged.lag - lag) < 0.1 * np.median(np.diff(camera.time))
+    assert abs(merged.lag - lag) < 5e-3
     assert merged.n_left_out < 0.02 * len(camera.time)
     # A part of a period of the fastest motion, and what is linear between two motor rows.
     assert np.abs(merged.log.q - q(merged.log.time)).max() < 1e-4
@@ -64,7 +64,7 @@ def test_lag_of_held_postures_is_found():
         seen = np.arange(10.0, 80.0, 1.0 / 60.0)
         x = tips(q(seen)) + 2e-4 * rng.standard_normal((len(seen), 3))
         merged = merge_logs(TimedColumns(q(t), t), TimedColumns(x, seen - 40.0))
-        assert abs(merged.lag + 40.0) < 0.1 / 60.0
+        assert abs(merged.lag + 40.0) < 5e-3
 
 
 def test_given_lag_is_exact():
@@ -126,7 +126,7 @@ def test_missing_markers_stay_missing():
     x[::11, 0] = np.nan
     x[::77] = np.nan
     merged = merge_logs(motors, TimedColumns(x, camera.time))
-    assert abs(merged.lag - 7.0) < 0.1 * np.median(np.diff(camera.time))
+    assert abs(merged.lag - 7.0) < 5e-3
     log = merged.log
     assert log.x.shape[1] == 6
     # Of a marker all or nothing is known.
