@@ -15,7 +15,7 @@ from hybridkin._core.files import check_outputs, write_file
 from hybridkin._core.text_rows import TextForm
 from hybridkin._core.texts import csv_table
 from hybridkin.datasets import merge_logs
-from hybridkin.datasets._merged import columns_as_written
+from hybridkin.datasets.merged import columns_as_written
 from hybridkin.datasets.table_files import read_table
 from hybridkin.workflow.report import Report
 
