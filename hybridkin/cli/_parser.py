@@ -59,7 +59,7 @@ def parser() -> argparse.ArgumentParser:
         "--version", action="version", version=f"hybridkin {hybridkin.__version__}"
     )
     commands = top.add_subparsers(required=True, metavar="COMMAND", dest="command")
-    begin = (_demo, _init, _describe, _fit, _evaluate)
+    begin = (_demo, _merge, _init, _describe, _fit, _evaluate)
     use = (_view, _track, _verify, _animate)
     for add_options in (*begin, *use, _next, _export):
         text = _help(add_options)
@@ -160,6 +160,48 @@ def _init(command: argparse.ArgumentParser) -> None:
         add(option, type=question.parse, metavar=value, help=question.text)
     _add_text_form(command)
     add("--force", action="store_true", help="replace the file if it exists")
+
+
+def _merge(command: argparse.ArgumentParser) -> None:
+    """Write one log from a file of the motors and one of a camera.
+
+    Gives each tip of the camera the command of its time. The clocks of the two files may differ:
+    the lag between them is that at which the commands explain the tips best, and is printed. A
+    motion that repeats has several such lags: give --lag, 0 if both files share a clock.
+
+    Some examples:
+      hybridkin merge motors.csv camera.csv --q m1,m2,m3 --x X,Y,Z --time t --out log.csv
+      hybridkin merge motors.csv camera.csv --q m1,m2,m3 --x X,Y,Z --time t --lag 0 --out log.csv
+
+    A camera's own name of the time is given by --camera-time, for example "Time (Seconds)".
+
+    Names, units and signs of the columns stay as they are in the files.
+    """
+    add = command.add_argument
+    add("motors", type=Path, metavar="MOTORS", help="file of the motors")
+    add("camera", type=Path, metavar="CAMERA", help="file of the camera")
+    add("--out", type=Path, required=True, metavar="LOG.csv", help="log to write")
+    text = "columns of the actuators"
+    add("--q", type=names, required=True, metavar="A,B,...", help=text)
+    text = "columns of the tip"
+    add("--x", type=names, required=True, metavar="X,Y,Z", help=text)
+    text = "column of the time of the motors [s]"
+    add("--time", required=True, metavar="COLUMN", help=text)
+    text = "column of the time of the camera [s] (of the same name)"
+    add("--camera-time", metavar="COLUMN", help=text)
+    add("--groups", metavar="COLUMN", help="column of the motion, with the motors")
+    text = "how much later the clock of the camera is [s] (estimated)"
+    add("--lag", type=float, metavar="S", help=text)
+    text = "longest time between two motor rows [s]; tips in longer gaps are left out (5 periods)"
+    add("--tolerance", type=positive, metavar="S", help=text)
+    text = "a command holds until the next one (linear between two rows)"
+    add("--hold", action="store_true", help=text)
+    text = "separator of text files (comma, semicolon or tab, by the header)"
+    add("--delimiter", metavar="CHAR", help=text)
+    add("--decimal", choices=DECIMALS, help="decimal sign of text files (.)")
+    text = "numbers of the camera that stand for missing values, such as 9999.999"
+    add("--missing", type=numbers, metavar="A,...", help=text)
+    add("--force", action="store_true", help="replace the log if it exists")
 
 
 def _next(command: argparse.ArgumentParser) -> None:

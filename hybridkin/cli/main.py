@@ -149,6 +149,28 @@ def _next(arguments: argparse.Namespace, stages: Stages) -> _Result:
     return report, 0
 
 
+def _merge(arguments: argparse.Namespace, stages: Stages) -> _Result:
+    stages("merging the recordings", 0, 1)
+    report = hybridkin.workflow.merge_files(
+        arguments.motors,
+        arguments.camera,
+        arguments.out,
+        q=arguments.q,
+        x=arguments.x,
+        time=arguments.time,
+        camera_time=arguments.camera_time,
+        groups=arguments.groups,
+        lag=arguments.lag,
+        tolerance=arguments.tolerance,
+        hold=arguments.hold,
+        delimiter=arguments.delimiter,
+        decimal=arguments.decimal or ".",
+        missing=arguments.missing or (),
+        force=arguments.force,
+    )
+    return report, 0
+
+
 def _fit(arguments: argparse.Namespace, stages: Stages) -> _Result:
     robot = hybridkin.robots.read_description(arguments.robot)
     log_format = _log_format(arguments, robot.log, arguments.robot)
@@ -477,6 +499,7 @@ def _demo(arguments: argparse.Namespace, stages: Stages) -> _Result:
 
 
 _COMMANDS = (
+    _merge,
     _next,
     _fit,
     _evaluate,

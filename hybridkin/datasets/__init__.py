@@ -7,7 +7,7 @@ from hybridkin.datasets._log_checks import LogFinding, LogReport, check_log
 from hybridkin.datasets._logs import Log, load_log, log_columns
 
 if TYPE_CHECKING:
-    from hybridkin.datasets._merged import (
+    from hybridkin.datasets.merged import (
         Merged,
         TimedColumns,
         merge_logs,
@@ -46,7 +46,7 @@ __all__ = [
 
 # Some results are Bunches of scikit-learn; a merge needs scipy.
 _NAMES_OF = {
-    "_merged": ("Merged", "TimedColumns", "merge_logs", "read_columns"),
+    "merged": ("Merged", "TimedColumns", "merge_logs", "read_columns"),
     "_recordings": (
         "load_armlab",
         "load_asl_trunk",

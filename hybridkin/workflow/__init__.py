@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from hybridkin.workflow.film import animate_track
     from hybridkin.workflow.fit import fit_log
     from hybridkin.workflow.fit_record import FitRecord
+    from hybridkin.workflow.merge import merge_files
     from hybridkin.workflow.path import scaled_path, shape_path
     from hybridkin.workflow.planning import next_rows
     from hybridkin.workflow.track import TrackRecord, track_path
@@ -45,6 +46,7 @@ __all__ = [
     "export_model",
     "fit_log",
     "is_log",
+    "merge_files",
     "next_rows",
     "open_model",
     "path_limits",
@@ -76,6 +78,7 @@ _NAMES_OF = {
     "film": ("animate_track",),
     "fit": ("fit_log",),
     "fit_record": ("FitRecord",),
+    "merge": ("merge_files",),
     "path": (
         "scaled_path",
         "shape_path",

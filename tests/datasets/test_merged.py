@@ -45,7 +45,26 @@ def test_lag_of_any_size_is_found(seed):
     assert merged.n_left_out < 0.02 * len(camera.time)
     # A part of a period of the fastest motion, and what is linear between two motor rows.
     assert np.abs(merged.log.q - q(merged.log.time)).max() < 1e-4
-    assert f"clock is {merged.lag:.6g} s later" in str(merged)
+    assert f"clock is {merged.lag:.4f} s later" in str(merged)
+
+
+def test_lag_of_held_postures_is_found():
+    """Long rests between quick moves: many rows are the same, few say when the robot moves."""
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        targets = rng.uniform(-4e-3, 4e-3, (60, 4))
+        starts = np.cumsum(rng.uniform(1.0, 3.0, 59))
+
+        def q(t, targets=targets, starts=starts):
+            k = np.searchsorted(starts, t)
+            share = np.clip((t - starts[np.maximum(k - 1, 0)]) / 0.4, 0.0, 1.0)[:, None]
+            return targets[np.maximum(k - 1, 0)] * (1.0 - share) + targets[k] * share
+
+        t = np.arange(0.0, 100.0, 0.02)
+        seen = np.arange(10.0, 80.0, 1.0 / 60.0)
+        x = tips(q(seen)) + 2e-4 * rng.standard_normal((len(seen), 3))
+        merged = merge_logs(TimedColumns(q(t), t), TimedColumns(x, seen - 40.0))
+        assert abs(merged.lag + 40.0) < 5e-3
 
 
 def test_given_lag_is_exact():

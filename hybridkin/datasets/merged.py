@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -25,7 +27,7 @@ from hybridkin._core.units import METRES, UNITS
 from hybridkin.datasets._encoders import _features as rough_features
 from hybridkin.datasets._log_report import named_rows
 from hybridkin.datasets._logs import Log
-from hybridkin.datasets._tables import without_missing
+from hybridkin.datasets._tables import Table, without_missing
 from hybridkin.datasets.table_files import read_table
 
 _GAP = 5.0  # usual periods of the motor rows: longer ones are gaps
@@ -34,11 +36,16 @@ _OVERLAP = 0.5  # of the shorter recording, at least
 _CANDIDATES = 6  # lags of the coarse search that are compared
 _SURE = 0.7  # least score of a candidate, relative to the best
 _ROWS = 2000  # camera rows that are compared, at most
-_FEATURES = 100  # of the rough model, at most
-_ROWS_PER_FEATURE = 5  # at least, for products of commands
+_FEATURES = 250  # of the rough model, at most
+_ROWS_PER_FEATURE = 5  # at least, of polynomials
 _WINDOWS = 30  # of the fine search, at most
-_PARTS = 10  # of a log, of which each is explained by the others
-_EXPLAINED = 0.5  # least share of the motion that the commands explain at the lag
+_DEGREES = (1, 2, 3)  # of the polynomials that explain tips
+_EXACT = 1e-3  # what a right lag can leave unexplained; a wrong one only where a motion repeats
+_RIDGE = 1e-9  # relative to the mean square of a feature
+_PARTS = (
+    3  # of a log, each explained by the others; short ones agree with anything smooth
+)
+_EXPLAINED = 0.8  # least share of the motion that the commands explain at the lag
 _RIVAL = 1.5  # least ratio of what the second best lag leaves to what the best leaves
 
 
@@ -155,21 +162,30 @@ def read_columns(
     one_of(unit, "unit", UNITS)
     factor = np.multiply(real_array(sign, "sign"), UNITS[unit])
     table = read_table(as_path(path), TextForm(delimiter, header_line, decimal))
+    table.check_unit("unit", table.names("names", names), unit)
+    columns = columns_as_written(table, names, time, groups, missing)
+    return replace(columns, values=columns.values * factor, unit=unit)
+
+
+def columns_as_written(
+    table: Table,
+    names: Sequence[str],
+    time: str,
+    groups: str | None = None,
+    missing: ArrayLike = (),
+) -> TimedColumns:
+    """Return columns of a table with their times, not converted; see `read_columns`."""
     columns = table.names("names", names)
-    table.check_unit("unit", columns, unit)
     values = table.values([*columns, time], [time])
     without_missing(values[:, :-1], missing)
     timed = countable(values[:, -1])
     motions = None
     if groups is not None:
         motions = table.labels("groups", groups, len(values))[timed]
+    time_of_rows = values[timed, -1]
+    values = values[timed, :-1]
     return TimedColumns(
-        values[timed, :-1] * factor,
-        values[timed, -1],
-        tuple(columns),
-        unit,
-        motions,
-        str(path),
+        values, time_of_rows, tuple(columns), "1", motions, str(table.source)
     )
 
 
@@ -202,7 +218,7 @@ class Merged(NamedTuple):
         how = "estimated from when both move" if self.is_estimated else "given"
         n_rows = len(self.log.q)
         return (
-            f"The camera's clock is {self.lag:.6g} s later than that of the motors ({how}); the "
+            f"The camera's clock is {self.lag:.4f} s later than that of the motors ({how}); the "
             f"commands then explain {self.explained:.1%} of the motion of the tip. {n_rows} of "
             f"{n_rows + self.n_left_out} camera rows have a tip and commands around them."
         )
@@ -229,7 +245,7 @@ def merge_logs(
         Tip positions [m], three columns for each marker, as from `read_columns`.
     lag : float or None, default=None
         How much later than the clock of the motors that of the camera is [s]; 0 if both share one.
-        None: it is estimated, to a small part of a period of the camera.
+        None: it is estimated, to a few milliseconds.
     tolerance : float or None, default=None
         Longest time between two motor rows of which a command is made [s]; camera rows in longer
         gaps are left out. Default: 5 usual periods of the motor rows; with `hold`, no limit.
@@ -311,7 +327,7 @@ def merge_logs(
         file_units={"q": motors.unit, "x": camera.unit},
         source=f"{motors.source} and {camera.source}",
     )
-    explained = _explained(q, x)
+    explained, _ = _explained(q, x)
     if is_estimated and explained < _EXPLAINED:
         raise ValueError(
             f"The lag between {motors.source} and {camera.source} is not clear: the commands "
@@ -381,15 +397,16 @@ def _estimated_lag(motors: TimedColumns, camera: TimedColumns, hold: bool) -> fl
     for lag, width in _coarse_lags(motors, camera):
         fits.append(_refined(motors, camera, lag, width, hold))
     unexplained, lag, width = min(fits)
+    as_good = max(_RIVAL * unexplained, _EXACT)
     for other, other_lag, _ in fits:
-        if abs(other_lag - lag) > width and other < _RIVAL * unexplained:
+        if abs(other_lag - lag) > width and other < as_good:
             raise ValueError(
                 f"The lag between {motors.source} and {camera.source} is not clear: lags of "
                 f"{lag:.6g} and {other_lag:.6g} s explain {1.0 - unexplained:.1%} and "
                 f"{1.0 - other:.1%} of the motion of the tip, as where a motion repeats. Give "
                 "`lag` (0 if they share a clock), or record a motion that does not repeat."
             )
-    return lag
+    return _polished(motors, camera, lag, width, hold)
 
 
 def _coarse_lags(
@@ -411,7 +428,7 @@ def _coarse_lags(
     peaks = peaks[score[peaks] >= _SURE * score[peaks].max()]
     best = peaks[np.argsort(-score[peaks])[:_CANDIDATES]]
     start = camera.time[0] - motors.time[0]
-    return [(start - shift[k] * step, 2.0 * step) for k in best]
+    return [(float(start - shift[k] * step), float(2.0 * step)) for k in best]
 
 
 def _tip(x: NDArray) -> NDArray:
@@ -470,30 +487,37 @@ def _refined(
     motors: TimedColumns, camera: TimedColumns, lag: float, width: float, hold: bool
 ) -> tuple[float, float, float]:
     """Return what the best lag nearby leaves unexplained, that lag, and the width of the search."""
-    cell = width / 8.0
+    tips = _surely_covered(motors, camera, lag, width)
+    shifts = np.linspace(-width, width, 17)
     for _ in range(_WINDOWS):
-        tips = _surely_covered(motors, camera, lag, width)
         if not len(tips.time):
             return np.inf, lag, width
-        lags = np.linspace(lag - width, lag + width, 17)
-        errors = [_left_at(seconds, motors, tips, hold) for seconds in lags]
+        errors = [_left_at(shift, lag, motors, tips, hold, 2) for shift in shifts]
         best = int(np.argmin(errors))
-        lag = float(lags[best])
-        if 0 < best < len(lags) - 1:
+        lag += float(shifts[best])
+        if 0 < best < len(shifts) - 1:
             break
+        tips = _surely_covered(motors, camera, lag, width)
+    q = commands_at(motors, tips.time - lag, hold)
+    return 1.0 - _explained(q, tips.values)[0], lag, width
+
+
+def _polished(
+    motors: TimedColumns, camera: TimedColumns, lag: float, width: float, hold: bool
+) -> float:
+    """Return the best lag near one of the fine search, by a polynomial of the commands."""
     tips = _surely_covered(motors, camera, lag, width)
     if not len(tips.time):
-        return np.inf, lag, width
+        return lag
+    _, degree = _explained(commands_at(motors, tips.time - lag, hold), tips.values)
     fit = minimize_scalar(
         _left_at,
-        args=(motors, tips, hold),
-        bounds=(lag - cell, lag + cell),
+        args=(lag, motors, tips, hold, degree),
+        bounds=(-width, width),  # its tolerance is relative, and a lag can be years
         method="bounded",
-        options={"xatol": 1e-3 * cell},
+        options={"xatol": 1e-4 * width},
     )
-    lag = float(fit.x)  # pyright: ignore[reportAttributeAccessIssue]
-    q = commands_at(motors, tips.time - lag, hold)
-    return 1.0 - _explained(q, tips.values), lag, width
+    return lag + float(fit.x)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _surely_covered(
@@ -514,26 +538,34 @@ def _surely_covered(
     return TimedColumns(tips[rows], camera.time[rows])
 
 
-def _left_at(lag: float, motors: TimedColumns, tips: TimedColumns, hold: bool) -> float:
-    """Return the share of the variance of tips that the commands leave at a lag."""
-    return _unexplained(commands_at(motors, tips.time - lag, hold), tips.values)
+def _left_at(
+    shift: float,
+    lag: float,
+    motors: TimedColumns,
+    tips: TimedColumns,
+    hold: bool,
+    degree: int,
+) -> float:
+    """Return the share of the variance of tips that the commands leave at a shifted lag."""
+    q = commands_at(motors, tips.time - lag - shift, hold)
+    return _unexplained(q, tips.values, degree)
 
 
-def _unexplained(q: NDArray, x: NDArray) -> float:
-    """Return the share of the variance of tips that a quadratic of the commands leaves."""
-    features = _features(q, squares=True)
-    weights = np.linalg.lstsq(features, x)[0]
+def _unexplained(q: NDArray, x: NDArray, degree: int) -> float:
+    """Return the share of the variance of tips that a polynomial of the commands leaves."""
+    features = _features(q, degree)
+    weights = _weights(features, x)
     n_free = max(len(x) - features.shape[1], 1)
     left = np.square(x - features @ weights).sum() * len(x) / n_free
     total = np.square(x - x.mean(axis=0)).sum()
     return float(left / total) if total > 0.0 else 1.0
 
 
-def _explained(q: NDArray, x: NDArray) -> float:
+def _explained(q: NDArray, x: NDArray) -> tuple[float, int]:
     """Return the share of the variance of tips that the commands explain in other parts of a log.
 
-    That of ten parts in a row, each from the other nine: a linear model, or a quadratic if that
-    explains more. Smooth motions that have nothing to do with each other agree within one part.
+    That of three parts in a row, each from the other two, by a polynomial of the best degree, and
+    that degree. Smooth motions that have nothing to do with each other agree within one part.
     """
     tips = _tip(x)
     known = np.isfinite(tips).all(axis=1)
@@ -544,27 +576,39 @@ def _explained(q: NDArray, x: NDArray) -> float:
     tips = tips[few]
     total = np.square(tips - tips.mean(axis=0)).sum()
     if not total > 0.0:
-        return 0.0
+        return 0.0, 1
     shares = []
-    for squares in (False, True):
-        features = _features(q, squares)
+    for degree in _DEGREES:
+        features = _features(q, degree)
         left = 0.0
         for part in np.array_split(np.arange(len(q)), _PARTS):
             others = np.delete(np.arange(len(q)), part)
-            weights = np.linalg.lstsq(features[others], tips[others])[0]
+            weights = _weights(features[others], tips[others])
             left += np.square(tips[part] - features[part] @ weights).sum()
         shares.append(1.0 - float(left / total))
-    return max(*shares, 0.0)
+    best = int(np.argmax(shares))
+    return max(shares[best], 0.0), _DEGREES[best]
 
 
-def _features(q: NDArray, squares: bool) -> NDArray:
-    """Return 1 and z of commands (N, n), z from -1 to 1; with `squares` also their products."""
+def _weights(features: NDArray, x: NDArray) -> NDArray:
+    """Return the weights (k, 3) of least squares; a tiny ridge keeps rows at rest solvable."""
+    gram = features.T @ features
+    ridge = _RIDGE * np.trace(gram) / len(gram)
+    return np.linalg.solve(gram + ridge * np.eye(len(gram)), features.T @ x)
+
+
+def _features(q: NDArray, degree: int) -> NDArray:
+    """Return the products of up to `degree` of 1 and z for commands (N, n), z from -1 to 1.
+
+    Where these are too many for the rows, products of fewer; at least z^2 where `degree` is 2.
+    """
     n = q.shape[1]
-    features = rough_features(q, q)
-    if not squares:
-        return features[:, : 1 + n]
-    first, second = np.triu_indices(n, k=1)
-    if features.shape[1] + len(first) <= min(_FEATURES, len(q) / _ROWS_PER_FEATURE):
-        z = features[:, 1 : 1 + n]
-        features = np.hstack([features, z[:, first] * z[:, second]])
-    return features
+    rough = rough_features(q, q)
+    if degree == 1:
+        return rough[:, : 1 + n]
+    most = min(_FEATURES, len(q) / _ROWS_PER_FEATURE)
+    if math.comb(n + degree, degree) > most:
+        return rough if degree == 2 else _features(q, degree - 1)
+    factors = rough[:, : 1 + n].T  # of which the first is 1
+    chosen = itertools.combinations_with_replacement(factors, degree)
+    return np.stack([np.prod(product, axis=0) for product in chosen], axis=1)
