@@ -14,6 +14,7 @@ from hybridkin.hybrid._range import TESTED, ranges_of_others
 from hybridkin.hybrid._rows import Rows
 
 _TOLERANCE = 1.1  # least factor by which a pace may be beyond those of the log
+_TINY = 1e-9  # pace that counts as rest, relative to the largest
 _KNOWN = 0.39  # part of a time constant; before, a run does not show the pace over it
 
 
@@ -82,12 +83,15 @@ def each_pace(
     rows = q[order.order].astype(np.float64)
     steps = order.steps(time)
     moved = np.abs(np.diff(rows, axis=0, prepend=rows[:1]))
-    moved[order.first] = 0.0
-    passed = np.where(order.first, 0.0, steps)
-    sums = np.cumsum(np.column_stack([passed, moved]), axis=0)
+    new = np.column_stack([steps, moved])
+    new[order.first] = 0.0
+    before = np.zeros_like(new)  # what fades in each step
+    before[1:] = new[:-1]
+    before[order.first] = 0.0
+    sums = np.cumsum(before, axis=0)
     for time_constant in time_constants:
         creep = CreepOperator([0.5], [time_constant])
-        recent = 2.0 * (sums - creep.followed(sums, steps))  # what has not faded yet
+        recent = new + 2.0 * (sums - creep.followed(sums, steps))
         duration = recent[:, :1]
         speeds = np.empty_like(rows)
         speeds[order.order] = recent[:, 1:] / np.where(duration > 0.0, duration, 1.0)
@@ -123,7 +127,9 @@ def pace_range(paces: list[Pace], measured: Rows) -> PaceRange:
     slower = _TOLERANCE
     others = ranges_of_others(relative, names)
     if others.low.size:
-        ratio = np.where(known & np.isfinite(others.low), others.low / relative, 1.0)
+        tested = known & np.isfinite(others.low)
+        least = np.where(tested, np.maximum(relative, _TINY), 1.0)
+        ratio = np.where(tested, others.low, 1.0) / least
         slower = max(slower, np.quantile(ratio.max(axis=1, initial=1.0), TESTED))
     low = np.where(np.isfinite(low), low, 0.0)
     return PaceRange(low / (slower * faster), faster * high)
