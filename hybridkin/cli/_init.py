@@ -242,11 +242,14 @@ def _is_tip(three: Sequence[str]) -> bool:
 def with_zeros(answers: _Answers, log: MeasuredLog) -> tuple[_Answers, str]:
     """Return the answers with the zeros of tendons from a log, and words for it.
 
-    They are the median of the first rows of all motions, if these are alike.
+    They are the median of the first rows of all motions, if these are alike. Readings of encoders
+    that are whole turns off tell nothing of them.
     """
     unit = answers["q_unit"]
     is_length = unit in METRES
-    if _has_chambers(answers) or (answers["kind"] != "tendons" and not is_length):
+    whole_turns_off = any(f.kind == "encoder" for f in log.report.findings)
+    known = _has_chambers(answers) or (answers["kind"] != "tendons" and not is_length)
+    if known or whole_turns_off:
         return answers, ""
     span = np.ptp(log.q, axis=0)
     first = np.zeros(1, dtype=int)

@@ -5,9 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hybridkin._core.units import UNITS
-from hybridkin.datasets._encoders import GLITCH, TURNS, encoder_faults, periods_of
+from hybridkin.datasets._encoders import (
+    TURNS,
+    WRAP,
+    EncoderFault,
+    encoder_faults,
+    periods_of,
+)
 from hybridkin.datasets._log_columns import LogRows
 from hybridkin.datasets._log_report import LogFinding
 from hybridkin.datasets._logs import column_names
@@ -26,27 +33,46 @@ def encoder_findings(rows: LogRows) -> Iterator[LogFinding]:
     readings = log.q / np.multiply(log.q_sign, UNITS.get(q_unit, 1.0))
     periods = [periods_of(q_unit)] * len(names)
     same_run = rows.runs[1:] == rows.runs[:-1]
+    wraps: dict[float, list[EncoderFault]] = {}
     for fault in encoder_faults(readings, log.x, same_run, periods):
-        where = rows.named(fault.rows)
-        period = f"{fault.period:.10g}"
-        name = names[fault.column]
-        severity = "error"
-        if fault.kind == GLITCH:
-            severity = "warning"
-            turns = np.unique(fault.turns[fault.rows] * fault.period)
-            amounts = " or ".join(f"{amount:+.10g}" for amount in turns)
-            message = (
-                f"{len(fault.rows)} readings of {name!r} are off by {amounts}, whole turns of "
-                f"{period}, while the tip stays ({where})."
-            )
+        if fault.kind == WRAP:
+            wraps.setdefault(fault.period, []).append(fault)
         elif fault.kind == TURNS:
-            changes = np.diff(fault.turns)[fault.rows - 1] * fault.period
-            amounts = ", ".join(f"{amount:+.10g}" for amount in changes)
-            message = (
-                f"the encoder of {name!r} changes by {amounts}, whole turns of {period}, while the "
-                f"tip stays: it lost turns, as at a power cycle, from {where} on."
-            )
+            yield _lost_turns(rows, names[fault.column], fault)
         else:
-            message = f"the readings of {name!r} wrap: they start again after {period} ({where})."
-        advice = _ADVICE.format(period=fault.period)
-        yield rows.finding("encoder", message, advice, fault.rows, severity)
+            yield _glitches(rows, names[fault.column], fault)
+    for period, faults in wraps.items():
+        columns = ", ".join(repr(names[fault.column]) for fault in faults)
+        places = np.unique(np.concatenate([fault.rows for fault in faults]))
+        message = (
+            f"the readings of {columns} wrap: they start again after {period:.10g} "
+            f"({rows.named(places)})."
+        )
+        yield _finding(rows, message, period, places, "error")
+
+
+def _lost_turns(rows: LogRows, name: str, fault: EncoderFault) -> LogFinding:
+    changes = np.diff(fault.turns)[fault.rows - 1] * fault.period
+    amounts = ", ".join(f"{amount:+.10g}" for amount in changes)
+    message = (
+        f"the encoder of {name!r} changes by {amounts}, whole turns of {fault.period:.10g}, while "
+        f"the tip stays: it lost turns, as at a power cycle, from {rows.named(fault.rows)} on."
+    )
+    return _finding(rows, message, fault.period, fault.rows, "error")
+
+
+def _glitches(rows: LogRows, name: str, fault: EncoderFault) -> LogFinding:
+    turns = np.unique(fault.turns[fault.rows] * fault.period)
+    amounts = " or ".join(f"{amount:+.10g}" for amount in turns)
+    message = (
+        f"{len(fault.rows)} readings of {name!r} are off by {amounts}, whole turns of "
+        f"{fault.period:.10g}, while the tip stays ({rows.named(fault.rows)})."
+    )
+    return _finding(rows, message, fault.period, fault.rows, "warning")
+
+
+def _finding(
+    rows: LogRows, message: str, period: float, places: NDArray, severity: str
+) -> LogFinding:
+    advice = _ADVICE.format(period=period)
+    return rows.finding("encoder", message, advice, places, severity)

@@ -172,7 +172,11 @@ def test_the_check_names_rows_and_amounts_and_nothing_else_of_the_columns():
         f.kind for f in checked(q, x).findings
     ]
     cases = {
-        "wrap": (np.mod(q, 4096.0), "error", "'q[0]' wrap: they start again after 4096"),
+        "wrap": (
+            np.mod(q, 4096.0),
+            "error",
+            "'q[2]' wrap: they start again after 4096",
+        ),
         "turns": (q + 4096.0 * (np.arange(400) >= 250)[:, None] * [0, 1, 0], "error", "row 250 on"),
         "glitch": (q - 4096.0 * (np.arange(400) == 99)[:, None] * [0, 0, 1], "warning", "by -4096"),
     }
