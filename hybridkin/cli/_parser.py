@@ -131,8 +131,8 @@ def _init(command: argparse.ArgumentParser) -> None:
 
     The file has the geometry of the robot and the columns and units of its logs, each with a
     comment. `fit` can read it at once. On a terminal the command asks for what the options do not
-    say. With --log it proposes the columns by their names, the zeros of tendons by the first rows of
-    the motions, and checks the log against the description, as `fit` does.
+    say. With --log it proposes the columns by their names and the zeros of tendons by the first rows
+    of the motions, and checks the log against the description, as `fit` does.
 
     Some examples:
       hybridkin init robot.toml --log log.csv
@@ -495,18 +495,18 @@ def _verify(command: argparse.ArgumentParser) -> None:
 
     Compares the error that the model promised with that of the measured tips, in parts of the path,
     and names the likely cause of a larger one: unit or axes of the tips, a late camera, a moved
-    base, the zero, gain, sign or place of an actuator, a slip, a dead actuator, a payload, backlash,
-    creep, misread rows, commands outside the log. It says how large the cause is, what explains as
-    much, and which motion tells them apart.
+    base, the zero, gain, sign or place of an actuator, a slip, a dead actuator, a payload,
+    backlash, creep, misread rows, commands outside the log. It says how large the cause is, what
+    explains as much, and which motion tells them apart.
 
     Some examples:
       hybridkin verify model track measured.csv
       hybridkin verify model track measured.csv --time stamp --out verification
 
-    MEASURED has the columns of the log of the model, or those of the tip alone, one row for each row
-    of the track. With other rows, --time names the column of the time: its first row is the first
-    row of the track. Where
-    the tips agree clearly better with earlier commands, the report says how late the camera is.
+    MEASURED has the columns of the log of the model, or those of the tip alone, one row for each
+    row of the track. With other rows, --time names the column of the time: its first row is the
+    first row of the track. Where the tips agree clearly better with earlier commands, the report
+    says how late the camera is.
     """
     add = command.add_argument
     _add_model(command)

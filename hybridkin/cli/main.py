@@ -382,7 +382,7 @@ def _export(arguments: argparse.Namespace, stages: Stages) -> _Result:
 
 def _describe(arguments: argparse.Namespace, stages: Stages) -> _Result:
     workflow = hybridkin.workflow
-    if arguments.log.suffix.lower() not in workflow.LOG_SUFFIXES:
+    if not workflow.is_log(arguments.log):
         loaded = workflow.open_model(arguments.log, arguments.robot)
         return workflow.describe(loaded), 0
     if arguments.robot is None:

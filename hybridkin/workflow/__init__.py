@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from hybridkin._core.first_use import on_first_use
 from hybridkin.workflow.description import Description, describe
 from hybridkin.workflow.log import LogError, MeasuredLog, read_log
-from hybridkin.workflow.model import LOG_SUFFIXES, LoadedModel, open_model
+from hybridkin.workflow.model import LOG_SUFFIXES, LoadedModel, is_log, open_model
 from hybridkin.workflow.report import Report
 
 if TYPE_CHECKING:
@@ -46,6 +46,7 @@ __all__ = [
     "export_model",
     "fit_log",
     "merge_files",
+    "is_log",
     "next_rows",
     "open_model",
     "path_limits",

@@ -32,8 +32,10 @@ if TYPE_CHECKING:
 LOG_SUFFIXES = (".csv", ".tsv", ".txt", ".npz", ".parquet", ".pq")
 """Endings of files that are treated as logs."""
 
+_MODELS = (".toml", ".safetensors")
 _MODEL = "model.safetensors"
 _ROBOT = "robot.toml"
+_HEADER = 8  # bytes of the size of the header of a model, which begins with a brace
 _LONG = 1e9  # time after which all creep has come [s]
 
 
@@ -270,6 +272,18 @@ class LoadedModel:
         if isinstance(self.chain, ArcChain) and not self.chain.in_metres:
             unit = "1"
         return robots.LogFormat(names, ("x", "y", "z"), unit)
+
+
+def is_log(path: str | Path) -> bool:
+    """Return whether a path names a log: by its ending, else a file that is no model."""
+    path = as_path(path)
+    if path.suffix.lower() in LOG_SUFFIXES:
+        return True
+    if path.suffix.lower() in _MODELS or not path.is_file():
+        return False
+    with open(path, "rb") as file:
+        start = file.read(_HEADER + 1)
+    return start[_HEADER:] != b"{"
 
 
 def open_model(path: str | Path, robot: str | Path | None = None) -> LoadedModel:

@@ -127,3 +127,21 @@ def test_what_is_not_needed_is_not_imported_and_a_pipe_may_close(robot):
         process.stdout.close()
         assert process.stderr.read() == b""
     assert process.returncode == 0
+
+
+def test_a_log_of_any_ending_is_described(tmp_path, capsys):
+    """A file that is no model is a log, as LabVIEW's .lvm or a plotter's .dat."""
+    robot = tmp_path / "robot.toml"
+    robot.write_text(
+        "[[segment]]\nradius = 0.01\nlength = 0.1\n"
+        '[log]\nq = ["a", "b", "c"]\nx = ["x", "y", "z"]\n'
+    )
+    rows = "\n".join(f"{k % 7 * 1e-4},{k % 5 * -1e-4},0,{k % 7 * 1e-3},0,0.1" for k in range(40))
+    for name in ("log.lvm", "log.dat", "log"):
+        path = tmp_path / name
+        path.write_text(f"a,b,c,x,y,z\n{rows}\n")
+        out = run(capsys, "describe", path, "--robot", robot)[1]
+        assert f"{name}: 40 rows" in " ".join(out.split())
+    code, _, err = run(capsys, "describe", tmp_path / "none.lvm")
+    assert code == 2
+    assert "none.lvm" in err

@@ -3,7 +3,6 @@
 import csv
 
 import numpy as np
-
 from simulated_log import document, run
 
 OPTIONS = ["--q", "a,b", "--x", "X,Y,Z", "--time", "t"]
