@@ -7,12 +7,6 @@ from hybridkin.datasets._log_checks import LogFinding, LogReport, check_log
 from hybridkin.datasets._logs import Log, load_log, log_columns
 
 if TYPE_CHECKING:
-    from hybridkin.datasets.merged import (
-        Merged,
-        TimedColumns,
-        merge_logs,
-        read_columns,
-    )
     from hybridkin.datasets._recordings import (
         load_armlab,
         load_asl_trunk,
@@ -22,6 +16,12 @@ if TYPE_CHECKING:
     )
     from hybridkin.datasets._repeatability import repeatability
     from hybridkin.datasets._shipped import load_trunk, paper_split
+    from hybridkin.datasets.merged import (
+        Merged,
+        TimedColumns,
+        merge_logs,
+        read_columns,
+    )
 
 __all__ = [
     "Log",
