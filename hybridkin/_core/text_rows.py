@@ -74,7 +74,8 @@ class TextForm:
             delimiter = max(candidates, key=unquoted.count)
             if delimiter in unquoted:
                 return delimiter
-        if any(" " in line.strip() for line in lines[:1]):
+        first = "".join(lines[:1]).strip()
+        if " " in first and _DELIMITERS[0] not in first:
             return " "
         return _DELIMITERS[0]
 

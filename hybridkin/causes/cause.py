@@ -107,8 +107,10 @@ class Cause(ABC):
             weights = np.where(used, robust_weights(_lengths(residual)), 0.0)
             columns = []
             for step in np.diag(_STEP * steps):
+                # At a kink, the mean of both slopes: the sign of an actuator does not matter.
                 ahead = self._residual(evidence, parameters + step, weights)
-                columns.append((ahead - residual).ravel() / _STEP)
+                behind = self._residual(evidence, parameters - step, weights)
+                columns.append((ahead - behind).ravel() / (2.0 * _STEP))
             root = np.sqrt(weights.repeat(3))
             slope = np.stack(columns, axis=1) * root[:, None]
             move, *_ = np.linalg.lstsq(slope, -root * residual.ravel(), rcond=1e-8)

@@ -61,7 +61,7 @@ class Reading(ActuatorCause):
 
 
 @dataclass(frozen=True)
-class _OneActuator(ActuatorCause):
+class OneActuator(ActuatorCause):
     """A cause in one actuator."""
 
     actuator: int
@@ -86,7 +86,7 @@ class _OneActuator(ActuatorCause):
         return evidence.motion.span[[self.actuator]]
 
 
-class Zero(_OneActuator):
+class Zero(OneActuator):
     """The zero of one actuator is another one, as after a slip or another pretension."""
 
     name = "zero of one actuator"
@@ -114,7 +114,7 @@ class Zero(_OneActuator):
 
 
 @dataclass(frozen=True)
-class Slip(_OneActuator):
+class Slip(OneActuator):
     """The zero of one actuator jumps during the motion: a slip, a lost step."""
 
     row: int
@@ -154,7 +154,7 @@ class Slip(_OneActuator):
         )
 
 
-class Gain(_OneActuator):
+class Gain(OneActuator):
     """One actuator moves by another factor: a spool of another radius, a leak."""
 
     name = "gain of one actuator"
@@ -183,7 +183,7 @@ class Gain(_OneActuator):
         return f"{name} moves {self._factor(parameters):.3g} times as far"
 
 
-class Dead(_OneActuator):
+class Dead(OneActuator):
     """One actuator does not move at all."""
 
     name = "dead actuator"
@@ -381,7 +381,7 @@ class Size(ActuatorCause):
         return f"its bends are {self._factor(parameters):.2g} times as large"
 
 
-class ZeroDrift(_OneActuator):
+class ZeroDrift(OneActuator):
     """The zero of one actuator drifts with time: a slipping spool, a drifting sensor."""
 
     name = "drift of one actuator"

@@ -248,7 +248,7 @@ class ConstantCurvatureChain(ArcChain):
         """
         from hybridkin.chains.elastic_tendons import ElasticTendonChain
 
-        if self.stage is not None or self.absolute.any():
+        if self.lengths is None or self.stage is not None or any(self.extensible):
             return []
         angles = self.angles.detach().split(self.actuators_per_segment)
         zeros = (self.gains * self.rest).detach()

@@ -82,6 +82,11 @@ class CreepOperator(HysteresisOperator):
         )
 
     @property
+    def time_constants(self) -> NDArray:
+        """The time constants (J,) [s]."""
+        return self.times
+
+    @property
     def _size(self) -> int | str:
         return self.gains.shape[1] if self.gains.ndim == 2 else "n"
 

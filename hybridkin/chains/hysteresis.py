@@ -65,6 +65,11 @@ class HysteresisOperator(ABC):
             setattr(self, name, value)
 
     @property
+    def time_constants(self) -> NDArray:
+        """Time constants of creep (J,) [s]; empty without creep."""
+        return np.empty(0)
+
+    @property
     def parts(self) -> tuple[HysteresisOperator, ...]:
         """The operators in series that it consists of."""
         return (self,)

@@ -124,6 +124,8 @@ class LogFormat:
             self,
             x=target,
             groups="status",
+            time_unit="s",
+            rate=None,
             header_line=None,
             decimal=".",
             missing=(),

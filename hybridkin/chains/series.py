@@ -74,6 +74,11 @@ class HysteresisSeries(HysteresisOperator):
         return " and ".join(operator.in_words(unit) for operator in self.operators)
 
     @property
+    def time_constants(self) -> NDArray:
+        """Time constants of creep of all operators (J,) [s]."""
+        return np.concatenate([part.time_constants for part in self.operators])
+
+    @property
     def _size(self) -> int | str:
         return self._actuators
 

@@ -131,8 +131,8 @@ def _init(command: argparse.ArgumentParser) -> None:
 
     The file has the geometry of the robot and the columns and units of its logs, each with a
     comment. `fit` can read it at once. On a terminal the command asks for what the options do not
-    say. With --log it proposes the columns by their names and the zeros of tendons by the first rows
-    of the motions, and checks the log against the description, as `fit` does.
+    say. With --log it proposes the columns by their names and the zeros of tendons by the first
+    rows of the motions, and checks the log against the description, as `fit` does.
 
     Some examples:
       hybridkin init robot.toml --log log.csv

@@ -16,7 +16,14 @@ from numpy.typing import NDArray
 from hybridkin._core.directions import in_terms
 from hybridkin._core.units import METRES
 from hybridkin.causes.alignment import Alignment, FreeBase, FreeOrigin
-from hybridkin.causes.commands import FirstRow, Size, Zero, ZeroDrift
+from hybridkin.causes.commands import (
+    FirstRow,
+    OneActuator,
+    Reading,
+    Size,
+    Zero,
+    ZeroDrift,
+)
 from hybridkin.causes.comparison import (
     READINGS,
     VALUES,
@@ -226,6 +233,7 @@ class _Comparison:
         best = np.eye(self.q.shape[1], dtype=int)
         least = self.declared_error
         for explanation in compared.explanations:
+            assert isinstance(explanation.cause, Reading)
             way = explanation.cause.way(compared.evidence).astype(int)
             error = self.error(self.read(self.q, way), self.x, self.base_is_free)
             if error * SIMPLE < least and self.keeps_balance(way):
@@ -583,6 +591,7 @@ def _in_words(comparison: _Comparison, best: Explanation) -> str:
 
 def _shift_in_words(comparison: _Comparison, best: Explanation) -> str:
     """Return the actuator with another zero, and how far it is off or drifts."""
+    assert isinstance(best.cause, OneActuator)
     verb = "is off" if isinstance(best.cause, Zero) else "drifts"
     far = 1e3 * abs(float(best.parameters[0]))
     return f"actuator {comparison.q_names[best.cause.actuator]!r} {verb} by about {far:.1g} mm"

@@ -30,7 +30,8 @@ def missing_values(rows: LogRows) -> Iterator[LogFinding]:
             "missing",
             f"{number} stands in {len(places)} rows, far outside all other values "
             f"({rows.named(places)}): it looks like a missing value.",
-            f"name it: missing = [{number}] in [log] (--missing {number}, missing=).",
+            f"name it: missing = [{number}] in [log] (--missing {number}, missing=), and leave "
+            "these rows out with --drop-invalid (drop_invalid=True).",
             places,
             "error",
         )
@@ -39,7 +40,8 @@ def missing_values(rows: LogRows) -> Iterator[LogFinding]:
             "missing",
             f"{marker} is at 0, 0, 0 in {len(places)} rows while the robot moves "
             f"({rows.named(places)}): the marker was lost.",
-            "name it: missing = [0] in [log] (--missing 0, missing=); zeros elsewhere stay.",
+            "name it: missing = [0] in [log] (--missing 0, missing=), and leave these rows out "
+            "with --drop-invalid (drop_invalid=True); zeros elsewhere stay.",
             places,
             "error",
         )

@@ -30,6 +30,7 @@ from hybridkin.hybrid._drift import Drift
 from hybridkin.hybrid._fit import known_tips
 from hybridkin.hybrid._hysteresis import Past
 from hybridkin.hybrid._module import Hybrid
+from hybridkin.hybrid._pace import each_pace
 from hybridkin.hybrid._radius import Radius
 from hybridkin.hybrid._range import TrainingRange
 from hybridkin.hybrid._rows import Rows
@@ -165,7 +166,8 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         With `play`, smooth friction and creep have states, which follow from the commands of a run.
         A row is outside if its states are farther from those of the log than a tenth of the range,
         and than groups of the log are from each other: for example in a run that begins where no
-        run of the log was, or after a long rest.
+        run of the log was, or after a long rest. With creep a row is outside as well if its run
+        moves faster or slower than the log did, over any time constant of creep.
 
         Parameters
         ----------
@@ -292,7 +294,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return (distance,)
 
     def _are_states_seen(self, X: object) -> NDArray[np.bool_]:
-        """Return whether the log had the states inside of the hysteresis (N,)."""
+        """Return whether the log had the states inside of the hysteresis, and such a pace (N,)."""
         commands = Commands.of(X)
         states_of_log = self._states_of_log
         if self.play_ is None or states_of_log is None:
@@ -303,6 +305,11 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         states = self.play_.each_inner_state(rows, commands.run_of_rows, commands.time)
         for k, state in enumerate(states):
             seen &= ((low[k] <= state) & (state <= high[k])).all(axis=1)
+        if self._fitted.pace is not None and commands.time is not None:
+            paces = each_pace(
+                rows, commands.run_of_rows, commands.time, self.play_.time_constants
+            )
+            seen &= self._fitted.pace.holds(paces, len(rows))
         return seen
 
     @property

@@ -12,7 +12,7 @@ from hybridkin._core.runs import RunOrder
 from hybridkin.hybrid._rows import Rows
 
 _MARGIN = 0.1  # of states beyond those of the log, relative to the range of a command
-_TESTED = 0.98  # share of the rows of the log that are in the range, held out
+TESTED = 0.98  # share of the rows of the log that are in the range, held out
 
 
 class TrainingRange(NamedTuple):
@@ -61,16 +61,24 @@ def state_range(states: NDArray, measured: Rows, size: NDArray) -> TrainingRange
     names = measured.groups
     if names is None:
         names = measured.run_of_rows
-    others = _ranges_of_others(states, names)
+    others = ranges_of_others(states, names)
     if states.size and others.low.size:
         beyond = (others.beyond(states) / size).max(axis=(1, 2))
-        margin = max(margin, np.quantile(beyond, _TESTED))
+        margin = max(margin, np.quantile(beyond, TESTED))
     low, high = TrainingRange.of(states)
     return TrainingRange(low - margin * size, high + margin * size)
 
 
-def _ranges_of_others(states: NDArray, names: NDArray) -> TrainingRange:
-    """Return for each row (K, ...) the range of the rows of other groups; empty for one group."""
+def ranges_of_others(states: NDArray, names: NDArray) -> TrainingRange:
+    """Return for each row (K, ...) the range of the rows of other groups; empty for one group.
+
+    Parameters
+    ----------
+    states : ndarray of shape (K, ...)
+        States, or other numbers, of the rows.
+    names : ndarray of shape (K,)
+        Group of every row.
+    """
     groups = RunOrder.of(names)
     if len(groups.starts) < 2:
         return TrainingRange(states[:0], states[:0])

@@ -38,6 +38,7 @@ from hybridkin.chains.series import HysteresisSeries
 from hybridkin.hybrid._adapt import Change
 from hybridkin.hybrid._drift import Drift
 from hybridkin.hybrid._module import Hybrid
+from hybridkin.hybrid._pace import PaceRange
 from hybridkin.hybrid._radius import Radius
 from hybridkin.hybrid._range import TrainingRange
 from hybridkin.hybrid._spec import ErrorModel, FittedError
@@ -93,6 +94,7 @@ def stored_hybrid(model: HybridForwardModel) -> Stored:
             "training_range": fit.training_range,
             **_stored_play(model.play_),
             "state_range": model._states_of_log,
+            **_stored_pace(model),
             "radius": model.radius_,
             "fitted_rows": fit.fitted_rows,
         },
@@ -200,6 +202,14 @@ def hybrid_of(stored: Stored, training: object) -> HybridForwardModel:
     return model
 
 
+def _stored_pace(model: HybridForwardModel) -> dict[str, NDArray]:
+    """Return the arrays of the range of paces; none without creep."""
+    pace = model._fitted.pace
+    if pace is None or model._states_of_log is None:
+        return {}
+    return {"pace_low": pace.low, "pace_high": pace.high}
+
+
 def _restored_fit(
     stored: Stored,
     training: object,
@@ -216,6 +226,13 @@ def _restored_fit(
             raise ValueError("`state_range` needs the arrays of a hysteresis")
         n_states = play.inner_states(np.zeros((1, n)), [0], [0.0]).shape[1]
         states = TrainingRange(*stored.array("state_range", (2, n_states, n)))
+    pace = None
+    if "pace_high" in stored.arrays:
+        if play is None or not play.creeps:
+            raise ValueError("`pace_high` needs the arrays of creep")
+        n_times = len(play.time_constants)
+        low = stored.array("pace_low", (n_times,))
+        pace = PaceRange(low, stored.array("pace_high", (n_times, n)))
     radius = None
     if "radius" in stored.arrays:
         numbers = stored.array("radius", (3,), finite=False).tolist()
@@ -250,6 +267,7 @@ def _restored_fit(
         no_drift=no_drift,
         play=play,
         state_range=states,
+        pace=pace,
         radius=radius,
     )
 

@@ -17,6 +17,7 @@ from hybridkin.hybrid._drift import Drift
 from hybridkin.hybrid._fit import few_rows, fit_hybrid, fit_messages
 from hybridkin.hybrid._hysteresis import moved_without, play_of
 from hybridkin.hybrid._module import Hybrid
+from hybridkin.hybrid._pace import Pace, PaceRange, each_pace, pace_range
 from hybridkin.hybrid._radius import Radius, conformal_radius
 from hybridkin.hybrid._range import TrainingRange, state_range
 from hybridkin.hybrid._rows import Rows
@@ -42,6 +43,8 @@ class HybridFit:
         Whether y had one dimension.
     training_range, state_range : TrainingRange
         Of what the actuators did, and of the states of hysteresis.
+    pace : PaceRange or None
+        How fast the commands moved, with creep.
     no_drift : Drift
         The drift before any measurement.
     calibration, play, radius
@@ -66,6 +69,7 @@ class HybridFit:
     refinement: Refinement = UNREFINED
     play: HysteresisOperator | None = None
     state_range: TrainingRange | None = None
+    pace: PaceRange | None = None
     radius: Radius | None = None
     messages: tuple[str, ...] = ()
 
@@ -111,12 +115,14 @@ def fit_to_log(
     rows = commands
     measured = commands
     states = None
+    pace = None
     moved = None
     if play is not None:
         spec = replace(spec, commanded=commands.directions)
         chosen = replace(chosen, commanded=commands.directions)
         measured = log.take(log.counted)
         states = state_range(_states(play, log), measured, np.ptp(log.X, axis=0))
+        pace = _pace(play, log, measured)
         moved = partial(moved_without, chosen, log)
         rows = log.effective(play).distinct()
     fitted = fit_hybrid(chosen, rows)
@@ -137,6 +143,7 @@ def fit_to_log(
         refinement=chosen.refinement,
         play=play,
         state_range=states,
+        pace=pace,
         radius=radius,
         messages=tuple(dict.fromkeys(messages)),
     )
@@ -148,6 +155,16 @@ def _states(play: HysteresisOperator, log: Rows) -> NDArray:
     for state in play.each_inner_state(log.X, log.run_of_rows, log.time):
         states.append(state[log.counted, None])
     return np.concatenate(states, axis=1)
+
+
+def _pace(play: HysteresisOperator, log: Rows, measured: Rows) -> PaceRange | None:
+    """Return the range of paces of the rows that count; None without creep."""
+    if log.time is None or not play.creeps:
+        return None
+    paces = []
+    for pace in each_pace(log.X, log.run_of_rows, log.time, play.time_constants):
+        paces.append(Pace(pace.speeds[log.counted], pace.known[log.counted]))
+    return pace_range(paces, measured)
 
 
 def _by_motion(log: Rows, rows: Rows, play: HysteresisOperator | None) -> Rows:

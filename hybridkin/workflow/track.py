@@ -14,6 +14,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 import hybridkin
+from hybridkin._core.text_rows import TextFile
 from hybridkin._core.units import METRES, duration_in_words
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.robots import LogFormat
@@ -585,16 +586,16 @@ def read_track(path: str | Path, log_format: LogFormat) -> Log:
         raise FileNotFoundError(
             f"`track` must be a file of commands, there is none at {file}."
         )
-    header = log_columns(
-        file, header_line=log_format.header_line, decimal=log_format.decimal
-    )
+    columns = replace(log_format, groups=None)
+    first_line = "".join(TextFile.of(file).head()[:1])
+    if {*TARGET} <= {*first_line.split(",")}:
+        columns = log_format.of_tracks(TARGET)
+    header = log_columns(file, header_line=columns.header_line, decimal=columns.decimal)
     time = None
     for name in (TIME, log_format.time):
         if time is None and name in header:
             time = name
-    columns = replace(log_format, groups=None, time=time)
-    if {*TARGET} <= {*header}:
-        columns = columns.of_tracks(TARGET)
+    columns = replace(columns, time=time)
     return load_log(file, **columns.reading)
 
 

@@ -374,8 +374,8 @@ def _evidence(
     bodies = [loaded.module]
     layout = ActuatorLayout.independent(loaded.n_actuators)
     if loaded.chain is not None:
-        chain = loaded.chain.tip_model
-        bodies = [chain, *chain.softer()]
+        robots = [loaded.chain, *loaded.chain.softer()]
+        bodies = [robot.tip_model for robot in robots]
         layout = loaded.chain.actuator_layout
     off_plane = _off_plane(loaded, q)
     low = motion.min(axis=0)

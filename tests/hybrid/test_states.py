@@ -16,6 +16,7 @@ from hybridkin import (
     robots,
     save_model,
 )
+from hybridkin.hybrid._pace import each_pace
 
 CHAIN = robots.bionic_handling_assistant()
 FRICTION = PrandtlIshlinskiiOperator([0.0, 0.01, 0.02, 0.2], [0.5, 0.7, 0.8])
@@ -106,6 +107,52 @@ def test_creep_after_a_long_rest_at_an_end_is_outside_the_domain():
         inside = model.in_domain(Commands(q, runs, time))
         assert inside[~later].mean() > 0.9
         assert least <= inside[later].mean() <= most
+
+
+def at_pace(commands, speed):
+    return Commands(commands.q, commands.runs, commands.time / speed)
+
+
+def test_paces_that_the_log_lacks_are_outside_the_domain(tmp_path):
+    """With creep; friction and backlash do not know how fast they are moved."""
+    new = motions(8, seed=2)
+    usual = fitted(CREEP, coverage=0.9)
+    save_model(usual, tmp_path / "model.safetensors")
+    loaded = load_model(tmp_path / "model.safetensors")
+    inside = usual.in_domain(new)
+    assert inside.mean() > 0.8
+    for speed, most in ((0.05, 0.3), (0.2, 0.5), (5.0, 0.2), (20.0, 0.1)):
+        other = at_pace(new, speed)
+        assert usual.in_domain(other).mean() < most
+        assert_array_equal(loaded.in_domain(other), usual.in_domain(other))
+        _, radius = usual.predict(other, return_radius=True)
+        assert_array_equal(np.isinf(radius), ~usual.in_domain(other))
+    without_times = fitted(FRICTION)
+    for speed in (0.05, 20.0):
+        other = at_pace(new, speed)
+        assert_array_equal(without_times.in_domain(other), without_times.in_domain(new))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_pace_is_a_mean_speed_in_which_the_past_fades(seed):
+    rng = np.random.default_rng(seed)
+    runs = rng.integers(0, 3, 60)
+    q = rng.standard_normal((60, 2)).cumsum(axis=0)
+    time = np.cumsum(rng.uniform(0.1, 2.0, 60))
+    for tau, pace in zip((0.5, 20.0), each_pace(q, runs, time, np.array([0.5, 20.0])), strict=True):
+        for run in range(3):
+            rows = np.flatnonzero(runs == run)
+            steps = np.diff(time[rows])
+            moved = np.abs(np.diff(q[rows], axis=0))
+            for k in range(1, len(rows)):
+                age = time[rows[k]] - time[rows[1 : k + 1]]
+                weights = np.exp(-age / tau)
+                speed = weights @ moved[:k] / (weights @ steps[:k])
+                np.testing.assert_allclose(pace.speeds[rows[k]], speed, rtol=1e-9)
+            assert not pace.known[rows[0]]
+    constant = Commands(0.3 * time[:, None] * [1.0, 2.0], np.zeros(60), time)
+    (pace,) = each_pace(constant.q, constant.runs, time, np.array([5.0]))
+    np.testing.assert_allclose(pace.speeds[1:], np.tile([0.3, 0.6], (59, 1)))
 
 
 @pytest.mark.parametrize("operator", [FRICTION, CREEP, HysteresisSeries([FRICTION, CREEP])])

@@ -426,7 +426,8 @@ def test_the_cause_of_an_error_does_not_depend_on_units(tmp_path, fault, cause):
             assert report.record.cause == cause
             found.append(report.record)
     for ours, theirs in (found[::2], found[1::2]):
-        assert vars(theirs)["causes"] == pytest.approx(ours.causes, abs=1e-6)
+        # Fits end where an iteration gains less than 1e-4 of the squared error.
+        assert vars(theirs)["causes"] == pytest.approx(ours.causes, abs=1e-4)
         assert theirs.range == pytest.approx(ours.range, rel=1e-9)
         for name, part in ours.parts.items():
             assert vars(theirs.parts[name]) == pytest.approx(vars(part), rel=1e-6), name

@@ -5,12 +5,20 @@ import json
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from hybridkin import ConstantCurvatureChain, HybridForwardModel, PlayOperator, save_model, workflow
+from hybridkin import (
+    ConstantCurvatureChain,
+    HybridForwardModel,
+    PlayOperator,
+    robots,
+    save_model,
+    workflow,
+)
 from hybridkin.cli.main import main
 from hybridkin.datasets import Log
-from hybridkin.workflow.track import TARGET
+from hybridkin.workflow.track import TARGET, read_track
 
 CHAIN = ConstantCurvatureChain([0.005, 0.005], lengths=[0.1, 0.1])
 NOISE, SIZE = 2e-4, 0.004
@@ -167,3 +175,25 @@ def test_the_command_leaves_out_rows_without_a_tip(loaded, tmp_path, capsys):
     assert record["cause"] == "moved base"
     assert record["parts"]["path"]["rows"] == len(q) - 11
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"report.md", "report.json"}
+
+
+def test_a_track_is_read_whatever_the_form_of_the_logs_is(tmp_path):
+    columns = [*("t", "a", "b", "tip X", "tip Y", "tip Z"), *TARGET, "error", "status"]
+    row = "0.5,1.5,2.5,1,2,3,4,5,6,0,CONVERGED\n"
+    (tmp_path / "track.csv").write_text(",".join(columns) + "\n" + 3 * row)
+    form = robots.LogFormat(
+        q=("a", "b"),
+        x=("tip X", "tip Y", "tip Z"),
+        q_unit="mm",
+        x_unit="mm",
+        time="frame",
+        time_unit="frames",
+        rate=100.0,
+        header_line=7,
+        decimal=",",
+        missing=(4.0,),
+    )
+    log = read_track(tmp_path, form)
+    assert_allclose(log.q, 1e-3 * np.array([[1.5, 2.5]] * 3))
+    assert_allclose(log.x, 1e-3 * np.array([[4.0, 5.0, 6.0]] * 3))
+    assert_allclose(log.time, 0.5)
