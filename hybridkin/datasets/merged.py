@@ -305,7 +305,7 @@ def merge_logs(
     kept, runs = _covered(commands, time, _longest_gap(commands, tolerance, hold))
     if not kept.any():
         raise ValueError(
-            f"No camera row lies between two motor rows: at the lag of {lag:.6g} s the camera "
+            f"No camera row lies between two motor rows: at the lag of {lag:.4f} s the camera "
             f"records from {time[0]:.6g} to {time[-1]:.6g} s, the motors from "
             f"{commands.time[0]:.6g} to {commands.time[-1]:.6g} s; give `lag`, or a larger "
             "`tolerance`."
@@ -331,7 +331,7 @@ def merge_logs(
     if is_estimated and explained < _EXPLAINED:
         raise ValueError(
             f"The lag between {motors.source} and {camera.source} is not clear: the commands "
-            f"explain at most {explained:.0%} of the motion of the tip, at {lag:.6g} s. Check that "
+            f"explain at most {explained:.0%} of the motion of the tip, at {lag:.4f} s. Check that "
             "both record the same motion, or give `lag` (0 if they share a clock)."
         )
     n_left_out = len(camera.time) - int(kept.sum())
@@ -402,7 +402,7 @@ def _estimated_lag(motors: TimedColumns, camera: TimedColumns, hold: bool) -> fl
         if abs(other_lag - lag) > width and other < as_good:
             raise ValueError(
                 f"The lag between {motors.source} and {camera.source} is not clear: lags of "
-                f"{lag:.6g} and {other_lag:.6g} s explain {1.0 - unexplained:.1%} and "
+                f"{lag:.4f} and {other_lag:.4f} s explain {1.0 - unexplained:.1%} and "
                 f"{1.0 - other:.1%} of the motion of the tip, as where a motion repeats. Give "
                 "`lag` (0 if they share a clock), or record a motion that does not repeat."
             )
