@@ -30,11 +30,11 @@ class FreeBase(Alignment):
 
     def aligned(self, tips: NDArray, x: NDArray, weights: NDArray) -> NDArray:
         """Return tips (N, 3) moved, turned and scaled to x (N, 3), by rows with weights (N,)."""
-        share = weights / weights.sum()
-        center = share @ tips
-        target = share @ x
+        normalised = weights / weights.sum()
+        center = normalised @ tips
+        target = normalised @ x
         centred = tips - center
-        moments = torch.from_numpy((share[:, None] * (x - target)).T @ centred)
+        moments = torch.from_numpy((normalised[:, None] * (x - target)).T @ centred)
         turn, trace = nearest_rotation(moments)
-        size = max(share @ np.square(centred).sum(axis=1), np.finfo(float).tiny)
+        size = max(normalised @ np.square(centred).sum(axis=1), np.finfo(float).tiny)
         return float(trace) / size * centred @ turn.numpy().T + target

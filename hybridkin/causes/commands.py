@@ -132,10 +132,10 @@ class Slip(OneActuator):
         after = np.cumsum(along[::-1], axis=0)[::-1]
         weight = np.cumsum(squares[::-1], axis=0)[::-1]
         gain = np.square(after) / np.maximum(weight, np.finfo(float).tiny)
-        found = []
+        slips = []
         for i in _moved_actuators(evidence):
-            found += [cls(i, row) for row in evidence.sudden_rows(gain[:, i])]
-        return found
+            slips += [cls(i, row) for row in evidence.sudden_rows(gain[:, i])]
+        return slips
 
     def starts(self, evidence: Evidence) -> Sequence[NDArray]:
         """Return no slip."""

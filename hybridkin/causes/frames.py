@@ -66,11 +66,11 @@ class Axes(Cause):
     @classmethod
     def members(cls, evidence: Evidence) -> Sequence[Self]:
         """Return all other orders and signs, those with the fewest changes first."""
-        found = []
+        readings = []
         for order in itertools.permutations(range(3)):
             for signs in itertools.product((1, -1), repeat=3):
-                found.append(cls(order, signs))
-        return sorted(found, key=lambda axes: axes.n_changes)[1:]
+                readings.append(cls(order, signs))
+        return sorted(readings, key=lambda axes: axes.n_changes)[1:]
 
     @property
     def n_changes(self) -> int:

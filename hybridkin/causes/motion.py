@@ -93,15 +93,15 @@ class Motion:
         Between two rows they are linear, outside a run constant; a negative delay is later.
         """
         first, last = self._bounds
-        asked = np.clip(self.time[rows] - delay, first[rows], last[rows])
+        passed = np.clip(self.time[rows] - delay, first[rows], last[rows])
         # One axis of time for all runs: each begins after the end of the one before.
         length = np.array([last[r][0] - first[r][0] for r in self._rows_of_runs])
         begin = np.append(0.0, np.cumsum(length + self.period))[
             self.runs - self.runs[0]
         ]
         places = begin + self.time - first
-        asked = begin[rows] + asked - first[rows]
-        columns = [np.interp(asked, places, column) for column in values.T]
+        passed = begin[rows] + passed - first[rows]
+        columns = [np.interp(passed, places, column) for column in values.T]
         return np.stack(columns, axis=1)
 
     def after(self, hysteresis: HysteresisOperator) -> NDArray:

@@ -69,19 +69,21 @@ def _candidates(evidence: Evidence) -> list[tuple[str, NDArray, float]]:
     period = evidence.motion.period
     still = np.repeat(straight[None], _ROWS, axis=0)
     out_and_back = np.sin(np.linspace(0.0, np.pi, _ROWS)) ** 2
-    found = [("hold still at the straight or middle posture", still, period)]
+    candidates = [("hold still at the straight or middle posture", still, period)]
     for i, name in enumerate(evidence.actuators.names):
         for end in (evidence.low[i], evidence.high[i]):
             sweep = still.copy()
             sweep[:, i] += out_and_back * (end - straight[i])
             words = f"move {name} alone, out and back"
-            found.append((words, sweep, period))
-            found.append((f"{words}, ten times slower", sweep, _SLOWER * period))
+            candidates.append((words, sweep, period))
+            candidates.append((f"{words}, ten times slower", sweep, _SLOWER * period))
     far = still.copy()
     far[: _ROWS // 8] = evidence.high
     pause = max(_HOLD / _ROWS, period)
-    found.append(("go far out and back at once, then hold still for 10 s", far, pause))
-    return found
+    candidates.append(
+        ("go far out and back at once, then hold still for 10 s", far, pause)
+    )
+    return candidates
 
 
 def _posture(evidence: Evidence) -> NDArray:

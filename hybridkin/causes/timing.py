@@ -124,11 +124,13 @@ class Creep(_Hysteresis):
 
     def starts(self, evidence: Evidence) -> Sequence[NDArray]:
         """Return several times; shares are logits, times logarithms of periods."""
-        found = []
-        for share in _SHARES:
+        beginnings = []
+        for late_part in _SHARES:
             for time in _TIMES:
-                found.append(np.array([np.log(share / (1.0 - share)), np.log(time)]))
-        return found
+                beginnings.append(
+                    np.array([np.log(late_part / (1.0 - late_part)), np.log(time)])
+                )
+        return beginnings
 
     def steps(self, evidence: Evidence) -> NDArray:
         """Return one for both."""
@@ -137,21 +139,21 @@ class Creep(_Hysteresis):
     def _share_and_time(
         self, motion: Motion, parameters: NDArray
     ) -> tuple[float, float]:
-        share = 0.95 / (1.0 + np.exp(-np.clip(parameters[0], -30.0, 30.0)))
+        late_part = 0.95 / (1.0 + np.exp(-np.clip(parameters[0], -30.0, 30.0)))
         longest = np.log(motion.duration / motion.period)
         time = motion.period * np.exp(np.clip(parameters[1], -1.0, max(longest, 0.0)))
-        return float(share), float(time)
+        return float(late_part), float(time)
 
     def effective(self, motion: Motion, parameters: NDArray) -> NDArray:
-        """Return the motion (T, n) of which a share comes late [unit of q]."""
-        share, time = self._share_and_time(motion, parameters)
-        return motion.after(CreepOperator([share], [time]))
+        """Return the motion (T, n) of which a part comes late [unit of q]."""
+        late_part, time = self._share_and_time(motion, parameters)
+        return motion.after(CreepOperator([late_part], [time]))
 
     def amount(self, evidence: Evidence, parameters: NDArray) -> str:
         """Return the share and the time constant in words."""
         motion = evidence.motion
-        share, time = self._share_and_time(motion, parameters)
+        late_part, time = self._share_and_time(motion, parameters)
         return (
-            f"{100 * share:.0f} % of every change comes with a time constant of {time:.3g} "
+            f"{100 * late_part:.0f} % of every change comes with a time constant of {time:.3g} "
             f"{motion.clock}"
         )

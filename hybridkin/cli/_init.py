@@ -248,8 +248,10 @@ def with_zeros(answers: _Answers, log: MeasuredLog) -> tuple[_Answers, str]:
     unit = answers["q_unit"]
     is_length = unit in METRES
     whole_turns_off = any(f.kind == "encoder" for f in log.report.findings)
-    known = _has_chambers(answers) or (answers["kind"] != "tendons" and not is_length)
-    if known or whole_turns_off:
+    needless = _has_chambers(answers) or (
+        answers["kind"] != "tendons" and not is_length
+    )
+    if needless or whole_turns_off:
         return answers, ""
     span = np.ptp(log.q, axis=0)
     first = np.zeros(1, dtype=int)

@@ -155,13 +155,13 @@ def encoder_faults(
         wraps += candidates[:1]
     wraps = _believed(q, x, same_run, wraps)
     wrapped = {fault.column for fault in wraps}
-    others = [() if k in wrapped else p for k, p in enumerate(periods)]
+    untouched = [() if k in wrapped else p for k, p in enumerate(periods)]
     mended = q
     for fault in wraps:
         mended = fault.mended(mended)
     calm = _calm(x, same_run, 1)
     glitches = []
-    for column, of_column in enumerate(others):
+    for column, of_column in enumerate(untouched):
         candidates = [*_glitches(mended, column, of_column, calm)]
         glitches += _best(
             [_error_in_rows(mended, x, f) for f in candidates], candidates
@@ -169,7 +169,7 @@ def encoder_faults(
     for fault in glitches:
         mended = fault.mended(mended)
     lost = []
-    for column, of_column in enumerate(others):
+    for column, of_column in enumerate(untouched):
         candidates = [*_lost_turns(mended, column, of_column)]
         lost += _best([_error(mended, x, [f]) for f in candidates], candidates)
     return [*wraps, *_believed(mended, x, same_run, lost), *glitches]
@@ -248,8 +248,8 @@ def _glitches(
             continue
         left = np.abs(np.diff(q[:, column] - period * turns))
         beside = np.unique(np.concatenate([rows - 1, rows]).clip(0, len(steps) - 1))
-        others = np.delete(left, beside)
-        usual = np.quantile(others, 0.99) if len(others) else np.inf
+        elsewhere = np.delete(left, beside)
+        usual = np.quantile(elsewhere, 0.99) if len(elsewhere) else np.inf
         if usual <= _SMALL * period and left[beside].max() <= 2.0 * usual:
             yield EncoderFault(column, GLITCH, period, turns)
 
@@ -306,8 +306,8 @@ def _believed(
     if few or least > _BETTER * _error(certain, x, []):
         return believed
     for fault in doubtful:
-        others = [other for other in doubtful if other is not fault]
-        if _error(certain, x, others) > _NEEDED * least:
+        remaining = [other for other in doubtful if other is not fault]
+        if _error(certain, x, remaining) > _NEEDED * least:
             believed.append(fault)
     return believed
 

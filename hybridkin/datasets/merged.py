@@ -95,11 +95,11 @@ class TimedColumns:
 
     def complete(self) -> TimedColumns:
         """Return the rows without a missing value."""
-        kept = countable(self.values).all(axis=1)
-        groups = None if self.groups is None else self.groups[kept]
+        complete = countable(self.values).all(axis=1)
+        groups = None if self.groups is None else self.groups[complete]
         return TimedColumns(
-            self.values[kept],
-            self.time[kept],
+            self.values[complete],
+            self.time[complete],
             self.names,
             self.unit,
             groups,
@@ -444,14 +444,14 @@ def _speed(values: NDArray, time: NDArray, step: float) -> NDArray:
 
     The root makes single outliers less heavy.
     """
-    known = np.isfinite(values).all(axis=1)
-    values = values[known]
+    complete = np.isfinite(values).all(axis=1)
+    values = values[complete]
     ranges = np.ptp(values, axis=0)
     scaled = values / np.where(ranges > 0.0, ranges, 1.0)
     steps = np.linalg.norm(np.diff(scaled, axis=0), axis=1)
     way = np.concatenate([[0.0], np.cumsum(steps)])
     edges = np.arange(time[0], time[-1] + step, step)
-    return np.sqrt(np.diff(np.interp(edges, time[known], way)))
+    return np.sqrt(np.diff(np.interp(edges, time[complete], way)))
 
 
 def _correlation(a: NDArray, b: NDArray) -> tuple[NDArray, NDArray]:
@@ -568,26 +568,26 @@ def _explained(q: NDArray, x: NDArray) -> tuple[float, int]:
     that degree. Smooth motions that have nothing to do with each other agree within one part.
     """
     tips = _tip(x)
-    known = np.isfinite(tips).all(axis=1)
-    q = q[known]
-    tips = tips[known]
+    complete = np.isfinite(tips).all(axis=1)
+    q = q[complete]
+    tips = tips[complete]
     few = np.linspace(0, len(q) - 1, min(len(q), _ROWS)).astype(int)
     q = q[few]
     tips = tips[few]
     total = np.square(tips - tips.mean(axis=0)).sum()
     if not total > 0.0:
         return 0.0, 1
-    shares = []
+    explained = []
     for degree in _DEGREES:
         features = _features(q, degree)
         left = 0.0
         for part in np.array_split(np.arange(len(q)), _PARTS):
-            others = np.delete(np.arange(len(q)), part)
-            weights = _weights(features[others], tips[others])
+            rows = np.delete(np.arange(len(q)), part)
+            weights = _weights(features[rows], tips[rows])
             left += np.square(tips[part] - features[part] @ weights).sum()
-        shares.append(1.0 - float(left / total))
-    best = int(np.argmax(shares))
-    return max(shares[best], 0.0), _DEGREES[best]
+        explained.append(1.0 - float(left / total))
+    best = int(np.argmax(explained))
+    return max(explained[best], 0.0), _DEGREES[best]
 
 
 def _weights(features: NDArray, x: NDArray) -> NDArray:
