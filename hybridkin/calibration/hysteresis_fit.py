@@ -257,8 +257,8 @@ def _held_back(steps: NDArray, spans: NDArray) -> NDArray:
     """
     passed = np.where(steps > 0.0, steps, 1.0)
     with np.errstate(over="ignore"):
-        share = 1.0 / (spans * np.expm1(passed / spans)) - 1.0 / np.expm1(passed)
-    return np.where((steps > 0.0) & (spans > 1.0), share, 0.0)
+        lag = 1.0 / (spans * np.expm1(passed / spans)) - 1.0 / np.expm1(passed)
+    return np.where((steps > 0.0) & (spans > 1.0), lag, 0.0)
 
 
 class _Prior(NamedTuple):

@@ -120,8 +120,8 @@ class HysteresisLog:
         log = self
         if len(self.rows) > _MOST_COUNTED:
             counts = np.zeros(len(self.q))
-            some = self.rows[thinned(self.groups[self.rows], _MOST_COUNTED)]
-            counts[some] = self.counts[some]
+            chosen = self.rows[thinned(self.groups[self.rows], _MOST_COUNTED)]
+            counts[chosen] = self.counts[chosen]
             log = replace(self, counts=counts)
         needed = needed_rows(self.runs, log.rows)
         if len(needed) < len(self.q):

@@ -63,14 +63,14 @@ class Coarseness(NamedTuple):
 
     Attributes
     ----------
-    share : ndarray of shape (n,)
+    reversing : ndarray of shape (n,)
         Share of the rows within runs at which an actuator reverses, by more than 2 % of its range.
     missed : ndarray of shape (n,)
         Median way beyond these rows, if actuators move smoothly: an eighth of the change of their
         step there [unit of q].
     """
 
-    share: NDArray
+    reversing: NDArray
     missed: NDArray
 
     @classmethod
@@ -94,4 +94,4 @@ class Coarseness(NamedTuple):
     @property
     def shows_reversals(self) -> bool:
         """Whether at most a third of the rows are reversals of any one actuator."""
-        return bool((self.share <= _MOST_REVERSALS).all())
+        return bool((self.reversing <= _MOST_REVERSALS).all())

@@ -341,9 +341,9 @@ def reversals(rows: LogRows) -> Iterator[LogFinding]:
     coarse = Coarseness.of(log.q, rows.runs)
     if coarse.shows_reversals:
         return
-    name, _ = rows.columns("q")[int(coarse.share.argmax())]
+    name, _ = rows.columns("q")[int(coarse.reversing.argmax())]
     message = (
-        f"actuator {name!r} reverses at {100.0 * coarse.share.max():.0f} % of the rows within "
+        f"actuator {name!r} reverses at {100.0 * coarse.reversing.max():.0f} % of the rows within "
         "runs: what the actuators do between the rows is not in the log."
     )
     advice = (

@@ -88,7 +88,7 @@ def coarse_in_words(operator: HysteresisOperator, rows: Rows) -> list[str]:
     if not log.shows_reversals:
         return [
             f"play='auto' found {operator.kind}, but actuators reverse at up to "
-            f"{100.0 * log.share.max():.0f} % of the rows: what they do between the rows is not in "
+            f"{100.0 * log.reversing.max():.0f} % of the rows: what they do in between is not in "
             f"the log. {hint}"
         ]
     missed = log.missed - _MISSED * operator.width

@@ -15,7 +15,7 @@ from hybridkin.hybrid._rows import Rows
 
 _TOLERANCE = 1.1  # least factor by which a pace may be beyond those of the log
 _TINY = 1e-9  # pace that counts as rest, relative to the largest
-_KNOWN = 0.39  # part of a time constant; before, a run does not show the pace over it
+_SHOWN = 0.39  # part of a time constant; before, a run does not show the pace over it
 
 
 class PaceRange(NamedTuple):
@@ -43,9 +43,9 @@ class PaceRange(NamedTuple):
         inside = np.ones(n_rows, dtype=bool)
         bound = self.high[:1]
         for low, high, pace in zip(self.low, self.high, paces, strict=True):
-            bound = np.where(pace.known[:, None], high, bound)
+            bound = np.where(pace.shown[:, None], high, bound)
             relative = _relative(pace.speeds, bound)
-            inside &= (relative <= 1.0) & (~pace.known | (relative >= low))
+            inside &= (relative <= 1.0) & (~pace.shown | (relative >= low))
         return inside
 
 
@@ -57,12 +57,12 @@ class Pace(NamedTuple):
     speeds : ndarray of shape (N, n)
         Mean speed of each actuator, in which the past fades; of the first row of a run zero [unit
         of q / s].
-    known : ndarray of shape (N,)
+    shown : ndarray of shape (N,)
         Whether the run shows it: it has gone on for half of the time constant.
     """
 
     speeds: NDArray
-    known: NDArray[np.bool_]
+    shown: NDArray[np.bool_]
 
 
 def each_pace(
@@ -95,9 +95,9 @@ def each_pace(
         duration = recent[:, :1]
         speeds = np.empty_like(rows)
         speeds[order.order] = recent[:, 1:] / np.where(duration > 0.0, duration, 1.0)
-        known = np.empty(len(rows), dtype=bool)
-        known[order.order] = (duration[:, 0] >= _KNOWN * time_constant) & ~order.first
-        yield Pace(speeds, known)
+        shown = np.empty(len(rows), dtype=bool)
+        shown[order.order] = (duration[:, 0] >= _SHOWN * time_constant) & ~order.first
+        yield Pace(speeds, shown)
 
 
 def pace_range(paces: list[Pace], measured: Rows) -> PaceRange:
@@ -113,21 +113,21 @@ def pace_range(paces: list[Pace], measured: Rows) -> PaceRange:
         The rows.
     """
     names = measured.run_of_rows if measured.groups is None else measured.groups
-    known = np.stack([pace.known for pace in paces], axis=1)
+    shown = np.stack([pace.shown for pace in paces], axis=1)
     speeds = np.stack([pace.speeds for pace in paces], axis=1)
-    fastest = np.where(known[:, :, None], speeds, 0.0)
+    fastest = np.where(shown[:, :, None], speeds, 0.0)
     high = fastest.max(axis=0)
     faster = _TOLERANCE
     others = ranges_of_others(fastest, names)
     if others.high.size:
         beyond = _relative(fastest, others.high).max(axis=1, initial=0.0)
         faster = max(faster, np.quantile(beyond, TESTED))
-    relative = np.where(known, _relative(fastest, high), np.inf)
+    relative = np.where(shown, _relative(fastest, high), np.inf)
     low = relative.min(axis=0)
     slower = _TOLERANCE
     others = ranges_of_others(relative, names)
     if others.low.size:
-        tested = known & np.isfinite(others.low)
+        tested = shown & np.isfinite(others.low)
         least = np.where(tested, np.maximum(relative, _TINY), 1.0)
         ratio = np.where(tested, others.low, 1.0) / least
         slower = max(slower, np.quantile(ratio.max(axis=1, initial=1.0), TESTED))

@@ -163,7 +163,7 @@ def _pace(play: HysteresisOperator, log: Rows, measured: Rows) -> PaceRange | No
         return None
     paces = []
     for pace in each_pace(log.X, log.run_of_rows, log.time, play.time_constants):
-        paces.append(Pace(pace.speeds[log.counted], pace.known[log.counted]))
+        paces.append(Pace(pace.speeds[log.counted], pace.shown[log.counted]))
     return pace_range(paces, measured)
 
 

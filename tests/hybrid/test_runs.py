@@ -216,6 +216,7 @@ def test_the_search_gets_the_rows_as_they_are(mechanical, monkeypatch):
 
 def test_the_chain_of_the_search_is_calibrated_with_the_weights(monkeypatch):
     monkeypatch.setattr(_hysteresis, "find_hysteresis", lambda log: log)
+    monkeypatch.setattr(_hysteresis, "coarse_in_words", lambda operator, rows: [])
     q, runs, _ = motions()
     weights = np.random.default_rng(0).integers(0, 4, len(q)).astype(float)
     x = tips(q) + 0.02 * np.sin(20 * q)

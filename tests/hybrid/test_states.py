@@ -149,7 +149,7 @@ def test_the_pace_is_a_mean_speed_in_which_the_past_fades(seed):
                 weights = np.exp(-age / tau)
                 speed = weights @ moved[:k] / (weights @ steps[:k])
                 np.testing.assert_allclose(pace.speeds[rows[k]], speed, rtol=1e-9)
-            assert not pace.known[rows[0]]
+            assert not pace.shown[rows[0]]
     constant = Commands(0.3 * time[:, None] * [1.0, 2.0], np.zeros(60), time)
     (pace,) = each_pace(constant.q, constant.runs, time, np.array([5.0]))
     np.testing.assert_allclose(pace.speeds[1:], np.tile([0.3, 0.6], (59, 1)))
