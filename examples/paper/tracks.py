@@ -129,7 +129,7 @@ def _one_track(
 ) -> Track:
     (low, high), dt = robots.BHA_LENGTH_LIMITS, float(path.t[1] - path.t[0])
     # Each step takes back the whole measured error, as in the paper.
-    law = {"q_pref": PREFERRED, "gain": 1.0 / dt, "dt": dt}
+    law: dict[str, Any] = {"q_pref": PREFERRED, "gain": 1.0 / dt, "dt": dt}
     ik = InverseKinematics(model, q_min=low, q_max=high, **law)
     plant = TrunkPlant(**plant_parameters, random_state=_MEASURED_SEED)
     return ik.track(path, plant=plant, feedback=feedback)
