@@ -19,6 +19,7 @@ _MARKS = {  # first bytes of a file
 }
 _WITHOUT_MARK = ("utf-8", "cp1252")  # names with a degree or micro sign
 _CONTROL = re.compile(r"[\x00-\x08\x0e-\x1a\x1c-\x1f]")
+_NUL = re.compile("\x00")
 _CHUNK = 1 << 20  # characters
 _HEAD = 100  # lines among which a header is looked for
 _MISSING = ("", "null", "na", "n/a", "<na>", "nat", "none")  # in lower case
@@ -65,19 +66,39 @@ class TextForm:
             )
 
     def separator(self, lines: Sequence[str]) -> str:
-        """Return the separator, by the first of some lines that has one."""
+        """Return the separator, by the first of some lines that has one.
+
+        Of several it is one that occurs as often in the next line, else the most frequent.
+        """
         if self.delimiter is not None:
             return self.delimiter
         candidates = [sign for sign in _DELIMITERS if sign != self.decimal]
-        for line in lines:
-            unquoted = re.sub('"[^"]*("|$)', "", line)
-            delimiter = max(candidates, key=unquoted.count)
-            if delimiter in unquoted:
-                return delimiter
+        unquoted = [re.sub('"[^"]*("|$)', "", line) for line in _whole_lines(lines)]
+        for line, following in itertools.zip_longest(
+            unquoted, unquoted[1:], fillvalue=""
+        ):
+            counts = {sign: line.count(sign) for sign in candidates if sign in line}
+            as_often = [
+                sign for sign in counts if following.count(sign) == counts[sign]
+            ]
+            if counts:
+                return max(as_often or counts, key=counts.__getitem__)
         first = "".join(lines[:1]).strip()
         if " " in first and _DELIMITERS[0] not in first:
             return " "
         return _DELIMITERS[0]
+
+
+def _whole_lines(lines: Sequence[str]) -> Iterator[str]:
+    """Yield lines, those that a quoted cell goes across as one."""
+    begun = ""
+    for line in lines:
+        begun += line
+        if begun.count('"') % 2 == 0:
+            yield begun
+            begun = ""
+    if begun:
+        yield begun
 
 
 def _is_character(value: object) -> bool:
@@ -132,10 +153,12 @@ class TextFile(NamedTuple):
 
 
 def _is_text(path: Path, encoding: str) -> bool:
+    # Any bytes but a few are letters of Windows, so other files are told by their control signs.
+    impossible = _CONTROL if encoding == "cp1252" else _NUL
     try:
         with open(path, encoding=encoding, newline="") as file:
             while text := file.read(_CHUNK):
-                if _CONTROL.search(text):
+                if impossible.search(text):
                     return False
     except UnicodeError:
         return False

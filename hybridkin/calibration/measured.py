@@ -128,8 +128,8 @@ def evenly_spaced(n: int, most: int) -> NDArray[np.intp]:
 def thinned(motions: NDArray, most: int) -> NDArray[np.intp]:
     """Return at most `most` rows of a log, ascending: of some of its motions, some rows of each.
 
-    All motions are used if each can have ten rows, else a part of them, spread over the log. Each
-    has rows in proportion to its length.
+    All motions are used if each can have ten rows, or all of fewer, else a part of them, spread
+    over the log. Each has rows in proportion to its length.
 
     Parameters
     ----------
@@ -144,7 +144,8 @@ def thinned(motions: NDArray, most: int) -> NDArray[np.intp]:
     starts = order.starts
     lengths = np.diff(starts, append=len(motions))
     by_time = np.argsort(order.order[starts], kind="stable")
-    chosen = by_time[spread(len(starts), max(1, most // _ROWS_OF_MOTION))]
+    needed = np.minimum(lengths, _ROWS_OF_MOTION).mean()
+    chosen = by_time[spread(len(starts), max(1, int(most / needed)))]
     part = (most - len(chosen)) / lengths[chosen].sum()
     rows = []
     for motion in chosen.tolist():

@@ -275,7 +275,18 @@ class LoadedModel:
 
 
 def is_log(path: str | Path) -> bool:
-    """Return whether a path names a log: by its ending, else a file that is no model."""
+    """Return whether a path names a log: by its ending, else a file that is no model.
+
+    Parameters
+    ----------
+    path : str or Path
+        A file, or a folder of a fit.
+
+    Returns
+    -------
+    bool
+        Files without a known ending are logs if they do not begin like a model.
+    """
     path = as_path(path)
     if path.suffix.lower() in LOG_SUFFIXES:
         return True

@@ -21,16 +21,23 @@ def columns(seed=0):
     return {**table, "m": np.repeat(["u", "v"], N // 2), "t": 0.1 * np.arange(N)}
 
 
+LIBRARIES = {
+    "pandas": lambda: pytest.importorskip("pandas"),
+    "polars": lambda: pytest.importorskip("polars"),
+    "pyarrow": lambda: pytest.importorskip("pyarrow"),
+}
+
+
 def frame_of(library, table):
-    module = pytest.importorskip(library, reason=f"needs {library}")
+    module = LIBRARIES[library]()
     if library == "pyarrow":
         return module.table(table)
     return module.DataFrame(table)
 
 
-@pytest.fixture(params=["pandas", "polars", "pyarrow"])
+@pytest.fixture(params=[*LIBRARIES])
 def library(request):
-    pytest.importorskip(request.param, reason=f"needs {request.param}")
+    LIBRARIES[request.param]()
     return request.param
 
 

@@ -1,5 +1,6 @@
 """Hybrid models of robots with play: what the past tells, and what it does not."""
 
+import contextlib
 import copy
 
 import numpy as np
@@ -108,7 +109,12 @@ def play_found(q, x, groups):
 @pytest.mark.parametrize("share", [0.0, 0.05, 0.37, 1.3])
 def test_any_width_up_to_the_range_is_found(share):
     q, x, groups, width = log_with(share)
-    assert play_found(q, x, groups) == pytest.approx(width, rel=0.05, abs=1e-12)
+    is_coarse = share == 0.05  # a reversal lies between two rows that are farther apart
+    context = contextlib.nullcontext()
+    if is_coarse:
+        context = pytest.warns(UserWarning, match="reverses about .* beyond the recorded rows")
+    with context:
+        assert play_found(q, x, groups) == pytest.approx(width, rel=0.05, abs=1e-12)
 
 
 @pytest.mark.slow
