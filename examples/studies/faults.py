@@ -335,7 +335,7 @@ MISTAKES: dict[str, tuple[Callable[..., NDArray], str, tuple[str, ...]]] = {
     "two columns of a segment swapped": (_of_one_segment, "q", _READ),
     "two columns of two segments swapped": (_of_two_segments, "q", _READ),
     "numbered in the other direction": (_other_direction, "q", ("numbering",)),
-    "zero of one actuator": (_offset, "q", ("offset",)),
+    "zero of one actuator": (_offset, "q", ("offset", "zeros")),
     "drift of one actuator": (_drifting, "q", ("drift",)),
     "tips in centimetres": (lambda x, rng: 10.0 * x, "x", ("units",)),
     "tips four rows late": (lambda x, rng: np.roll(x, 4, axis=0), "x", ("lag",)),

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from hybridkin._core.rotations import nearest_rotation
+from hybridkin._core.rotations import nearest_turn
 
 
 class Alignment:
@@ -34,7 +33,6 @@ class FreeBase(Alignment):
         center = normalised @ tips
         target = normalised @ x
         centred = tips - center
-        moments = torch.from_numpy((normalised[:, None] * (x - target)).T @ centred)
-        turn, trace = nearest_rotation(moments)
+        turn, trace = nearest_turn((normalised[:, None] * (x - target)).T @ centred)
         size = max(normalised @ np.square(centred).sum(axis=1), np.finfo(float).tiny)
-        return float(trace) / size * centred @ turn.numpy().T + target
+        return trace / size * centred @ turn.T + target

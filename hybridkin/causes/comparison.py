@@ -68,6 +68,9 @@ _FOLDS = 5
 _SCREENED = 100  # rows of the first fits
 _ROUNDS = (1, 8, 1)  # iterations of the first fits, of the best, and in each fold
 _CANDIDATES = 2  # of a kind, which are fitted to all rows
+_RIVAL = (
+    1.2  # ratio of the error of a candidate that may become the best, and of the best
+)
 _LAST_RESORT = 1.5  # ratio of the errors that a named cause and the last resort leave
 _MOST_NOISE = 0.5  # of the error: largest difference that can be noise
 _AS_MUCH = 0.1  # of the error: causes that differ less explain as much
@@ -142,7 +145,7 @@ class CauseComparison:
     def best(self) -> Explanation:
         """The simplest cause within the noise of the best."""
         named = [e for e in self.explanations if not e.cause.is_last_resort]
-        best = self._simplest([self.nothing, *named])
+        best = self.simplest([self.nothing, *named])
         others = [e for e in self.explanations if e.cause.is_last_resort]
         for other in others:
             far_better = other.mean * _LAST_RESORT < best.mean
@@ -150,8 +153,8 @@ class CauseComparison:
                 best = other
         return best
 
-    def _simplest(self, explanations: Sequence[Explanation]) -> Explanation:
-        """Return the one with the fewest parameters within the noise of the best."""
+    def simplest(self, explanations: Sequence[Explanation]) -> Explanation:
+        """Return the one with the fewest parameters within the noise of the best of them."""
         least = min(explanations, key=lambda e: e.mean)
         near = [e for e in explanations if self._as_good(e, least)]
         return min(near, key=lambda e: (e.cause.n_parameters, e.mean))
@@ -235,7 +238,10 @@ def _explained(
         return []
     screened.sort(key=lambda entry: entry[0])  # of equal ones the first stay first
     fitted = []
-    for _, whole, member, start in screened[:_CANDIDATES]:
+    least = screened[0][0]
+    for error, whole, member, start in screened[:_CANDIDATES]:
+        if error > _RIVAL * least:
+            break
         parameters = member.fit(whole, _all(whole), start, _ROUNDS[1])
         fitted.append((_error(whole, member, parameters), whole, member, parameters))
     _, whole, cause, parameters = min(fitted, key=lambda entry: entry[0])
@@ -247,12 +253,17 @@ def _judged(evidence: Evidence, cause: Cause, parameters: NDArray) -> Explanatio
     n_rows = len(evidence.rows)
     fold = blocks(n_rows) % _FOLDS
     errors = np.empty(n_rows)
+    tips = cause.tips(evidence, parameters)
     for k in range(_FOLDS):
         held_out = fold == k
-        if held_out.any():
+        if not held_out.any():
+            continue
+        if len(parameters):
             refitted = cause.fit(evidence, ~held_out, parameters, _ROUNDS[2])
-            tips = cause.aligned(evidence, refitted, (~held_out).astype(float))
-            errors[held_out] = distances(tips, evidence.x)[held_out]
+            tips = cause.tips(evidence, refitted)
+        weights = (~held_out).astype(float)
+        aligned = evidence.alignment.aligned(tips, evidence.x, weights)
+        errors[held_out] = distances(aligned, evidence.x)[held_out]
     errors = _with_excuse(errors, cause.excused(evidence), evidence.promised)
     return Explanation(cause, parameters, errors, evidence.body)
 

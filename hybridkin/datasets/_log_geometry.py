@@ -571,17 +571,21 @@ def _turned_base(comparison: _Comparison) -> Iterator[LogFinding]:
 def _changed_values(comparison: _Comparison) -> Iterator[LogFinding]:
     """Yield wrong radii, zeros or the drift of one actuator, that explain far more."""
     compared = comparison.values
-    best = compared.best
-    if best is compared.nothing:
+    eligible = []
+    for explanation in compared.explanations:
+        largest = _VALUES[type(explanation.cause)][1]
+        if explanation.mean < largest * compared.nothing.mean:
+            eligible.append(explanation)
+    if not eligible:
         return
-    kind, largest, words = _VALUES[type(best.cause)]
-    ratio = comparison.better_values
-    if ratio < largest:
-        problem = words(comparison, best)
-        message = (
-            f"the error of the nominal model falls to {100 * ratio:.0f} % if {problem}."
-        )
-        yield LogFinding(kind, "warning", message, _ADVICE[kind])
+    best = compared.simplest(eligible)
+    kind, _, words = _VALUES[type(best.cause)]
+    ratio = best.mean / compared.nothing.mean
+    message = (
+        f"the error of the nominal model falls to {100 * ratio:.0f} % if "
+        f"{words(comparison, best)}."
+    )
+    yield LogFinding(kind, "warning", message, _ADVICE[kind])
 
 
 def _in_words(comparison: _Comparison, best: Explanation) -> str:
@@ -626,7 +630,7 @@ _VALUES = {
     Size: ("size", _FAR_BETTER, _in_words),
     Zero: ("offset", _SHIFTED, _shift_in_words),
     ZeroDrift: ("drift", _SHIFTED, _shift_in_words),
-    FirstRow: ("zeros", _FAR_BETTER, _in_words),
+    FirstRow: ("zeros", _SHIFTED, _in_words),
 }
 """Kind of the finding, largest relative error that is worth a word, and words of a wrong value."""
 

@@ -29,8 +29,8 @@ class LogFinding:
     kind : str
         "invalid", "missing", "encoder", "frozen tip", "frozen actuator", "constant", "duplicates",
         "same command", "jumps", "time", "reversals", "motions", "rows", "same column", "drift",
-        "lag", "offset",
-        "units", "order", "sign", "numbering", "axes", "size" or "geometry".
+        "lag", "offset", "zeros", "exchanged", "units", "order", "sign", "numbering", "axes", "size"
+        or "geometry".
     severity : {"error", "warning", "note"}
         "error": a fit would be worthless; "warning": check it; "note": information.
     message : str

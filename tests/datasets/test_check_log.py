@@ -227,7 +227,7 @@ OF_GEOMETRY = {
     "clockwise, fixed base": (measured(), CLOCKWISE, FIXED, "numbering", "clockwise = "),
     "axes": (measured(x=X[:, [1, 2, 0]]), CHAIN, FIXED, "axes", "rotated."),
     "left-handed axes": (measured(x=X[:, [1, 0, 2]]), CHAIN, FIXED, "axes", "mirrored."),
-    "diameters": (measured(), WIDE, {}, "size", "1.9 times as large"),
+    "diameters": (measured(), WIDE, {}, "size", "1.9 times as large"),  # 2 / 1.04
     "offset": (measured(Q + SHIFT, x=X), CHAIN, {}, "offset", "'h' is off by about 3 mm"),
     "drift": (measured(Q + WAY * SHIFT, x=X), CHAIN, {}, "drift", "'h' drifts"),
     "whole lengths": (measured(Q + 0.06, x=X), CHAIN, {}, "geometry", "straight robot"),
