@@ -16,6 +16,7 @@ from hybridkin._core.commands import Commands
 from hybridkin._core.digests import row_digests
 from hybridkin._core.directions import in_terms
 from hybridkin._core.model import ForwardModel, as_forward_model
+from hybridkin._core.units import duration_in_words
 from hybridkin.chains import robots
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
@@ -267,7 +268,7 @@ def play_widths(model: HybridForwardModel | None) -> list[float] | None:
 
 
 def hysteresis_in_words(model: HybridForwardModel) -> str:
-    """Return the kinds of hysteresis that the actuators have, with their widths.
+    """Return the kinds of hysteresis that the actuators have, with widths and time constants.
 
     Parameters
     ----------
@@ -278,7 +279,13 @@ def hysteresis_in_words(model: HybridForwardModel) -> str:
     words = []
     for part in model.play_.parts:
         width = _in_metres(model, part.width).max()
-        words.append(f"{part.kind} {millimetres(width)}" if width > 0.0 else part.kind)
+        text = part.kind
+        if width > 0.0:
+            text += f" {millimetres(width)}"
+        if part.creeps:
+            shortest = duration_in_words(part.time_constants.min())
+            text += f" ({shortest} to {duration_in_words(part.time_constants.max())})"
+        words.append(text)
     return " and ".join(words)
 
 
