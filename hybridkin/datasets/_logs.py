@@ -116,7 +116,9 @@ class Log:
         ]
         if self.time is not None:
             duration = duration_in_words(float(np.ptp(self.time)))
-            lines.append(f"time from {self.time[0]:.6g} s, {duration} long")
+            lines.append(
+                f"time from {self.time[0]:.6g} to {self.time[-1]:.6g} s: {duration}"
+            )
         return "\n  ".join(lines)
 
     @classmethod

@@ -243,5 +243,5 @@ def test_a_log_shows_a_summary():
         "Log of log.csv: 2 rows, 2 motions",
         "  2 actuators: left, right; 0.1 to 0.3 m",
         "  tips within 0.03 x 0 x 0.2 m",
-        "  time from 2 s, 2.5 s long",
+        "  time from 2 to 4.5 s: 2.5 s",
     ]
