@@ -120,10 +120,9 @@ class Verification:
                 "None of the known causes explains the error; check load and friction."
             )
         else:
-            report.text(
-                f"Likely cause: {self.cause}. {{amount}}. To do: {self.remedy}.",
-                amount=self.amount[:1].upper() + self.amount[1:],
-            )
+            report.text(f"Likely cause: {self.cause}. To do: {self.remedy}.")
+            if self.amount:
+                report.text("Amount: {amount}.", amount=self.amount)
             self._write_others(report)
         later = self.later
         if later is not None and later.is_clear:
