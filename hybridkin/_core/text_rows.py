@@ -153,7 +153,7 @@ class TextFile(NamedTuple):
 
 
 def _is_text(path: Path, encoding: str) -> bool:
-    # Any bytes but a few are letters of Windows, so other files are told by their control signs.
+    # Nearly any byte is a letter of Windows: other files are recognised by control characters.
     impossible = _CONTROL if encoding == "cp1252" else _NUL
     try:
         with open(path, encoding=encoding, newline="") as file:

@@ -243,7 +243,7 @@ def with_zeros(answers: _Answers, log: MeasuredLog) -> tuple[_Answers, str]:
     """Return the answers with the zeros of tendons from a log, and words for it.
 
     They are the median of the first rows of all motions, if these are alike. Readings of encoders
-    that are whole turns off tell nothing of them.
+    that are whole turns off do not show them.
     """
     unit = answers["q_unit"]
     is_length = unit in METRES
