@@ -28,11 +28,11 @@ portable: $(VENV)/.native
 everything: export HYBRIDKIN_MUST_RUN := 1
 everything: $(VENV)/.bench $(VENV)/.browser $(VENV)/.native
 	$(BIN)/python -m pytest $(TESTS) -m "not browser"
-	$(BIN)/python -m pytest -q tests/viewer -m browser
+	$(BIN)/python -m pytest -q tests/app/viewer -m browser
 
 # The live view in a real browser; needs Chromium of the system.
 view-test: $(VENV)/.browser $(VENV)/.native
-	$(BIN)/python -m pytest -q tests/viewer -m browser
+	$(BIN)/python -m pytest -q tests/app/viewer -m browser
 
 bench: $(VENV)/.bench $(VENV)/.native
 	$(BIN)/python -m pytest -q tests/benchmarks --benchmark-enable --benchmark-quiet

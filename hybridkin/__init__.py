@@ -7,7 +7,7 @@ from hybridkin._core.first_use import on_first_use
 from hybridkin._core.version import __version__
 
 if TYPE_CHECKING:
-    from hybridkin import datasets, native, plots, workflow
+    from hybridkin import datasets, native, plots
     from hybridkin._core.commands import Commands
     from hybridkin._core.model import ForwardModel, as_forward_model, jacobian
     from hybridkin.calibration.calibrate import CalibrationResult, calibrate
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from hybridkin.learning.elm import ELMRegressor
     from hybridkin.learning.elm_cv import ELMRegressorCV
     from hybridkin.saving.saved_model import load_model, save_model
-    from hybridkin.viewer import view
 
 __all__ = [
     "CalibrationResult",
@@ -70,8 +69,6 @@ __all__ = [
     "save_model",
     "tasks",
     "trajectories",
-    "view",
-    "workflow",
 ]
 
 _NAMES_OF = {
@@ -95,7 +92,6 @@ _NAMES_OF = {
     "learning.elm": ("ELMRegressor",),
     "learning.elm_cv": ("ELMRegressorCV",),
     "saving.saved_model": ("load_model", "save_model"),
-    "viewer": ("view",),
 }
 _FOLDER_OF = {
     "datasets": "",
@@ -104,7 +100,6 @@ _FOLDER_OF = {
     "robots": "chains.",
     "tasks": "ik.",
     "trajectories": "ik.",
-    "workflow": "",
 }
 
 

@@ -2,7 +2,7 @@
 
 import sys
 
-from hybridkin.cli.main import main
+from hybridkin.app.cli.main import main
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -19,8 +19,8 @@ from hybridkin import (
     robots,
     save_model,
     trajectories,
-    workflow,
 )
+from hybridkin.app import workflow
 
 FOLDER = Path(tempfile.mkdtemp(prefix="hybridkin-"))
 Q, X, GROUPS = trunk_log(24)

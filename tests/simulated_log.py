@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import hybridkin
-from hybridkin.cli.main import main
+from hybridkin.app.cli.main import main
 
 COLUMNS = ["t1", "t2", "t3", "t4", "t5", "t6"]
 HEADER = ",".join(["time", *COLUMNS, "x", "y", "z", "motion"])

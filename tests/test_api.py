@@ -7,31 +7,44 @@ from pathlib import Path
 import pytest
 
 import hybridkin
+import hybridkin.app
 
 ROOT = Path(hybridkin.__file__).parent
 FILES = sorted(path for path in ROOT.rglob("*.py") if path.parent != ROOT)
 # A folder may import from folders further down only; those on one line do not know each other.
 FLOORS = [
-    {"cli"},
-    {"viewer"},
-    {"workflow"},
+    {"app.cli"},
+    {"app.viewer"},
+    {"app.workflow"},
+    {"app.checks"},
+    {"app"},
     {"saving"},
     {"hybrid"},
     {"calibration"},
     {"chains", "learning", "ik"},
     {"native"},
-    {"_core", "causes", "datasets", "plots"},
+    {"_core", "datasets", "plots"},
 ]
+APP_FOLDER_OF = {
+    name: folder for folder, names in hybridkin.app._NAMES_OF.items() for name in names
+}
 BESIDE = {
-    "causes": {"_core", "chains", "native"},
-    "datasets": {"_core", "chains", "causes"},
+    "app": {"app.workflow", "app.checks", "app.viewer", "_core"},
+    "datasets": {"_core", "chains"},
     "plots": {"_core", "chains"},
     "_core": set(),
 }
 
 
 def folder_of(path):
-    return path.relative_to(ROOT).parts[0]
+    parts = path.relative_to(ROOT).parts
+    return ".".join(parts[:2]) if parts[0] == "app" and len(parts) > 2 else parts[0]
+
+
+def folder_named(module):
+    """Return the folder of a module of the package."""
+    parts = module.split(".")[1:]
+    return ".".join(parts[:2]) if parts[0] == "app" else parts[0]
 
 
 def imports_of(path):
@@ -48,13 +61,12 @@ def imports_of(path):
 def imported_folders(path):
     found = set()
     for module, names in imports_of(path):
-        parts = module.split(".")
-        if parts[0] == "hybridkin":
-            found |= (
-                {parts[1]}
-                if len(parts) > 1
-                else {hybridkin._FOLDER_OF.get(n, n).strip(".") for n in names}
-            )
+        if module == "hybridkin":
+            found |= {hybridkin._FOLDER_OF.get(name, name).strip(".") or name for name in names}
+        elif module == "hybridkin.app":
+            found |= {f"app.{APP_FOLDER_OF.get(name, name)}" for name in names}
+        elif module.startswith("hybridkin."):
+            found.add(folder_named(module))
     return found
 
 
@@ -70,9 +82,9 @@ def test_imports_run_one_way(path):
 @pytest.mark.parametrize("path", FILES, ids=[str(p.relative_to(ROOT)) for p in FILES])
 def test_modules_with_an_underscore_are_their_folders_own(path):
     for module, names in imports_of(path):
-        parts = module.split(".")
-        if parts[0] == "hybridkin" and len(parts) > 1 and parts[1] != folder_of(path):
-            assert not any(re.match("_[^_]", name) for name in (*parts[2:], *names)), module
+        if module.startswith("hybridkin.") and folder_named(module) != folder_of(path):
+            names_within = module.split(".")[2:] + names
+            assert not any(re.match("_[^_]", name) for name in names_within), module
 
 
 @pytest.mark.slow
@@ -83,7 +95,7 @@ def test_only_plots_uses_matplotlib_and_only_the_command_line_prints():
         )
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
-                assert node.func.id != "print" or folder_of(path) == "cli"
+                assert node.func.id != "print" or folder_of(path) == "app.cli"
 
 
 def loaded_by(code):
@@ -100,7 +112,7 @@ HEAVY = {"matplotlib", "pandas", "pytorch_kinematics", "scipy.optimize", "scipy.
 @pytest.mark.slow
 def test_what_needs_no_torch_does_not_load_it():
     assert "torch" not in loaded_by("import hybridkin")
-    assert "torch" not in loaded_by("from hybridkin.cli._parser import parser; parser()")
+    assert "torch" not in loaded_by("from hybridkin.app.cli._parser import parser; parser()")
 
 
 @pytest.mark.slow
@@ -109,13 +121,13 @@ def test_what_needs_no_torch_does_not_load_it():
     [
         "robot = hybridkin.robots.read_description({robot!r}); robot.chain",
         "hybridkin.ForceTendonChain([0.01], [0.1], 0.02, 100.0)",
-        "from hybridkin.cli.main import main; main(['describe', {robot!r}])",
+        "from hybridkin.app.cli.main import main; main(['describe', {robot!r}])",
     ],
 )
 def test_a_chain_and_its_description_load_neither_learning_nor_optimisation(code):
     loaded = loaded_by("import hybridkin; " + code.format(robot=str(ROBOT)))
     assert not HEAVY & loaded
-    for name in ("hybrid.estimator", "calibration.calibrate", "ik.solver", "workflow.compare"):
+    for name in ("hybrid.estimator", "calibration.calibrate", "ik.solver", "app.workflow.compare"):
         assert f"hybridkin.{name}" not in loaded
 
 

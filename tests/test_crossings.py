@@ -33,9 +33,9 @@ from hybridkin import (
     load_model,
     save_model,
 )
+from hybridkin.app.workflow import open_model, path_limits
 from hybridkin.hybrid._wrapped import in_columns
 from hybridkin.plots import BackboneDisplay
-from hybridkin.workflow import open_model, path_limits
 
 MARKERS = [(0, 0.6), (0, 1.0)]
 N_MOTIONS, N_ROWS = 5, 8

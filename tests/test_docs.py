@@ -14,12 +14,13 @@ import pytest
 import torch
 
 import hybridkin
-from hybridkin import ForwardModel
-from hybridkin.cli.main import main
+from hybridkin import ForwardModel, app
+from hybridkin.app.cli.main import main
 
 DOCS = Path(__file__).parent.parent / "docs"
 PAGES = sorted(DOCS.glob("*.md"))
 MODULES = (
+    "app",
     "datasets",
     "plots",
     "robots",
@@ -175,7 +176,8 @@ def public():
     found = {name: getattr(hybridkin, name) for name in hybridkin.__all__}
     found = {name: o for name, o in found.items() if callable(o)}
     for folder in MODULES:
-        module = getattr(hybridkin, folder)
+        within = app if folder == "workflow" else hybridkin
+        module = getattr(within, folder)
         members = {f"{folder}.{name}": getattr(module, name) for name in module.__all__}
         found |= {name: o for name, o in members.items() if callable(o)}
     for name, cls in list(found.items()):

@@ -43,6 +43,7 @@ from hybridkin import (
     PlayOperator,
     PrandtlIshlinskiiOperator,
     RigidChain,
+    app,
     as_forward_model,
     calibrate,
     choose_rows,
@@ -55,11 +56,11 @@ from hybridkin import (
     save_model,
     tasks,
     trajectories,
-    workflow,
 )
+from hybridkin.app import check_log, workflow
+from hybridkin.app.workflow import FitSettings
 from hybridkin.calibration.choice import choose_geometry
-from hybridkin.datasets import Log, check_log, paper_split
-from hybridkin.workflow import FitSettings
+from hybridkin.datasets import Log, paper_split
 
 
 @pytest.fixture(autouse=True)
@@ -312,10 +313,8 @@ ENTRIES = {
             **{"lag": 0.5, "tolerance": 2.0, "hold": False},
         },
     ),
-    "datasets.check_log": (
-        lambda q, x, groups, time, **k: str(
-            datasets.check_log(datasets.Log(q, x, groups, time), **k)
-        ),
+    "app.check_log": (
+        lambda q, x, groups, time, **k: str(app.check_log(datasets.Log(q, x, groups, time), **k)),
         {
             **{"q": Q, "x": X, "groups": GROUPS, "time": np.arange(24.0), "chain": trunk()},
             **{"base_is_free": True, "drop_invalid": True},

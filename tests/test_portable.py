@@ -8,7 +8,7 @@ import pytest
 FILES = (
     "tests/calibration/test_choice.py",
     "tests/core/test_directions.py",
-    "tests/datasets/test_check_log.py::test_clean_logs_pass",
+    "tests/app/checks/test_check_log.py::test_clean_logs_pass",
     "tests/hybrid/test_guards.py",
     "tests/ik/test_hysteresis.py::test_the_core_commands_what_torch_does",
 )

@@ -13,7 +13,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
-from hybridkin.cli._parser import parser
+from hybridkin.app.cli._parser import parser
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -72,7 +72,7 @@ def test_every_kind_of_command_is_tried_below():
 
 
 def test_commands_of_the_first_use_are_known(tmp_path, monkeypatch):
-    """They run in tests/cli and tests/viewer: one takes a minute, one asks, one waits."""
+    """They run in tests/app/cli and tests/app/viewer: one takes a minute, one asks, one waits."""
     monkeypatch.chdir(tmp_path)
     Path("log.csv").touch()
     found = [parser().parse_args(command[1:]).command for command in FIRST_USE]
@@ -103,7 +103,7 @@ RUNS = {  # the last command of a target
     "docs": "python -m sphinx -W --keep-going -n -b html docs docs/_build/html",
     "examine": "python tests/examination --out results/examination",
     "bench": "python -m pytest -q tests/benchmarks --benchmark-enable --benchmark-quiet",
-    "view-test": "python -m pytest -q tests/viewer -m browser",
+    "view-test": "python -m pytest -q tests/app/viewer -m browser",
     "check": "pyright --pythonpath .venv/bin/python",
 }
 EXTRAS = {"docs": "docs", "bench": "bench"}  # more than the extra "dev"

@@ -17,8 +17,8 @@ from pathlib import Path
 
 sys.path.append(str(Path(__file__).parents[1]))  # where the package `paper` lies
 
-from hybridkin.cli._terminal import Stages
-from hybridkin.cli._values import count
+from hybridkin.app.cli._terminal import Stages
+from hybridkin.app.cli._values import count
 from paper.report import run_paper
 
 

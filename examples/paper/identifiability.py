@@ -10,14 +10,14 @@ from sklearn.utils import Bunch
 
 from hybridkin import calibrate, robots
 from hybridkin._core.units import LogUnit
-from hybridkin.calibration.measured import distance
-from hybridkin.datasets import paper_split
-from hybridkin.workflow.calibrated import (
+from hybridkin.app.workflow.calibrated import (
     IDENTIFIED,
     calibrated_parameters,
     write_parameters,
 )
-from hybridkin.workflow.report import Report
+from hybridkin.app.workflow.report import Report
+from hybridkin.calibration.measured import distance
+from hybridkin.datasets import paper_split
 
 ASKED = ("radii", "turns", "rest_bends", "actuator_zeros", "tool", "base")
 """All parameters that `identifiability` calibrates at once."""

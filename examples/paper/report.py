@@ -9,10 +9,10 @@ import torch
 from sklearn.utils import Bunch
 
 from hybridkin import HybridForwardModel, robots
+from hybridkin.app.workflow.report import Progress, Report, check_out, quiet
 from hybridkin.calibration.measured import distance
 from hybridkin.datasets import load_trunk, paper_split
 from hybridkin.plots import ErrorHistogramDisplay, WorkspaceDisplay, new_figure
-from hybridkin.workflow.report import Progress, Report, check_out, quiet
 from paper import tables, tracks
 from paper.identifiability import identifiability, write_identifiability
 from paper.trunk import TrunkPlant

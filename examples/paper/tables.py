@@ -12,12 +12,12 @@ from sklearn.utils import Bunch
 
 from hybridkin import ELMRegressor, HybridForwardModel, calibrate, robots
 from hybridkin._core.turns import one_thread
+from hybridkin.app.workflow.compare import quadratic
+from hybridkin.app.workflow.report import Progress, Report, quiet
 from hybridkin.calibration.measured import distance
 from hybridkin.chains.chain import Chain
 from hybridkin.datasets import paper_split
 from hybridkin.plots import model_color, new_figure
-from hybridkin.workflow.compare import quadratic
-from hybridkin.workflow.report import Progress, Report, quiet
 
 PAPER_TABLE_1 = {
     ("mechanical, nominal", "-"): ("", "2.5 (9.3)"),

@@ -19,6 +19,7 @@ from hybridkin import (
     trajectories,
 )
 from hybridkin._core.turns import one_thread
+from hybridkin.app.workflow.report import Progress, Report, quiet
 from hybridkin.ik.trajectories import Trajectory
 from hybridkin.plots import (
     ActuatorDisplay,
@@ -26,7 +27,6 @@ from hybridkin.plots import (
     TrackingDisplay,
     new_figure,
 )
-from hybridkin.workflow.report import Progress, Report, quiet
 from paper.tables import PAPER_ELM, cell, chains_of, mechanical_over_hybrid, run_all
 from paper.trunk import TrunkPlant
 

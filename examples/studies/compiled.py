@@ -37,9 +37,9 @@ from numpy.typing import NDArray
 from reachable_targets import KINDS, ROBOTS, STARTS, Robot, draw
 
 from hybridkin import InverseKinematics, as_forward_model
+from hybridkin.app.workflow.report import Report
 from hybridkin.ik.results import IKStatus
 from hybridkin.native.library import program_of
-from hybridkin.workflow.report import Report
 
 PARTS = ("agreement", "steps", "solve", "ticks")
 TICKED = (

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridkin.app.workflow.report import Report
 from hybridkin.plots import new_figure
-from hybridkin.workflow.report import Report
 
 FAR = 20.0  # times half the range: the farthest rows
 RUNS, MORE_RUNS = 3, 100  # of every tick, and of the slowest

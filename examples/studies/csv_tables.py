@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from hybridkin.workflow.report import Report
+from hybridkin.app.workflow.report import Report
 
 
 def add_csv(

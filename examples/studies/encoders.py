@@ -25,7 +25,8 @@ import torch
 from numpy.typing import NDArray
 
 from hybridkin import ConstantCurvatureChain, HybridForwardModel
-from hybridkin.datasets import Log, check_log, load_log
+from hybridkin.app import check_log
+from hybridkin.datasets import Log, load_log
 
 PERIOD = 4096.0
 GAIN = 1e-5  # [m/count]

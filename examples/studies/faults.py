@@ -44,12 +44,12 @@ from hybridkin import (
     HybridForwardModel,
     PlayOperator,
     save_model,
-    workflow,
 )
-from hybridkin.datasets import Log, check_log
+from hybridkin.app import check_log, workflow
+from hybridkin.app.workflow.errors import Promise
+from hybridkin.app.workflow.report import Report
+from hybridkin.datasets import Log
 from hybridkin.hybrid.log_distance import held_out_distances
-from hybridkin.workflow.errors import Promise
-from hybridkin.workflow.report import Report
 
 N_MOTIONS, N_ROWS = 24, 80  # of the log
 N_TRACK = 300  # rows

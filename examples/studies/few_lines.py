@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from hybridkin import ConstantCurvatureChain, HybridForwardModel
-from hybridkin.workflow.report import Report
+from hybridkin.app.workflow.report import Report
 
 LINES = (
     "single actuators from the middle",

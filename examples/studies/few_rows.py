@@ -32,10 +32,10 @@ from joblib import Parallel, delayed
 from threadpoolctl import threadpool_limits
 
 from hybridkin import HybridForwardModel
+from hybridkin.app.workflow.report import Report
 from hybridkin.calibration.natural_scales import STRUCTURE
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._structure import fit_structure
-from hybridkin.workflow.report import Report
 
 SIZES = (12, 25, 50, 100)
 COVERAGE = 0.9

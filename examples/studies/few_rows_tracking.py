@@ -18,7 +18,7 @@ from simulated_trunk import PAPER_ELM
 from threadpoolctl import threadpool_limits
 
 from hybridkin import ELMRegressor, HybridForwardModel, datasets, robots
-from hybridkin.workflow.report import Report
+from hybridkin.app.workflow.report import Report
 from paper.tracks import Tracks, paper_paths, tracking
 
 SIZES = (25, 100, 1900)

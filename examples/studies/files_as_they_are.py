@@ -29,7 +29,8 @@ from numpy.typing import NDArray
 from sklearn.linear_model import LinearRegression
 
 from hybridkin import HybridForwardModel
-from hybridkin.datasets import Log, check_log, load_log
+from hybridkin.app import check_log
+from hybridkin.datasets import Log, load_log
 from hybridkin.hybrid.estimator import prepared
 from hybridkin.hybrid.log_fit import fit_to_log
 

@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 from sklearn.model_selection import GroupKFold
 
 from hybridkin import calibrate, datasets
+from hybridkin.app.workflow.report import Report
 from hybridkin.chains.arc_chain import ArcChain
-from hybridkin.workflow.report import Report
 
 EXTRA: dict[str, tuple[str, ...]] = {
     "gains fixed": (),

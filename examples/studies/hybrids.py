@@ -46,7 +46,7 @@ from hybrid_cases import (
 from joblib import Parallel, delayed
 
 from hybridkin import plots
-from hybridkin.workflow.report import Report
+from hybridkin.app.workflow.report import Report
 
 SIZES = (12, 25, 50, 100, 200, 400, 800, 1600, 3200)
 

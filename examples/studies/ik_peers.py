@@ -29,8 +29,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from hybridkin import InverseKinematics, RigidChain
+from hybridkin.app.workflow.report import Report
 from hybridkin.ik.tasks import PoseTask
-from hybridkin.workflow.report import Report
 
 TOL = (1e-3, 1e-2)  # [m], [rad]
 _DT = 1.0  # [s], the period of mink and Pink: whole steps

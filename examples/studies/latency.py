@@ -29,9 +29,9 @@ from hybridkin import (
     InverseKinematics,
     datasets,
 )
+from hybridkin.app.workflow.report import Report
 from hybridkin.native import export_c
 from hybridkin.plots import new_figure
-from hybridkin.workflow.report import Report
 
 LOOP = Path(__file__).parents[1] / "c" / "loop.c"
 # of the circle [m]; of a turn [ticks]; [ns]

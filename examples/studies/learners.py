@@ -48,7 +48,7 @@ from hybridkin import (
     plots,
     robots,
 )
-from hybridkin.workflow.report import Report
+from hybridkin.app.workflow.report import Report
 
 _LOOKS = ("o-#0072B2", "s-#D55E00", "D-#009E73", "^-#CC79A7")
 

@@ -38,10 +38,11 @@ from scipy.spatial.transform import Rotation
 from sklearn.linear_model import LinearRegression
 
 from hybridkin import ConstantCurvatureChain, ElasticTendonChain, HybridForwardModel
-from hybridkin.datasets import Log, check_log
+from hybridkin.app import check_log
+from hybridkin.app.workflow.report import Report
+from hybridkin.datasets import Log
 from hybridkin.hybrid.estimator import prepared
 from hybridkin.hybrid.log_fit import fit_to_log
-from hybridkin.workflow.report import Report
 
 N_MOTIONS, N_ROWS = 12, 16  # of the fitted log
 N_TEST = 6  # motions

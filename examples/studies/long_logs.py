@@ -25,7 +25,8 @@ import numpy as np
 from hysteresis import TRUNK, by_group, creep, many_plays, tips
 from numpy.typing import NDArray
 
-from hybridkin import Commands, PlayOperator, load_model, robots, workflow
+from hybridkin import Commands, PlayOperator, load_model, robots
+from hybridkin.app import workflow
 from hybridkin.datasets import Log
 
 ROWS = 60  # in a motion

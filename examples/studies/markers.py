@@ -31,7 +31,7 @@ from sklearn.model_selection import GroupKFold
 from threadpoolctl import threadpool_limits
 
 from hybridkin import ConstantCurvatureChain, HybridForwardModel, datasets, robots
-from hybridkin.workflow.report import Report
+from hybridkin.app.workflow.report import Report
 
 SIZES = (25, 50, 100, 400)
 ENDS = [(0, 1.0), (1, 1.0), (2, 1.0)]

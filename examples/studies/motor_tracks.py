@@ -54,10 +54,10 @@ from hybridkin import (
     save_model,
     trajectories,
 )
+from hybridkin.app.workflow import open_model
+from hybridkin.app.workflow.errors import Promise
+from hybridkin.app.workflow.report import Report
 from hybridkin.hybrid.log_distance import held_out_distances
-from hybridkin.workflow import open_model
-from hybridkin.workflow.errors import Promise
-from hybridkin.workflow.report import Report
 
 FIT = "fit"  # models that begin so are made by the command line
 _STILL = 0.02  # of the rms of the direction with the largest motion

@@ -32,7 +32,7 @@ from hybridkin import (
     robots,
     trajectories,
 )
-from hybridkin.workflow.report import Report
+from hybridkin.app.workflow.report import Report
 
 SIZES = (12, 25, 50, 100)
 MORE = (

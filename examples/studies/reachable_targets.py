@@ -30,8 +30,8 @@ from hybridkin import (
     as_forward_model,
     datasets,
 )
+from hybridkin.app.workflow.report import Report
 from hybridkin.ik.results import IKStatus
-from hybridkin.workflow.report import Report
 
 TOL = 1e-4  # [m]
 KINDS = ("inside", "face", "edge", "corner", "straight")

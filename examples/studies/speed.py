@@ -28,8 +28,8 @@ from hybridkin import (
     datasets,
     native,
     robots,
-    workflow,
 )
+from hybridkin.app import workflow
 
 _SHORTEST = 0.02  # [s]; shorter jobs are timed many at a time
 _TARGETS = 2000

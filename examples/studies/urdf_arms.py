@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from hybridkin import RigidChain
-from hybridkin.workflow.report import Report
+from hybridkin.app.workflow.report import Report
 
 FREE = ("x", "y", "z", "yaw", "pitch", "roll")  # what a floating joint is
 

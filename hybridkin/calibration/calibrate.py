@@ -317,7 +317,7 @@ def _unexplained(fit: Fit, rows: Rows) -> str | None:
     return (
         f"the calibrated model has a median residual of {1e3 * residual:.3g} mm, but the tip moves "
         f"by only {1e3 * spread:.3g} mm. Order or sign of the columns of `q`, or the description "
-        "of the robot, may be wrong: datasets.check_log(Log(q, x), chain=chain) looks for better "
+        "of the robot, may be wrong: app.check_log(Log(q, x), chain=chain) looks for better "
         "ones."
     )
 

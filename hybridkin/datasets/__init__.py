@@ -3,8 +3,7 @@
 from typing import TYPE_CHECKING
 
 from hybridkin._core.first_use import on_first_use
-from hybridkin.datasets._log_checks import LogFinding, LogReport, check_log
-from hybridkin.datasets._logs import Log, load_log, log_columns
+from hybridkin.datasets.logs import Log, load_log, log_columns
 
 if TYPE_CHECKING:
     from hybridkin.datasets._recordings import (
@@ -25,11 +24,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Log",
-    "LogFinding",
-    "LogReport",
     "Merged",
     "TimedColumns",
-    "check_log",
     "load_armlab",
     "load_asl_trunk",
     "load_asu_bellows",

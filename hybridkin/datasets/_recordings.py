@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from sklearn.utils import Bunch
 
 from hybridkin._core.arrays import one_of
-from hybridkin.datasets._logs import load_log
 from hybridkin.datasets._npz import arrays_of
+from hybridkin.datasets.logs import load_log
 
 _FTDCR_SERVOS = tuple(f"servo_{i}_mm" for i in (4, 3, 9, 5, 2, 8, 6, 1, 7))
 _FTDCR_TIP = ("tip_x", "tip_y", "tip_z")

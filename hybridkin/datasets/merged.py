@@ -22,12 +22,12 @@ from hybridkin._core.arrays import (
     one_of,
     real_array,
 )
+from hybridkin._core.named_rows import named_places
 from hybridkin._core.text_rows import TextForm
 from hybridkin._core.units import METRES, UNITS
-from hybridkin.datasets._encoders import _features as rough_features
-from hybridkin.datasets._log_report import named_rows
-from hybridkin.datasets._logs import Log
 from hybridkin.datasets._tables import Table, without_missing
+from hybridkin.datasets.encoders import _features as rough_features
+from hybridkin.datasets.logs import Log
 from hybridkin.datasets.table_files import read_table
 
 _GAP = 5.0  # usual periods of the motor rows: longer ones are gaps
@@ -89,7 +89,7 @@ class TimedColumns:
         if len(late) or not np.isfinite(time).all():
             raise ValueError(
                 f"`time` of {self.source} must increase from row to row, but does not at "
-                f"{named_rows(late, 'row')}; sort the rows, leave out repeated ones, and merge "
+                f"{named_places(late, 'row')}; sort the rows, leave out repeated ones, and merge "
                 "recordings whose clock starts again one by one."
             )
 

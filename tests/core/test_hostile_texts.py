@@ -16,12 +16,12 @@ import numpy as np
 import pytest
 from markdown_it import MarkdownIt
 
-from hybridkin import cli
 from hybridkin._core import texts
 from hybridkin._core.html import html_table
+from hybridkin.app import cli
+from hybridkin.app.workflow import Report
 from hybridkin.datasets import load_log
 from hybridkin.plots import ActuatorDisplay, ErrorBoxDisplay
-from hybridkin.workflow import Report
 
 if sys.version_info >= (3, 11):
     import tomllib

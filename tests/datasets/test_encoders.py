@@ -7,8 +7,9 @@ from numpy.testing import assert_allclose
 from simulated_log import run
 
 from hybridkin import ConstantCurvatureChain
-from hybridkin.datasets import Log, check_log, load_log
-from hybridkin.datasets._encoders import encoder_faults, given_periods, unwrapped
+from hybridkin.app import check_log
+from hybridkin.datasets import Log, load_log
+from hybridkin.datasets.encoders import encoder_faults, given_periods, unwrapped
 
 PERIODS = {"counts": (4096.0, 65536.0, 8192.0, 2.0**32), "deg": (360.0,), "rad": (2 * np.pi,)}
 

@@ -8,7 +8,8 @@ import torch
 from numpy.testing import assert_allclose, assert_array_equal
 
 from hybridkin import robots
-from hybridkin.datasets import Log, check_log, load_log, load_trunk
+from hybridkin.app import check_log
+from hybridkin.datasets import Log, load_log, load_trunk
 
 N = 300
 SENTINELS = (9999.999, -9999.0, 99999.0, -1.0e6)

@@ -7,7 +7,8 @@ from numpy.testing import assert_allclose
 from hybridkin import Commands, ConstantCurvatureChain, HybridForwardModel
 from hybridkin._core.clock import clock_doubt
 from hybridkin._core.units import duration_in_words
-from hybridkin.datasets import Log, check_log, load_log
+from hybridkin.app import check_log
+from hybridkin.datasets import Log, load_log
 
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 START = 1_700_000_000.0  # [s] since 1970

@@ -15,9 +15,9 @@ import torch
 from saved_models import FOLDER, predictions
 
 from hybridkin import RigidChain, load_model, robots
+from hybridkin.app.workflow import open_model
 from hybridkin.datasets import load_armlab, load_asl_trunk, load_log
 from hybridkin.ik import trajectories
-from hybridkin.workflow import open_model
 
 URDF = b"""<robot name="arm"><link name="base"/><link name="upper"/><link name="hand"/>
 <joint name="turn" type="revolute"><parent link="base"/><child link="upper"/>

@@ -27,7 +27,7 @@ from tqdm import tqdm
 
 from hybridkin import robots, save_model
 from hybridkin._core.files import write_files
-from hybridkin.cli.main import main
+from hybridkin.app.cli.main import main
 from paper import make_trunk, trunk_data
 
 ROBOT = """calibrate = []

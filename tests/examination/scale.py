@@ -236,11 +236,11 @@ def calibrate(n: int) -> Callable[[], Any]:
 
 
 def check_log(n: int) -> Callable[[], Any]:
-    from hybridkin import datasets
+    from hybridkin import app, datasets
 
     q, x = rows(n)
     log = datasets.Log(q, x, groups=np.arange(n) // 50, time=0.01 * np.arange(n))
-    return lambda: datasets.check_log(log, chain=trunk())
+    return lambda: app.check_log(log, chain=trunk())
 
 
 def load_csv(n: int) -> Callable[[], Any]:

@@ -32,8 +32,8 @@ from tqdm import tqdm
 import hybridkin
 from hybridkin import native, robots
 from hybridkin._core import texts
-from hybridkin.cli._terminal import write
-from hybridkin.cli.main import main
+from hybridkin.app.cli._terminal import write
+from hybridkin.app.cli.main import main
 
 sys.path.insert(1, str(Path(__file__).parents[1] / "core"))
 import test_hostile_texts as checks

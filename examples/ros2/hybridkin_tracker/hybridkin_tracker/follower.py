@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from hybridkin import InverseKinematics, workflow
+from hybridkin import InverseKinematics
+from hybridkin.app import workflow
 
 
 class Follower:

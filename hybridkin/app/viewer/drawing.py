@@ -1,0 +1,200 @@
+"""What is drawn of a robot: its body, and the backbone of another model."""
+
+from __future__ import annotations
+
+from typing import Any, TypeAlias
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from hybridkin._core.commands import Commands
+from hybridkin._core.model import ForwardModel
+from hybridkin.app.viewer.steered import SteeredRobot
+from hybridkin.chains.arc_chain import ArcChain
+from hybridkin.chains.chain import Chain
+from hybridkin.chains.elastic_tendons import ElasticTendonChain
+from hybridkin.datasets import Log
+from hybridkin.plots.models import body_of
+
+Color: TypeAlias = tuple[int, int, int]
+
+GREEN = (40, 160, 80)
+ORANGE = (235, 150, 30)
+RED = (210, 50, 50)
+BLUE = (40, 90, 200)
+GREY = (150, 150, 150)
+YELLOW = (250, 215, 70)
+GHOSTS = {"nominal model": (90, 90, 90), "calibrated model": (150, 90, 190)}
+_POINTS = 10  # drawn along a segment
+_MOST_ROWS = 2000  # of a log, drawn as a cloud
+_CLICK = 2.0  # distance of a click from a row, relative to the size of its dot
+
+
+class Body:
+    """The robot: backbone, actuators and disks."""
+
+    def __init__(self, scene: Any, model: Any, robot: SteeredRobot) -> None:
+        self._model = model
+        self._chain = robot.loaded.chain
+        body = body_of(model, robot.q, _POINTS)
+        self._thick = 0.015 * robot.size
+        if isinstance(self._chain, ArcChain):
+            self._thick = min(self._thick, 0.4 * float(self._chain.radii.min()))
+        self._backbone = scene.add_spline_catmull_rom(
+            "/robot/backbone",
+            body["points"][0],
+            thickness=self._thick,
+            color=(60, 60, 60),
+        )
+        self._tip = scene.add_icosphere("/robot/tip", 0.012 * robot.size, (20, 20, 20))
+        self._actuators = [
+            scene.add_spline_catmull_rom(
+                f"/robot/actuator {k + 1}", path[0], thickness=0.4 * self._thick
+            )
+            for k, path in enumerate(body["actuators"])
+        ]
+        self._markers = None
+        if self._chain is not None and self._chain.n_outputs > 3:
+            self._markers = scene.add_point_cloud(
+                "/robot/markers",
+                self._marked(robot),
+                BLUE,
+                point_size=2.0 * self._thick,
+                point_shape="circle",
+            )
+        self._disks = None
+        if "disks" in body:
+            self._disks = scene.add_line_segments(
+                "/robot/disks",
+                _rims(body["disks"]),
+                GREY,
+                thickness=0.3 * self._thick,
+            )
+
+    def move(self, robot: SteeredRobot) -> None:
+        """Draw the robot where it is."""
+        body = body_of(self._model, robot.q, _POINTS)
+        if not np.isfinite(body["points"]).all():
+            return
+        self._backbone.points = body["points"][0]
+        self._tip.position = robot.x
+        if self._disks is not None and "disks" in body:
+            self._disks.points = _rims(body["disks"])
+        if self._markers is not None:
+            self._markers.points = self._marked(robot)
+        colors, slack = self._tensions(robot)
+        for k, handle in enumerate(self._actuators):
+            handle.points = body["actuators"][k][0]
+            color = tuple(colors[k].tolist())
+            thickness = (0.12 if slack[k] else 0.4) * self._thick
+            if tuple(handle.color) != color:
+                handle.color = color
+            if handle.thickness != thickness:
+                handle.thickness = thickness
+
+    def _marked(self, robot: SteeredRobot) -> NDArray:
+        """Return the markers (K, 3) as the model predicts them."""
+        return robot.loaded.predict(Commands(robot.q[None])).reshape(-1, 3)
+
+    def _tensions(self, robot: SteeredRobot) -> tuple[NDArray, NDArray]:
+        """Return colours (n, 3) of the actuators, and which are slack (n,)."""
+        chain = self._chain
+        if isinstance(chain, ElasticTendonChain):
+            with torch.no_grad():
+                tension = chain.tensions(torch.from_numpy(robot.q)).numpy()
+            fraction = tension / max(float(tension.max()), 1e-300)
+            return between(BLUE, RED, fraction), tension <= 0.0
+        fraction = (robot.q - robot.limits.q_min) / robot.span
+        return between(RED, BLUE, fraction), np.zeros(len(fraction), dtype=bool)
+
+
+class Ghost:
+    """The backbone of another model at the same command."""
+
+    def __init__(
+        self, scene: Any, name: str, chain: Chain, robot: SteeredRobot
+    ) -> None:
+        self._chain = chain
+        self.line = scene.add_spline_catmull_rom(
+            f"/{name}",
+            body_of(chain, robot.q, _POINTS)["points"][0],
+            thickness=0.008 * robot.size,
+            color=GHOSTS[name],
+            visible=False,
+        )
+
+    def move(self, robot: SteeredRobot) -> None:
+        """Draw it, if it is shown."""
+        if self.line.visible:
+            points = body_of(self._chain, robot.q, _POINTS)["points"][0]
+            if np.isfinite(points).all():
+                self.line.points = points
+
+
+class LogCloud:
+    """Rows of a log: measured tips coloured by the error of the model, which can be clicked."""
+
+    def __init__(self, scene: Any, robot: SteeredRobot, log: Log) -> None:
+        loaded = robot.loaded
+        (commands, tips) = robot.measured_rows(log)
+        every = 1 + len(tips) // _MOST_ROWS
+        self._commands = commands[::every]
+        self._tips = tips[::every]
+        error = np.linalg.norm(loaded.tips(self._commands) - self._tips, axis=1)
+        largest = 1.0
+        if len(error):
+            largest = float(np.percentile(error, 95))
+        self._size = 0.007 * robot.size
+        self.name = f"log, red: error of {1e3 * largest:.3g} mm or more"
+        self.dots = scene.add_point_cloud(
+            "/log",
+            self._tips,
+            between(YELLOW, RED, error / max(largest, 1e-12)),
+            point_size=self._size,
+            point_shape="circle",
+        )
+        self.learned = None
+        if loaded.hybrid is not None and loaded.chain is not None:
+            mechanical = tips_of(loaded.chain, self._commands)
+            hybrid = tips_of(loaded.hybrid.module_, self._commands)
+            self.learned = scene.add_line_segments(
+                "/learned",
+                np.stack([mechanical, hybrid], axis=1),
+                ORANGE,
+                thickness=0.3 * self._size,
+                visible=False,
+            )
+
+    def row_at(
+        self, origin: NDArray, direction: NDArray
+    ) -> tuple[NDArray, NDArray] | None:
+        """Return the command (n,) and the tip (3,) of the first row that a ray meets, or None."""
+        ways = self._tips - origin
+        along = ways @ direction
+        distance = np.linalg.norm(ways - along[:, None] * direction, axis=1)
+        hit = (distance < _CLICK * self._size) & (along > 0.0)
+        if not hit.any():
+            return None
+        first = np.argmin(np.where(hit, along, np.inf))
+        return self._commands[first], self._tips[first]
+
+
+def tips_of(model: ForwardModel, q: NDArray) -> NDArray:
+    """Return the tips (N, 3) of a model for rows of q (N, n)."""
+    with torch.no_grad():
+        return model.tip_model(torch.from_numpy(q)).numpy()
+
+
+def _rims(disks: NDArray) -> NDArray:
+    """Return the rims of the disks (1, D, C, 3) as segments (L, 2, 3)."""
+    rims = disks[0]
+    strokes = np.stack([rims[:, :-1], rims[:, 1:]], axis=2)
+    return strokes.reshape(-1, 2, 3)
+
+
+def between(low: Color, high: Color, fraction: NDArray) -> NDArray:
+    """Return colours (N, 3) from low to high for fractions (N,) from 0 to 1."""
+    part = np.clip(fraction, 0.0, 1.0)[:, None]
+    colors = (1.0 - part) * np.array(low) + part * np.array(high)
+    return colors.astype(np.uint8)

@@ -1,0 +1,417 @@
+"""The page: what viser shows of a robot, and what the mouse changes."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Callable
+from pathlib import Path
+from threading import Event, Thread
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from typing_extensions import Self
+
+from hybridkin._core.page_server import page_server, stop
+from hybridkin._core.texts import csv_table, markdown, visible
+from hybridkin.app.viewer.drawing import BLUE, GREEN, ORANGE, RED, Body, Ghost, LogCloud
+from hybridkin.app.viewer.motions import (
+    Loop,
+    Motion,
+    Replay,
+    Wiggle,
+    circle,
+    figure_eight,
+)
+from hybridkin.app.viewer.steered import RATE, SteeredRobot
+from hybridkin.app.workflow.domain import path_limits
+from hybridkin.app.workflow.model import LoadedModel
+from hybridkin.chains.chain import Chain
+from hybridkin.datasets import Log
+from hybridkin.hybrid.estimator import HybridForwardModel
+from hybridkin.ik.trajectories import Trajectory
+
+__all__ = ["LiveView", "view"]
+
+_CAMERA = np.array([0.9, -1.1, 0.4])  # from the middle, relative to the robot's size
+_PAUSE = 0.1  # between two updates of the words [s]
+
+
+def view(
+    model: LoadedModel | HybridForwardModel | Chain,
+    log: Log | None = None,
+    *,
+    path: Trajectory | None = None,
+    q_min: ArrayLike | None = None,
+    q_max: ArrayLike | None = None,
+    dq_max: ArrayLike | None = None,
+    ddq_max: ArrayLike | None = None,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+) -> LiveView:
+    """Open a live 3D view of a robot: a page on which its target can be dragged.
+
+    Parameters
+    ----------
+    model : LoadedModel, HybridForwardModel or Chain
+        A model with a mechanical part that can be drawn; from a file by `workflow.open_model`.
+    log : Log, optional
+        Measured rows to show, from `datasets.load_log` or `workflow.read_log`. A click on a row
+        moves the robot there.
+    path : Trajectory, optional
+        A path that a button starts, in a loop; from `trajectories`.
+    q_min, q_max, dq_max, ddq_max : float or array-like of shape (n,), optional
+        Limits of position, speed and acceleration [unit of q, s]. Default: those of the model and
+        its description; else the range of the log, and one second for the whole range.
+    host : str, default="127.0.0.1"
+        Address to listen to. The default can be reached from this machine alone, and by no page
+        but this one.
+    port : int, default=8080
+        Port; the next free one if it is taken.
+
+    Returns
+    -------
+    LiveView
+        The running view; `close` ends it, as does the end of a ``with`` block.
+
+    Raises
+    ------
+    ImportError
+        Without viser.
+    RuntimeError
+        If this version of viser cannot be kept from pages of others.
+    TypeError
+        If the model has no mechanical part that can be drawn.
+    ValueError
+        If the range of the actuators is not known.
+
+    Examples
+    --------
+    >>> import hybridkin
+    >>> chain = hybridkin.robots.bionic_handling_assistant()
+    >>> with hybridkin.app.view(chain, q_min=0.1, q_max=0.4) as shown:  # doctest: +SKIP
+    ...     print(shown.address)
+    http://127.0.0.1:8080
+    """
+    if not isinstance(model, LoadedModel):
+        model = LoadedModel(type(model).__name__, Path(), model)
+    if model.chain is None:
+        raise TypeError(
+            "`model` must be a chain, or a hybrid fitted on one, so that its body can be drawn; "
+            f"got a model without a mechanical part, {model.name}."
+        )
+    if log is not None and not _has_range(model):
+        q_min = np.nanmin(log.q, axis=0) if q_min is None else q_min
+        q_max = np.nanmax(log.q, axis=0) if q_max is None else q_max
+    limits = path_limits(
+        model, q_min=q_min, q_max=q_max, dq_max=dq_max, ddq_max=ddq_max
+    )
+    return LiveView(SteeredRobot(model, limits), log, path, host, port)
+
+
+def _has_range(model: LoadedModel) -> bool:
+    """Return whether the model or its description gives a range of the actuators."""
+    if model.trained_range is not None:
+        return True
+    return model.description is not None and model.description.limits.q_min is not None
+
+
+class LiveView:
+    """A running view, made by `view`: a server, and a thread that moves the robot.
+
+    Attributes
+    ----------
+    robot : SteeredRobot
+        The robot that is shown.
+    address : str
+        Address of the page.
+    ticks_per_second : float
+        Rate while the robot moved, averaged over some ticks.
+    """
+
+    def __init__(
+        self,
+        robot: SteeredRobot,
+        log: Log | None,
+        path: Trajectory | None,
+        host: str,
+        port: int,
+    ) -> None:
+        try:
+            self._server = page_server(host, port, label="hybridkin")
+        except ImportError as error:
+            raise ImportError(
+                'a live view needs viser: pip install "hybridkin[view]".'
+            ) from error
+        self.robot = robot
+        self.ticks_per_second = 0.0
+        self.address = f"http://{host}:{self._server.get_port()}"
+        self._wake = Event()
+        self._closed = False
+        self._failure: Exception | None = None
+        self._motion: Motion | None = None
+        self._last_words = 0.0
+        self._draw_scene(log)
+        self._add_panel(log, path)
+        self._show()
+        self._thread = Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _draw_scene(self, log: Log | None) -> None:
+        """Draw the robot, its target, and what can be shown beside it."""
+        robot = self.robot
+        scene = self._server.scene
+        scene.set_up_direction("+z")
+        reachable = robot.domain.sample[1]
+        corners = np.vstack([reachable, np.zeros(3)])
+        middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
+        self._server.initial_camera.look_at = middle
+        self._server.initial_camera.position = middle + robot.size * _CAMERA
+        scene.add_frame(
+            "/base", axes_length=0.15 * robot.size, axes_radius=0.004 * robot.size
+        )
+        self._body = Body(scene, robot.loaded.model, robot)
+        self._aim = scene.add_transform_controls(
+            "/target",
+            scale=0.15 * robot.size,
+            disable_rotations=True,
+            position=robot.target,
+        )
+        self._aim.on_update(self._dragged)
+        self._ball = scene.add_icosphere("/target/ball", 0.02 * robot.size, GREEN)
+        self._measured = scene.add_icosphere(
+            "/measured", 0.015 * robot.size, (0, 0, 0), visible=False
+        )
+        self._radius = scene.add_icosphere(
+            "/radius", 1.0, color=ORANGE, opacity=0.2, visible=False
+        )
+        self._switched: dict[str, Any] = {}
+        self._switched["reachable"] = scene.add_point_cloud(
+            "/reachable",
+            reachable,
+            BLUE,
+            point_size=0.007 * robot.size,
+            point_shape="circle",
+            visible=False,
+        )
+        if log is not None:
+            self._rows = LogCloud(scene, robot, log)
+            self._switched[self._rows.name] = self._rows.dots
+            if self._rows.learned is not None:
+                name = "learned error: mechanical to hybrid tip"
+                self._switched[name] = self._rows.learned
+            scene.on_click()(self._clicked)
+        self._ghosts = []
+        for name, chain in _other_models(robot.loaded).items():
+            ghost = Ghost(scene, name, chain, robot)
+            self._ghosts.append(ghost)
+            self._switched[name] = ghost.line
+        if self._expected() > 0.0:
+            self._switched["expected error"] = self._radius
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Stop the robot and the server; the port is free afterwards."""
+        if not self._closed:
+            self._closed = True
+            self._wake.set()
+            self._thread.join()
+            stop(self._server)
+
+    def wait(self) -> None:
+        """Wait until the view is closed, or Ctrl-C; an error of the drawing is raised here."""
+        self._thread.join()
+        if self._failure is not None:
+            raise self._failure
+
+    def follow(self, target: NDArray) -> None:
+        """Follow a target (3,) [m], as if it was dragged there."""
+        self._motion = None
+        self.robot.follow(target)
+        self._wake.set()
+
+    def go_to(self, q: NDArray) -> None:
+        """Move the actuators to q (n,), as if their sliders were moved."""
+        self._motion = None
+        self.robot.go_to(q)
+        self._wake.set()
+
+    def _add_panel(self, log: Log | None, path: Trajectory | None) -> None:
+        """Add words, sliders and buttons."""
+        gui = self._server.gui
+        robot = self.robot
+        gui.configure_theme(show_share_button=False)  # it would not be heard
+        self._words = gui.add_markdown("")
+        self._add_sliders()
+        with gui.add_folder("Show", expand_by_default=len(self._switched) > 1):
+            for name, handle in self._switched.items():
+                self._switch(name, handle)
+        with gui.add_folder("Motion"):
+            self._button("Wiggle every actuator", lambda: Wiggle(robot))
+            self._button("Circle", lambda: Loop(robot, circle(robot)))
+            self._button("Figure eight", lambda: Loop(robot, figure_eight(robot)))
+            if path is not None:
+                self._button("Follow the path", lambda: Loop(robot, path))
+            if log is not None:
+                self._button("Play the log", lambda: Replay(robot, log, self._measured))
+            self._button("Stop", lambda: None)
+            button = gui.add_button("Download the commands")
+            button.on_click(self._download)
+
+    def _add_sliders(self) -> None:
+        """Add a slider for every actuator, in the names and the unit of the log."""
+        robot = self.robot
+        log_format = robot.loaded.log_format()
+        self._factor = np.broadcast_to(log_format.q_factor, robot.q.shape)
+        ends = [robot.limits.q_min / self._factor, robot.limits.q_max / self._factor]
+        low, high = np.sort(ends, axis=0)
+        start = robot.q / self._factor
+        self._sliders = []
+        unit = visible(log_format.q_unit)
+        with self._server.gui.add_folder(f"Actuators [{unit}]"):
+            for k, name in enumerate(map(visible, log_format.q)):
+                step = max((high[k] - low[k]) / 1000.0, 1e-12)
+                end = max(high[k], low[k] + step)
+                slider = self._server.gui.add_slider(name, low[k], end, step, start[k])
+                slider.on_update(self._slid)
+                self._sliders.append(slider)
+
+    def _button(self, name: str, motion: Callable[[], Motion | None]) -> None:
+        def start(_: object) -> None:
+            self._motion = motion()
+            self._wake.set()
+
+        self._server.gui.add_button(name).on_click(start)
+
+    def _switch(self, name: str, handle: Any) -> None:
+        box = self._server.gui.add_checkbox(name, handle.visible)
+
+        def switch(_: object) -> None:
+            handle.visible = box.value
+            self._show()
+
+        box.on_update(switch)
+
+    def _clicked(self, event: Any) -> None:
+        """Go to the row of the log that was clicked."""
+        origin = np.array(event.ray_origin)
+        row = self._rows.row_at(origin, np.array(event.ray_direction))
+        if row is not None and self._rows.dots.visible:
+            q, tip = row
+            self._measured.position = tip
+            self._measured.visible = True
+            self.go_to(q)
+
+    def _dragged(self, event: Any) -> None:
+        if event.client is not None:  # not one of our own
+            self.follow(np.array(self._aim.position))
+
+    def _slid(self, event: Any) -> None:
+        if event.client is not None:
+            values = np.array([slider.value for slider in self._sliders])
+            self.go_to(values * self._factor)
+
+    def _download(self, event: Any) -> None:
+        rows = []
+        for k, row in enumerate(self.robot.commands()):
+            rows.append([f"{k / RATE:.2f}", *(f"{value:.9g}" for value in row)])
+        text = csv_table(["t", *self.robot.loaded.log_format().q], rows)
+        event.client.send_file_download("commands.csv", text.encode())
+
+    def _expected(self) -> float:
+        """Return the error to expect of the robot here [m], 0 if it is not known."""
+        expected = self.robot.loaded.expected_errors(self.robot.q[None])
+        for errors in expected.values():
+            return float(errors[0])
+        return 0.0
+
+    def _run(self) -> None:
+        try:
+            self._tick_until_closed()
+        except Exception as error:
+            self._failure = error
+            self._words.content = f"**The view has stopped: {markdown(error)}**"
+
+    def _tick_until_closed(self) -> None:
+        """Tick while something moves, else wait."""
+        due = time.perf_counter()
+        while not self._closed:
+            motion = self._motion
+            going = motion is not None and motion()
+            if motion is not None and not going and self._motion is motion:
+                self._motion = None
+            moves = self.robot.tick()
+            if moves or going:
+                self._show()
+            else:
+                self._say()
+                self._wake.wait()
+                self._wake.clear()
+                due = time.perf_counter()
+            due += 1.0 / RATE
+            now = time.perf_counter()
+            late = max(now - due, 0.0)
+            rate = 1.0 / (1.0 / RATE + late)
+            self.ticks_per_second += 0.1 * (rate - self.ticks_per_second)
+            if late > 0.0:
+                due = now
+            else:
+                time.sleep(due - now)
+
+    def _show(self) -> None:
+        """Draw the robot as it is."""
+        robot = self.robot
+        with self._server.atomic():
+            self._body.move(robot)
+            for ghost in self._ghosts:
+                ghost.move(robot)
+            if self._radius.visible:
+                self._radius.position = robot.x
+                self._radius.scale = self._expected()
+            if not np.array_equal(self._aim.position, robot.target):
+                self._aim.position = robot.target
+        if time.perf_counter() - self._last_words > _PAUSE:
+            self._say()
+
+    def _say(self) -> None:
+        """Write words and sliders, a few times a second."""
+        self._last_words = time.perf_counter()
+        robot = self.robot
+        situation = robot.situation
+        color = ORANGE
+        if situation.out_of_reach:
+            color = RED
+        elif situation.reached and situation.in_domain:
+            color = GREEN
+        if tuple(self._ball.color) != color:
+            self._ball.color = color
+        names = map(markdown, robot.loaded.log_format().q)
+        at_limits = itertools.compress(names, robot.held)
+        lines = [f"**{situation.words}**"]
+        if np.isfinite(situation.error):
+            lines.append(f"error {1e3 * situation.error:.2f} mm")
+        lines.append("at limits: " + (", ".join(at_limits) or "none"))
+        lines.append(f"{self.ticks_per_second:.0f} ticks/s")
+        motion = self._motion
+        if motion is not None:
+            lines.append(f"moving: {markdown(motion.label)}")
+        self._words.content = "<br>".join(lines)
+        for slider, value in zip(self._sliders, robot.q / self._factor, strict=True):
+            if abs(slider.value - value) > 0.5 * slider.step:
+                slider.value = float(np.clip(value, slider.min, slider.max))
+
+
+def _other_models(loaded: LoadedModel) -> dict[str, Chain]:
+    """Return the mechanical models behind a model, by name."""
+    models = {}
+    if loaded.description is not None and loaded.description.chain is not None:
+        models["nominal model"] = loaded.description.chain
+    if loaded.hybrid is not None and loaded.chain is not None:
+        models["calibrated model"] = loaded.chain
+    return {name: chain for name, chain in models.items() if chain is not loaded.model}

@@ -1,0 +1,97 @@
+"""From a log to a model, a report and a track: the functions behind the command line."""
+
+from typing import TYPE_CHECKING
+
+from hybridkin._core.first_use import on_first_use
+from hybridkin.app.workflow.description import Description, describe
+from hybridkin.app.workflow.log import LogError, MeasuredLog, read_log
+from hybridkin.app.workflow.model import LOG_SUFFIXES, LoadedModel, is_log, open_model
+from hybridkin.app.workflow.report import Report
+
+if TYPE_CHECKING:
+    from hybridkin.app.workflow.compare import FitSettings
+    from hybridkin.app.workflow.counts import Counts
+    from hybridkin.app.workflow.delay import Delay, estimated_delay
+    from hybridkin.app.workflow.domain import PathLimits, path_limits
+    from hybridkin.app.workflow.evaluate import Evaluation, evaluate_log
+    from hybridkin.app.workflow.export import export_model
+    from hybridkin.app.workflow.film import animate_track
+    from hybridkin.app.workflow.fit import fit_log
+    from hybridkin.app.workflow.fit_record import FitRecord
+    from hybridkin.app.workflow.merge import merge_files
+    from hybridkin.app.workflow.path import scaled_path, shape_path
+    from hybridkin.app.workflow.planning import next_rows
+    from hybridkin.app.workflow.track import TrackRecord, track_path
+    from hybridkin.app.workflow.verify import Verification, read_tips, verify_track
+
+__all__ = [
+    "LOG_SUFFIXES",
+    "Counts",
+    "Delay",
+    "Description",
+    "Evaluation",
+    "FitRecord",
+    "FitSettings",
+    "LoadedModel",
+    "LogError",
+    "MeasuredLog",
+    "PathLimits",
+    "Report",
+    "TrackRecord",
+    "Verification",
+    "animate_track",
+    "describe",
+    "estimated_delay",
+    "evaluate_log",
+    "export_model",
+    "fit_log",
+    "is_log",
+    "merge_files",
+    "next_rows",
+    "open_model",
+    "path_limits",
+    "read_log",
+    "read_tips",
+    "scaled_path",
+    "shape_path",
+    "track_path",
+    "verify_track",
+]
+
+# A description of a robot needs no fit and no inverse kinematics.
+_NAMES_OF = {
+    "compare": ("FitSettings",),
+    "counts": ("Counts",),
+    "delay": (
+        "Delay",
+        "estimated_delay",
+    ),
+    "domain": (
+        "PathLimits",
+        "path_limits",
+    ),
+    "evaluate": (
+        "Evaluation",
+        "evaluate_log",
+    ),
+    "export": ("export_model",),
+    "film": ("animate_track",),
+    "fit": ("fit_log",),
+    "fit_record": ("FitRecord",),
+    "merge": ("merge_files",),
+    "path": (
+        "scaled_path",
+        "shape_path",
+    ),
+    "planning": ("next_rows",),
+    "track": (
+        "TrackRecord",
+        "track_path",
+    ),
+    "verify": (
+        "Verification",
+        "read_tips",
+        "verify_track",
+    ),
+}
+__getattr__ = on_first_use(__name__, _NAMES_OF)

@@ -1,0 +1,301 @@
+"""Limits of a track, and commands in the domain of a model, one of which is its posture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from hybridkin._core.arrays import as_array, real_array
+from hybridkin.app.workflow.model import LoadedModel
+from hybridkin.chains import robots
+from hybridkin.chains.arc_chain import ArcChain
+from hybridkin.chains.constant_curvature import ConstantCurvatureChain
+from hybridkin.ik.solver import InverseKinematics
+
+_WALKERS = 256
+_STEPS = 60
+_STEP = 0.12  # length of a step, as a share of the range
+_PLANAR = 1e-9  # relative cut-off of singular values, for tendons in one plane
+_NAMES = ("q_min", "q_max", "dq_max", "ddq_max")
+
+
+@dataclass(frozen=True, eq=False)
+class PathLimits:
+    """The limits of a track.
+
+    Attributes
+    ----------
+    q_min, q_max : ndarray of shape (n,)
+        Least and largest value of every actuator [m]; with backlash, of the actuators' motion.
+    dq_max, ddq_max : ndarray of shape (n,) or None
+        Largest speed [m/s] and acceleration [m/s^2].
+    source : str
+        Source of `q_min` and `q_max`, in words.
+    """
+
+    q_min: NDArray
+    q_max: NDArray
+    source: str
+    dq_max: NDArray | None = None
+    ddq_max: NDArray | None = None
+
+    @property
+    def span(self) -> NDArray:
+        """The width of the range of every actuator (n,)."""
+        return self.q_max - self.q_min
+
+
+def path_limits(
+    loaded: LoadedModel,
+    q_min: ArrayLike | None = None,
+    q_max: ArrayLike | None = None,
+    dq_max: ArrayLike | None = None,
+    ddq_max: ArrayLike | None = None,
+    *,
+    within_fit: bool = True,
+) -> PathLimits:
+    """Return the limits of the actuators: given ones, else those of the robot description.
+
+    By default they do not exceed the training range of the model.
+
+    Parameters
+    ----------
+    loaded : LoadedModel
+        The model, as from `open_model`.
+    q_min, q_max, dq_max, ddq_max : float or array-like of shape (n,), optional
+        Limits of the commands [m], of their speed [m/s] and acceleration [m/s^2].
+    within_fit : bool, default=True
+        Whether to stay within the training range if the description gives limits.
+
+    Returns
+    -------
+    PathLimits
+        With backlash, commands exceed these limits by half its width.
+
+    Raises
+    ------
+    ValueError
+        If the range of the actuators is not known.
+    """
+    n = loaded.n_actuators
+    overrides: dict[str, NDArray] = {}
+    for name, value in zip(_NAMES, (q_min, q_max, dq_max, ddq_max), strict=True):
+        if value is not None:
+            limit = real_array(value, name).astype(float)
+            if limit.shape not in ((), (1,), (n,)):
+                raise ValueError(
+                    f"`{name}` must be one number or {n}, got {limit.size}."
+                )
+            overrides[name] = limit
+    described = robots.Limits()
+    if loaded.description is not None:
+        described = loaded.description.limits
+    trained = robots.Limits()
+    if within_fit or not _has_ends(described):
+        trained = loaded.trained_range or trained
+    limits = dict(vars(described.narrowed(loaded.half_play).intersect(trained)))
+    given = vars(robots.Limits(**overrides).narrowed(loaded.half_play))
+    for name in overrides:
+        limit = given[name]
+        # Of one given end, scaled to actuators of both signs, some entries are open.
+        if name in ("q_min", "q_max") and limits[name] is not None:
+            limit = np.where(np.isfinite(limit), limit, limits[name])
+        limits[name] = limit
+    values = {}
+    for name, value in limits.items():
+        if value is not None:
+            values[name] = np.broadcast_to(value, n).astype(float)
+    if not _has_ends(robots.Limits(**values)):
+        raise ValueError(
+            "`q_min` and `q_max` must be given (--q-min, --q-max), or written as [limits] in the "
+            "robot description, because this model has no training range."
+        )
+    if (values["q_min"] > values["q_max"]).any():
+        raise ValueError(
+            "`q_min` must not exceed `q_max`, including half the backlash and the training range, "
+            f"got {values['q_min']} and {values['q_max']} m; check their unit and sign."
+        )
+    sources = []
+    if described.q_min is not None:
+        sources.append("robot description")
+    if trained.q_min is not None:
+        sources.append("training range")
+    source = ", within the ".join(sources)
+    if "q_min" in overrides and "q_max" in overrides:
+        source = "given"
+    elif "q_min" in overrides or "q_max" in overrides:
+        source = f"given and {source}"
+    return PathLimits(**values, source=source)
+
+
+def _has_ends(limits: robots.Limits) -> bool:
+    """Return whether every actuator has a finite range."""
+    if limits.q_min is None or limits.q_max is None:
+        return False
+    return bool(np.isfinite(limits.q_min).all() and np.isfinite(limits.q_max).all())
+
+
+@dataclass(frozen=True, eq=False)
+class Domain:
+    """The commands that a track may use: within limits, and in the domain of the model."""
+
+    loaded: LoadedModel
+    limits: PathLimits
+
+    @cached_property
+    def preferred(self) -> NDArray:
+        """A configuration (n,) in the domain of the model, within the limits.
+
+        It is the first of these that lies in the domain: the median of the training rows, actuator
+        by actuator, the middle of the training range, no tendon pulled, the training row nearest to
+        the middle. For a model without a fit it is no tendon pulled, or for other robots the middle
+        of the limits.
+        """
+        trained = self.loaded.trained_range
+        limits = self.limits
+        spanned = trained or limits
+        middle = 0.5 * (np.asarray(spanned.q_min) + np.asarray(spanned.q_max))
+        middle = self._bent(middle)
+        candidates = [middle]
+        if self.tendons is not None:
+            candidates.append(self.rest)
+            if trained is None:
+                candidates.reverse()
+        hybrid = self.loaded.hybrid
+        if hybrid is not None and hybrid.fitted_module_.tested is not None:
+            tested = hybrid.fitted_module_.tested
+            rows = as_array(tested.rows) - hybrid.change_.shift
+            far = np.linalg.norm(rows - middle, axis=1)
+            median = self._bent(np.median(rows, axis=0))
+            candidates = [median, *candidates, rows[far.argmin()]]
+        q = np.clip(candidates, limits.q_min, limits.q_max)
+        distance = self.loaded.domain_distance(q)
+        return q[np.maximum(distance, 1.0).argmin()]  # the first of those in the domain
+
+    def _bent(self, q: NDArray) -> NDArray:
+        """Return a configuration (n,) without a common pull of the tendons."""
+        return self.rest + (q - self.rest) @ self.bending
+
+    @property
+    def tendons(self) -> ArcChain | None:
+        """The chain if all its actuators are tendons of given lengths, else None."""
+        chain = self.loaded.chain
+        if isinstance(chain, ArcChain) and chain.takes_lengths:
+            return None if any(chain.extensible) else chain
+        return None
+
+    @property
+    def rest(self) -> NDArray:
+        """The command (n,) at which no tendon is pulled; for other robots zero."""
+        chain = self.tendons
+        if chain is None:
+            return np.zeros(self.loaded.n_actuators)
+        return as_array(chain.rest.detach())
+
+    @cached_property
+    def sample(self) -> tuple[NDArray, NDArray]:
+        """Commands (K, n) from the whole domain, and their tips (K, 3) [m].
+
+        The first is near the preferred one.
+
+        They are the ends of random walks from the preferred configuration that stay in the domain,
+        because with many actuators most of the training range lies outside the domain. On a plain
+        tendon chain no tendon pulls against another. Without a learned part the limits are sampled.
+        """
+        rng = np.random.default_rng(0)
+        low = self.limits.q_min
+        high = self.limits.q_max
+        span = self.limits.span
+        q = rng.uniform(low, high, (_WALKERS, len(low)))
+        if self.loaded.hybrid is not None:
+            q[:] = self.preferred
+            for _ in range(_STEPS):
+                step = _STEP * span * rng.standard_normal(q.shape)
+                ahead = q + step @ self.bending
+                inside = self.loaded.domain_distance(ahead) <= 1.0
+                inside &= ((ahead >= low) & (ahead <= high)).all(axis=1)
+                q[inside] = ahead[inside]
+            # Near the preferred one, because that may be exactly straight.
+            near = 0.01 * span * rng.standard_normal(len(low))
+            q[0] = self.preferred + near @ self.bending
+        tips = self.loaded.tips(q)
+        finite = np.isfinite(tips).all(axis=1)
+        return q[finite], tips[finite]
+
+    def nearest(self, x: NDArray) -> NDArray:
+        """Return the commands (..., n) of the `sample` whose tips are nearest to x (..., 3)."""
+        commands, tips = self.sample
+        far = np.linalg.norm(tips - x[..., None, :], axis=-1)
+        return commands[far.argmin(axis=-1)]
+
+    def solver(self, dt: float = 0.01) -> InverseKinematics:
+        """Return inverse kinematics within the limits, with `preferred` as its posture.
+
+        With hysteresis the limits of q are those of the commands.
+        """
+        limits = self.limits
+        q_min, q_max = self.of_commands
+        return InverseKinematics(
+            self.loaded.model,
+            q_min=q_min,
+            q_max=q_max,
+            dq_max=limits.dq_max,
+            ddq_max=limits.ddq_max,
+            q_pref=self.preferred,
+            dt=dt,
+        )
+
+    @property
+    def of_commands(self) -> tuple[NDArray, NDArray]:
+        """Limits of commands, which lead what the actuators do by up to half the width."""
+        half = self.loaded.half_play
+        return self.limits.q_min - half, self.limits.q_max + half
+
+    def postures(self, n: int) -> NDArray:
+        """Return at most n commands from the whole range of the limits; tendons are balanced.
+
+        The tendons of a segment do not pull against each other. If a balanced command exceeds an
+        upper limit, all tendons of the segment are pulled until the slackest is at its limit.
+        """
+        low = self.limits.q_min
+        high = self.limits.q_max
+        q = np.random.default_rng(0).uniform(low, high, (n, len(low)))
+        chain = self.tendons
+        if chain is None:
+            return q
+        rest = self.rest
+        gains = as_array(chain.gains.detach())  # balanced in metres
+        low, high = np.sort([gains * (low - rest), gains * (high - rest)], axis=0)
+        pulled = gains * (q - rest)
+        angles = as_array(chain.angles.detach())
+        first = 0
+        for count in chain.actuators_per_segment:
+            ring = slice(first, first + count)
+            first += count
+            axes = np.stack([np.cos(angles[ring]), np.sin(angles[ring])], axis=1)
+            balanced = pulled[:, ring] @ axes @ np.linalg.pinv(axes, rcond=_PLANAR)
+            excess = (balanced - high[ring]).max(axis=1, keepdims=True)
+            pulled[:, ring] = balanced - excess.clip(min=0.0)
+        within = ((pulled >= low) & (pulled <= high)).all(axis=1)
+        return rest + pulled[within] / gains
+
+    @cached_property
+    def bending(self) -> NDArray:
+        """The projector (n, n) of rows q on those that bend a plain tendon chain, else identity.
+
+        The bendings of such a chain are linear in q and do not depend on the common pull of its
+        tendons, which is one in metres.
+        """
+        chain = self.loaded.chain
+        if not isinstance(chain, ConstantCurvatureChain) or any(chain.extensible):
+            return np.eye(self.loaded.n_actuators)
+        zero = torch.from_numpy(np.zeros(chain.n_actuators))
+        slopes = torch.func.jacrev(lambda row: chain.arcs(row)[1].ravel())(zero)
+        gains = as_array(chain.gains.detach())
+        slopes = as_array(slopes) / gains
+        of_metres = np.linalg.pinv(slopes, rcond=_PLANAR) @ slopes
+        return gains[:, None] * of_metres / gains

@@ -1,0 +1,100 @@
+"""A model in C, for MATLAB or as a functional mock-up unit, with a step if requested."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from hybridkin._core.arrays import one_of
+from hybridkin.app.workflow.domain import Domain, PathLimits, path_limits
+from hybridkin.app.workflow.model import LoadedModel
+from hybridkin.app.workflow.report import Report
+from hybridkin.native.export import export_c
+from hybridkin.native.fmu import export_fmu
+from hybridkin.native.mex import export_mex
+
+_TITLES = {
+    "c": "C code",
+    "fmu": "Functional mock-up unit",
+    "mex": "MATLAB and Octave",
+}
+
+
+def export_model(
+    loaded: LoadedModel,
+    out: str | Path,
+    *,
+    kind: str = "c",
+    name: str = "model",
+    dtype: str = "float64",
+    dt: float | None = None,
+    limits: PathLimits | None = None,
+    force: bool = False,
+) -> Report[dict[str, object]]:
+    """Write a model as C code, see `native.export_c`.
+
+    Parameters
+    ----------
+    loaded : LoadedModel
+        The model, as from `open_model`.
+    out : str or Path
+        Folder to write into; of a functional mock-up unit the file.
+    kind : {"c", "fmu", "mex"}, default="c"
+        C code, a functional mock-up unit, or C code for MATLAB and Octave.
+    name : str, default="model"
+        Name of the files and functions.
+    dtype : {"float64", "float32"}, default="float64"
+        Number type of C code.
+    dt : float, optional
+        Control period [s]. If given, a step of inverse kinematics is written, too; it prefers a
+        configuration in the domain of the model. Default: the model alone.
+    limits : PathLimits, optional
+        Limits of the step. Default: `path_limits`.
+    force : bool, default=False
+        Replace files that `export` did not write.
+
+    Returns
+    -------
+    Report of dict
+        Number type "dtype", control period "dt" [s] and "limits" of the step.
+    """
+    one_of(kind, "kind", _TITLES)
+    if kind != "c" and dtype != "float64":
+        raise ValueError('`dtype` must be "float64" here; "float32" is for C code.')
+    record: dict[str, object] = {"dtype": dtype, "dt": dt}
+    report = Report(_TITLES[kind], record)
+    report.text(f"{name}: {loaded.n_actuators} actuators, {dtype}.")
+    model = loaded.module
+    if dt is not None:
+        limits = limits or path_limits(loaded)
+        model = Domain(loaded, limits).solver(dt=dt)
+        record["limits"] = limits
+        report.text(f"Steps of {dt:g} s within limits: {limits.source}.")
+    about_q = _about_q(loaded)
+    report.text("{about_q}", about_q=about_q)
+    words = {"name": name, "about_q": about_q}
+    if kind == "fmu":
+        report.paths = [export_fmu(model, out, **words, force=force)]
+    elif kind == "mex":
+        report.paths = export_mex(model, out, **words, force=force)
+    else:
+        report.paths = export_c(model, out, dtype=dtype, **words, force=force)
+    return report
+
+
+def _about_q(loaded: LoadedModel) -> str:
+    """Return unit, sign and hysteresis of q in sentences, as a controller must know them."""
+    log = loaded.log_format()
+    factors = np.broadcast_to(log.q_factor, len(log.q))
+    terms = []
+    for i, name in enumerate(log.q):
+        terms.append(f"q[{i}] = {factors[i]:g} * {name}")
+    unit = "" if log.q_unit == "1" else f" in {log.q_unit}"
+    about_q = f"q from the columns of the log{unit}: {', '.join(terms)}."
+    if loaded.play is None:
+        return about_q
+    return (
+        f"{about_q} The actuators have {loaded.play.in_words(loaded.log_unit)}: x(q) is that of "
+        "what the actuators do; steps return commands for it."
+    )

@@ -1,0 +1,91 @@
+"""A film or an interactive page of a robot that follows a file of commands."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import hybridkin
+from hybridkin._core.commands import Commands
+from hybridkin._core.files import check_outputs
+from hybridkin.app.workflow.model import LoadedModel
+from hybridkin.app.workflow.report import Progress, Report, quiet
+from hybridkin.app.workflow.track import LEAD_IN, TARGET, read_track
+from hybridkin.chains.arc_chain import ArcChain
+
+
+def animate_track(
+    loaded: LoadedModel,
+    path: str | Path,
+    out: str | Path,
+    *,
+    unit: str = "cm",
+    speed: float = 1.0,
+    n_frames: int = 150,
+    force: bool = False,
+    progress: Progress = quiet,
+) -> Report[dict[str, object]]:
+    """Write a film or an interactive page of a robot that follows a file of commands.
+
+    Parameters
+    ----------
+    loaded : LoadedModel
+        A model with a chain as its mechanical model.
+    path : str or Path
+        ``track.csv`` of `track_path`, its folder, or any log of commands in the robot's format. The
+        film begins where the path begins, after the lead-in.
+    out : str or Path
+        File that ends in ".mp4", ".gif" or ".html".
+    unit : {"m", "cm", "mm"}, default="cm"
+        Unit of the axes.
+    speed : float, default=1.0
+        Speed of the film relative to the motion.
+    n_frames : int, default=150
+        Largest number of frames.
+    force : bool, default=False
+        Replace a file that `animate` did not write.
+    progress : callable, optional
+        Called with (what, done, total).
+
+    Returns
+    -------
+    Report of dict
+        Number of "frames" and "bytes", frames per second "fps".
+    """
+    if loaded.chain is None:
+        raise ValueError(
+            f"`model` {loaded.path} has no body to draw; give a model with a chain as its "
+            "mechanical model."
+        )
+    out = Path(out)
+    check_outputs([out], "animate", force=force)
+    log = read_track(path, loaded.log_format())
+    q = loaded.effective(Commands(log.q, time=log.time))
+    if log.groups is not None:  # the way to the path is no part of it
+        on_path = log.groups != LEAD_IN
+        log = log.rows(on_path)
+        q = q[on_path]
+    promised = loaded.promised_errors(q)
+    film = hybridkin.plots.TrackAnimation.from_estimator(
+        loaded.chain,
+        q,
+        target=log.x if tuple(log.x_names) == TARGET else None,
+        t=log.time,
+        tips=loaded.tips(q),
+        expected=None if promised is None else promised.mean,
+        names=loaded.log_format().q if isinstance(loaded.chain, ArcChain) else (),
+        n_frames=n_frames,
+    )
+    try:
+        film.save(
+            out, unit=unit, speed=speed, progress=partial(progress, "drawing frames")
+        )
+    except RuntimeError as error:  # no program to write films with
+        raise ValueError(str(error)) from error
+    fps = speed * film.fps
+    size = out.stat().st_size
+    record = {"frames": len(film.rows), "fps": fps, "bytes": size}
+    report = Report(f"{loaded.name}: film of {path}", record)
+    report.text(f"{len(film.rows)} frames, {fps:.3g} a second, {size / 1e6:.2f} MB")
+    report.paths = [out]
+    return report

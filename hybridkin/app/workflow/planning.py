@@ -1,0 +1,126 @@
+"""The configurations to measure next, as a file of commands for the robot."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from hybridkin._core.arrays import whole
+from hybridkin._core.units import METRES
+from hybridkin.app.workflow.domain import Domain, PathLimits, path_limits
+from hybridkin.app.workflow.log import MeasuredLog
+from hybridkin.app.workflow.model import LoadedModel
+from hybridkin.app.workflow.report import (
+    Progress,
+    Report,
+    check_out,
+    millimetres,
+    quiet,
+)
+from hybridkin.app.workflow.track import Attempts, best_track
+from hybridkin.calibration.measured import distance
+from hybridkin.hybrid.choose_rows import choose_rows
+from hybridkin.ik.trajectories import Trajectory
+
+_POOL = 2000  # number of configurations to choose from
+_SHOWN = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)  # rows of the table
+_TOL = 1e-3  # tolerance of the inverse kinematics along a path [m]
+
+
+def next_rows(
+    loaded: LoadedModel,
+    out: str | Path,
+    *,
+    n: int = 50,
+    limits: PathLimits | None = None,
+    measured: MeasuredLog | None = None,
+    path: Trajectory | None = None,
+    force: bool = False,
+    progress: Progress = quiet,
+) -> Report[dict[str, object]]:
+    """Choose the configurations to measure next, see `choose_rows`, and write them.
+
+    ``next.csv`` has one row per configuration, in the order of the choice: commands in the units,
+    names and sign of the robot's logs, and the expected error after this row. Commands lie within
+    the limits, and tendons of a segment do not pull against each other. With backlash, send the
+    commands in this order.
+
+    Parameters
+    ----------
+    loaded : LoadedModel
+        The model, as from `open_model`.
+    out : str or Path
+        Folder to write into.
+    n : int, default=50
+        Number of configurations.
+    limits : PathLimits, optional
+        As from `path_limits`. Default: those of the description, else the training range.
+    measured : MeasuredLog, optional
+        Rows that are already measured.
+    path : Trajectory, optional
+        Path along which the error must be small [m]; its configurations are candidates, too.
+        Default: everywhere within the limits.
+    force : bool, default=False
+        Replace files of `out` that `next` did not write.
+    progress : callable, optional
+        Called with (what, done, total).
+
+    Returns
+    -------
+    Report of dict
+        "expected_errors" (n,) [m] after each configuration, the "limits", "n_measured" rows, and
+        "where" the error must be small, in words.
+
+    Raises
+    ------
+    ValueError
+        If the range of the actuators is not known, or fewer than `n` balanced configurations lie
+        within it.
+    """
+    check_out(out, "next", ["next.csv"], force=force)
+    n = whole(n, "n")
+    if limits is None:
+        limits = path_limits(loaded, within_fit=False)
+    domain = Domain(loaded, limits)
+    candidates = domain.postures(_POOL)
+    target = None
+    where = "within the limits"
+    if path is not None:
+        target = best_track(domain, path, _TOL, Attempts(progress)).effective
+        candidates = np.concatenate([target, candidates])
+        far = distance(loaded.tips(target), path.x).max()
+        where = f"along the path, which the model reaches to within {millimetres(far)}"
+    measured_q = None
+    if measured is not None:
+        measured_q = loaded.effective(measured.commands)
+    progress("choosing configurations", 0, 1)
+    rows, errors = choose_rows(
+        loaded.model, candidates, n, measured=measured_q, target=target
+    )
+    n_measured = 0 if measured is None else len(measured.q)
+    record = {
+        "command": "next",
+        "model": loaded.path,
+        "n_measured": n_measured,
+        "where": where,
+        "limits": limits,
+        "expected_errors": errors,
+    }
+    report = Report(f"{loaded.name}: {n} configurations to measure next", record)
+    shown = sorted({k for k in _SHOWN if k < n} | {n})
+    table = [[str(k), f"{1e3 * errors[k - 1]:.2f}"] for k in shown]
+    report.table(["rows", "expected error [mm]"], table)
+    report.text(
+        f"Expected error {where}, computed without measured tips. It shows when more rows bring "
+        f"little, not how large the error will be. {n_measured} rows are already measured. "
+        f"Limits: {limits.source}."
+    )
+    log = loaded.log_format()
+    sent = log.to_log(loaded.commands(candidates[rows]))
+    numbers = np.column_stack([sent, errors / METRES[log.x_unit]])
+    report.table_file(
+        "next.csv", [*log.q, "expected_error"], np.char.mod("%.9g", numbers)
+    )
+    report.write(out)
+    return report

@@ -1,0 +1,675 @@
+"""The commands that follow a path with a model, as a file to send to the robot."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+import hybridkin
+from hybridkin._core.text_rows import TextFile
+from hybridkin._core.units import METRES, duration_in_words
+from hybridkin.app.workflow.counts import Counts
+from hybridkin.app.workflow.domain import Domain, PathLimits, path_limits
+from hybridkin.app.workflow.errors import Errors
+from hybridkin.app.workflow.model import LoadedModel
+from hybridkin.app.workflow.reach import better_place, check_reach
+from hybridkin.app.workflow.report import (
+    Progress,
+    Report,
+    check_out,
+    millimetres,
+    percent,
+    quiet,
+)
+from hybridkin.chains.arc_chain import ArcChain
+from hybridkin.chains.robots import LogFormat
+from hybridkin.datasets import Log, load_log, log_columns
+from hybridkin.ik import trajectories
+from hybridkin.ik.results import IKStatus, Track, score, statuses
+from hybridkin.ik.trajectories import Trajectory
+
+TARGET = ("target_x", "target_y", "target_z")
+TIME = "t"
+_REACHED = (IKStatus.CONVERGED, IKStatus.OUT_OF_DOMAIN)
+LEAD_IN = "LEAD_IN"  # status of the rows before the path
+_STEP = 0.002  # largest tip step between two solutions, relative to the extent of the workspace
+_PEAK = 1.875  # largest speed of `min_jerk`
+_PUSH = 10.0 / math.sqrt(3.0)  # its largest acceleration
+_MOST_OUTSIDE = 0.05  # share of the points outside the domain that is not worth a word
+_SLOW = 0.1  # share of the range per second, without known limits
+_DT = 0.02  # period of a path of one point [s]
+_FINER = (1, 4)  # times as many steps, in each attempt
+_SHOWN = 100  # times that a track reports its progress
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TrackRecord:
+    """What `track_path` found.
+
+    Attributes
+    ----------
+    command, model : str
+        "track", and the file of the model.
+    n : int
+        Number of points of the path.
+    reached, missed : int
+        Number of points that are reached within `tol`, and of the others.
+    missed_by : float
+        Largest error of the solver at a missed point [m], 0 if none is missed.
+    errors : Errors
+        Errors of the solver at all points [m].
+    statuses : dict of str to int
+        How many points have each status.
+    in_domain : float or None
+        Share of the points in the domain of the model, None without a learned part.
+    expected : dict of str to float
+        "mean" and "p95" of the errors to expect of the robot at all points [m], also at those that
+        are missed or outside the domain; empty if not known.
+    expected_inside : dict of str to float
+        The same at the points that are reached in the domain.
+    rounded : dict of str to float or None
+        "before" and "after": mean error of the solver before and after commands were rounded [m].
+    backend : str
+        What computed the steps: "compiled", or "torch: " and the reason.
+    play : list of float or None
+        Widths of the hysteresis of one or all actuators, in the unit of the robot's logs.
+    lead_in : int
+        Number of rows that lead from the robot's configuration to the path.
+    limits : PathLimits
+        The limits that were kept.
+    delay : float
+        How much later than its command a tip will be read [s], for `verify_track`.
+    period : float
+        Time from row to row that the commands are computed for [s].
+    """
+
+    command: str = "track"
+    model: str
+    n: int
+    reached: int
+    missed: int
+    missed_by: float
+    errors: Errors
+    statuses: dict[str, int]
+    in_domain: float | None
+    expected: Mapping[str, float]
+    expected_inside: Mapping[str, float]
+    rounded: Mapping[str, float] | None
+    backend: str
+    play: list[float] | None
+    lead_in: int
+    limits: PathLimits
+    delay: float = 0.0
+    period: float = _DT
+
+
+def _write(report: Report[TrackRecord], loaded: LoadedModel, better: str) -> None:
+    """Add the record to a report, in words; `better` says where the path would lie better."""
+    record = report.record
+    errors = record.errors
+    report.text(
+        f"In the model, {record.reached} of {record.n} points are reached. Error of the solver: "
+        f"mean {millimetres(errors.mean)}, 95 % quantile {millimetres(errors.p95)}, max "
+        f"{millimetres(errors.max)}. Limits: {record.limits.source}. Backend: {{backend}}.",
+        backend=record.backend,
+    )
+    rows = [[status, str(count)] for status, count in record.statuses.items()]
+    report.table(["status", "points"], rows)
+    log = loaded.log_format()
+    sign = ", shortening positive" if np.all(np.less(log.q_sign, 0)) else ""
+    report.text(
+        f"track.csv: q in {{unit}}{sign}; x, target and error in {log.x_unit}; t in s. Its first "
+        f"{record.lead_in} rows, with the status LEAD_IN, move from the start of the robot to the "
+        "path.",
+        unit=log.q_unit,
+    )
+    report.text(
+        f"Period: {duration_in_words(record.period)} from row to row. Send the commands at these "
+        "times: lag and creep are those of this pace."
+    )
+    if loaded.play is not None:
+        report.text(
+            f"The actuators have {loaded.play.in_words(loaded.log_unit)}: a command crosses the "
+            "width when its actuator reverses, and leads where they creep. Send q; effective_... "
+            "is the motion of the actuators."
+        )
+    if loaded.plane_in_words():
+        report.text("{plane}", plane=loaded.plane_in_words())
+    report.text(*_about_counts(record, Counts.read(loaded.training)))
+    report.text(_outcome(record, better))
+
+
+def _about_counts(record: TrackRecord, counts: Counts | None) -> list[str]:
+    """Return what rounding costs, or that it is possible."""
+    if record.rounded is not None:
+        before = millimetres(record.rounded["before"])
+        after = millimetres(record.rounded["after"])
+        return [
+            f"Commands are rounded to whole steps of the actuators. Mean error of the solver: "
+            f"{before} before, {after} after."
+        ]
+    if counts is not None and counts.whole.all():
+        return [
+            "The columns of the log hold whole numbers; these commands are not rounded: --round."
+        ]
+    return []
+
+
+def _outcome(record: TrackRecord, better: str) -> str:
+    """Return what is reached and missed, and the error to expect of the robot."""
+    words = f"Reached: {record.reached} of {record.n} points"
+    if record.missed:
+        by = millimetres(record.missed_by, ".2g")
+        words += f"; missed: {record.missed}, by up to {by}"
+    if not record.expected:
+        unknown = (
+            "The error of the robot is not known: the model has no held-out errors"
+        )
+        return f"{words}. {unknown}{better}."
+    mean = millimetres(record.expected["mean"], ".2g")
+    p95 = millimetres(record.expected["p95"], ".2g")
+    words += f". Expect {mean} (95 % below {p95}) of the robot"
+    if record.in_domain == 1.0 and not record.missed:
+        return f"{words} inside the log."
+    words += " over all points"
+    if record.expected_inside:
+        inside = millimetres(record.expected_inside["mean"], ".2g")
+        words += f", {inside} at those reached inside the log"
+    if record.in_domain is not None and record.in_domain < 1.0:
+        outside = percent(1.0 - record.in_domain)
+        words += f"; {outside} of the path is outside, where errors can be larger"
+    return f"{words}{better}."
+
+
+def track_path(
+    loaded: LoadedModel,
+    path: Trajectory,
+    out: str | Path,
+    *,
+    limits: PathLimits | None = None,
+    start: ArrayLike | str = "rest",
+    tol: float = 1e-4,
+    delay: float = 0.0,
+    counts: Counts | None = None,
+    out_of_reach: bool = False,
+    force: bool = False,
+    progress: Progress = quiet,
+) -> Report[TrackRecord]:
+    """Compute the commands that move the tip along a path, write them and return a report.
+
+    ``track.csv`` has one row per point in the units, names and sign of the robot's logs: time,
+    commands, the model's tip, the target, the error and its status. Figures and a report are
+    written beside it. Points far apart are connected by several steps on a straight line. If points
+    are not reached, another start and smaller steps are tried, and the track that reaches most
+    points in the domain is kept. Errors and statuses are those of the commands in the file, which
+    are all that the robot gets. Rows with the status LEAD_IN move from `start` to the path, below
+    ``dq_max`` (default: a tenth of the largest range per second) and ``ddq_max``. With backlash,
+    columns ``effective_NAME`` hold the motion of the actuators, half its width from the commands.
+
+    Parameters
+    ----------
+    loaded : LoadedModel
+        The model, as from `open_model`.
+    path : Trajectory
+        Points [m] and times [s].
+    out : str or Path
+        Folder to write into.
+    limits : PathLimits, optional
+        As from `path_limits`, which is also the default.
+    start : array-like of shape (n,), "rest" or "path", default="rest"
+        Configuration of the robot before the path [m]. "rest": no tendon pulled; for robots without
+        tendons zero, or the middle of the range if zero lies outside the limits. "path": the first
+        command of the path, without a lead-in.
+    tol : float, default=1e-4
+        As for `InverseKinematics.track` [m].
+    delay : float, default=0.0
+        How much later than its command a tip will be read [s]. It is noted for `verify_track`; the
+        commands do not depend on it.
+    counts : Counts, optional
+        Whole numbers to which commands are rounded. Default: not rounded. A step can then exceed
+        ``dq_max`` by one number.
+    out_of_reach : bool, default=False
+        If points of the path are out of reach, track them as closely as possible.
+    force : bool, default=False
+        Replace files of `out` that `track` did not write.
+    progress : callable, optional
+        Called with (what, done, total).
+
+    Returns
+    -------
+    Report of TrackRecord
+        What is reached within which limits, and what to expect of the robot.
+
+    Raises
+    ------
+    ValueError
+        If more than a tenth of the checked points of the path are out of reach; the message gives
+        the largest scale in reach.
+    """
+    check_out(out, "track", ["track.csv", "track.png", "commands.png"], force=force)
+    domain = Domain(loaded, limits or path_limits(loaded))
+    stands = _start(domain, start)
+    check_reach(domain, path, tol, out_of_reach, progress)
+    attempts = Attempts(progress)
+    if loaded.play is None or stands is None:
+        track = best_track(domain, path, tol, attempts)
+        lead_in = _lead_in(track, stands, domain)
+    else:
+        # The state of the hysteresis after the lead-in decides the commands of the path.
+        first = best_track(domain, path, tol, attempts, finest=_FINER[0])
+        lead_in = _lead_in(first, stands, domain)
+        track = best_track(domain, path, tol, attempts, lead_in)
+    n_lead = len(lead_in) - 1
+    rounded = None
+    if counts is not None:
+        exact = track
+        lead_in = _rounded(lead_in, counts, domain)
+        track = _with_commands(
+            track,
+            _rounded(track.q, counts, domain),
+            domain,
+            tol,
+            _state_after(lead_in, track, domain),
+        )
+        rounded = {
+            "before": float(exact.error.mean()),
+            "after": float(track.error.mean()),
+        }
+    whole = _with_lead_in(track, lead_in[:-1], loaded)
+    statuses = [IKStatus(int(code)).name for code in track.status]
+    inside = loaded.domain_distance(track.effective) <= 1.0
+    _, reached = score(track)
+    missed = np.isin(track.status, _REACHED, invert=True)
+    better = ""
+    if loaded.hybrid is not None and inside.mean() < 1.0 - _MOST_OUTSIDE:
+        better = f": {better_place(domain, path, tol)}"
+    record = TrackRecord(
+        model=str(loaded.path),
+        n=len(path),
+        reached=reached,
+        missed=len(path) - reached,
+        missed_by=float(track.error[missed].max(initial=0.0)),
+        errors=Errors.of(track.error),
+        statuses=dict(Counter(statuses)),
+        in_domain=None if loaded.hybrid is None else float(inside.mean()),
+        expected=_expected(loaded, track),
+        expected_inside=_expected(loaded, track, track.status == IKStatus.CONVERGED),
+        rounded=rounded,
+        backend=domain.solver().tracker(track.q[0]).backend,
+        play=loaded.play_widths,
+        lead_in=n_lead,
+        limits=domain.limits,
+        delay=delay,
+        period=_period(whole),
+    )
+    report = Report(f"{loaded.name}: a path of {len(path)} points", record)
+    _write(report, loaded, better)
+    commands = {"command": whole.q}
+    if loaded.play is not None:
+        commands["actuator"] = whole.effective
+    _add_path(report, loaded, track)
+    _add_commands(report, domain, whole.t, commands, n_lead)
+    statuses = [LEAD_IN] * n_lead + statuses
+    digits = 9 if counts is None else 15
+    _add_track(report, whole, commands, statuses, loaded.log_format(), digits)
+    report.write(out)
+    return report
+
+
+def _expected(
+    loaded: LoadedModel, track: Track, rows: NDArray | slice = slice(None)
+) -> dict[str, float]:
+    """Return the mean errors to expect at rows of a track; empty if not known.
+
+    The directions in which the solver and the model miss a point do not depend on each other.
+    """
+    promised = loaded.promised_errors(track.effective[rows])
+    if promised is None or len(promised.mean) == 0:
+        return {}
+    missed = track.error[rows]
+    means = np.hypot(promised.mean, missed)
+    # Where some points are missed by far, these are the largest errors of the path.
+    p95 = max(np.hypot(promised.p95, missed).mean(), np.quantile(means, 0.95))
+    return {"mean": float(means.mean()), "p95": float(p95)}
+
+
+def _start(domain: Domain, start: ArrayLike | str) -> NDArray | None:
+    """Return the configuration (n,) before the path; None: its first command."""
+    low = domain.limits.q_min
+    high = domain.limits.q_max
+    if isinstance(start, str):
+        if start == "path":
+            return None
+        if start == "rest":
+            if domain.tendons or ((low <= 0) & (high >= 0)).all():
+                return domain.rest
+            return domain.preferred
+        raise ValueError(f'`start` must be "rest", "path" or numbers, got {start!r}.')
+    q = np.array(start, dtype=float)
+    middle = 0.5 * (low + high)
+    if q.shape != low.shape or (np.abs(q - middle) > 1.5 * (high - low)).any():
+        raise ValueError(
+            f"`start` must be {len(low)} values in or near the limits, {low.round(4)} to "
+            f"{high.round(4)} m, got {q} m; check its unit and sign."
+        )
+    return q
+
+
+def _lead_in(track: Track, start: NDArray | None, domain: Domain) -> NDArray:
+    """Return the commands (N + 1, n) from `start` to a track, of which the last is its first.
+
+    They begin and end at rest.
+    """
+    if start is None:
+        return track.q[:1]
+    limits = domain.limits
+    end = track.effective[0]
+    play = domain.loaded.play
+    if play is not None:
+        # With creep only a start: the track then begins with the state after these commands.
+        led, _ = play.command(np.stack([start, end]), dt=1.0)
+        end = led[1].clip(*domain.of_commands)
+    way = end - start
+    dt = _period(track)
+    speed = limits.dq_max
+    if speed is None:
+        speed = _SLOW * max(limits.span.max(), np.abs(way).max())
+    moves = math.ceil((_PEAK * np.abs(way) / (speed * dt)).max())
+    n = moves
+    if limits.ddq_max is not None:
+        seconds = np.sqrt(_PUSH * np.abs(way) / limits.ddq_max).max()
+        moves = max(moves, math.ceil(seconds / dt))
+        n = moves + 1  # the path begins at rest
+    left = 1.0 - trajectories.min_jerk(np.arange(n + 1) / max(moves, 1))
+    left[n] = 0.0
+    return end - left[:, None] * way
+
+
+def _period(points: Track | Trajectory) -> float:
+    """Return the time between two points [s]."""
+    return float(points.t[1] - points.t[0]) if len(points.t) > 1 else _DT
+
+
+def _with_lead_in(track: Track, lead_in: NDArray, loaded: LoadedModel) -> Track:
+    """Return a track after other commands (N, n); the targets of these are the model's tips."""
+    n = len(lead_in)
+    dt = _period(track)
+    effective = lead_in
+    if loaded.play is not None and n > 0:
+        effective, _ = loaded.play.apply(lead_in, None, dt)
+    x = loaded.tips(effective)
+    return replace(
+        track,
+        t=np.concatenate([track.t[0] + dt * np.arange(n), track.t + n * dt]),
+        q=np.concatenate([lead_in, track.q]),
+        effective=np.concatenate([effective, track.effective]),
+        x=np.concatenate([x, track.x]),
+        target=np.concatenate([x, track.target]),
+        error=np.concatenate([np.zeros(n), track.error]),
+    )
+
+
+class Attempts:
+    """Progress of tracks that are computed one after another, each under its number."""
+
+    def __init__(self, progress: Progress) -> None:
+        self._progress = progress
+        self._number = 0
+
+    def __call__(self, done: int, total: int) -> None:
+        """Report that point `done` of a track begins."""
+        if done == 0:
+            self._number += 1
+        if done % max(1, total // _SHOWN) and done + 1 < total:
+            return
+        what = "tracking"
+        if self._number > 1:
+            what = f"tracking, attempt {self._number}"
+        self._progress(what, done + 1, total)
+
+
+def best_track(
+    domain: Domain,
+    path: Trajectory,
+    tol: float,
+    attempts: Attempts,
+    lead_in: NDArray | None = None,
+    finest: int = _FINER[-1],
+) -> Track:
+    """Return the track of several attempts that reaches most points in the domain.
+
+    Each attempt has smaller steps, up to `finest` times as many; it starts where the one before
+    did. After the commands `lead_in` (N + 1, n) it starts at the last of them, with its hysteresis.
+    """
+    commands, tips = domain.sample
+    state = None
+    if lead_in is not None and domain.loaded.play is not None:
+        commands = lead_in[-1]
+        _, state = domain.loaded.play.apply(lead_in, None, _period(path))
+    way = np.linalg.norm(np.diff(path.x, axis=0), axis=1).max(initial=0.0)
+    extent = np.linalg.norm(np.ptp(tips, axis=0))
+    least = max(1, math.ceil(way / (_STEP * extent)))
+    tracks: list[Track] = []
+    for finer in _FINER:
+        if finer > finest:
+            break
+        every = finer * least
+        fine = _in_steps(path, every)
+        dt = float(np.diff(fine.t).max()) if len(fine) > 1 else 0.01
+        ik = domain.solver(dt)
+        track = ik.track(fine, q0=commands, tol=tol, progress=attempts, state=state)
+        # Only the points are kept, not the steps between them.
+        tracks.append(_alone(_thinned(track, every), domain, tol, state))
+        if score(tracks[-1]) == (len(path), len(path)):
+            break
+        commands = track.q[0]
+    return max(tracks, key=score)  # of equal tracks the first
+
+
+def _in_steps(path: Trajectory, n: int) -> Trajectory:
+    """Return the path with every segment between two points cut into n."""
+    places = np.arange((len(path) - 1) * n + 1) / n
+    return trajectories.interpolated(
+        path, np.interp(places, np.arange(len(path)), path.t)
+    )
+
+
+def _thinned(track: Track, every: int) -> Track:
+    """Return every k-th row of a track."""
+    rows = {name: a[::every] for name, a in vars(track).items() if a is not None}
+    return replace(track, **rows)
+
+
+def _alone(track: Track, domain: Domain, tol: float, state: Any) -> Track:
+    """Return a track whose commands are sent without those between its points.
+
+    With hysteresis other commands can do the same at the points: what an actuator does between
+    them, such as a reversal, depends on all commands. The better ones of both are kept.
+    """
+    play = domain.loaded.play
+    if play is None:
+        return track
+    commands = [track.q]
+    exact, _ = play.command(track.effective, state, _steps(track))
+    exact = _within_speeds(exact.clip(*domain.of_commands), track, domain)
+    if exact is not None:
+        commands.append(exact)
+    tracks = [_with_commands(track, q, domain, tol, state) for q in commands]
+    return max(tracks, key=score)
+
+
+def _within_speeds(q: NDArray, track: Track, domain: Domain) -> NDArray | None:
+    """Return commands (N, n) within the limits of speed; None if they accelerate too much."""
+    limits = domain.limits
+    seconds = _steps(track)[:, None]
+    if limits.dq_max is not None:
+        q = q.copy()
+        for k in range(1, len(q)):
+            most = limits.dq_max * seconds[k]
+            q[k] = q[k - 1] + (q[k] - q[k - 1]).clip(-most, most)
+    if limits.ddq_max is not None:
+        speed = np.diff(q, axis=0, prepend=q[:1]) / np.where(
+            seconds > 0.0, seconds, 1.0
+        )
+        change = np.abs(np.diff(speed, axis=0)) / seconds[1:]
+        if (change > limits.ddq_max * (1.0 + 1e-9)).any():
+            return None
+    return q
+
+
+def _steps(track: Track) -> NDArray:
+    """Return the time before every point of a track (N,) [s]; before the first: 0."""
+    return np.diff(track.t, prepend=track.t[0])
+
+
+def _with_commands(
+    track: Track, q: NDArray, domain: Domain, tol: float, state: Any
+) -> Track:
+    """Return a track with commands q (N, n) that are sent alone, and what they do."""
+    loaded = domain.loaded
+    effective = q
+    if loaded.play is not None:
+        effective, _ = loaded.play.apply(q, state, _steps(track))
+    x = loaded.tips(effective)
+    e, motion = map(torch.from_numpy, (track.target - x, effective))
+    status = statuses(
+        domain.solver().settings.task,
+        motion,
+        e,
+        tol,
+        known=torch.from_numpy(track.status != IKStatus.INVALID_INPUT),
+        held=torch.from_numpy(track.status == IKStatus.AT_LIMITS),
+        singular=torch.from_numpy(track.status == IKStatus.SINGULAR),
+    )
+    return replace(
+        track,
+        q=q,
+        effective=effective,
+        x=x,
+        error=e.norm(dim=-1).numpy(),
+        status=status.numpy(),
+    )
+
+
+def _rounded(q: NDArray, counts: Counts, domain: Domain) -> NDArray:
+    """Return commands (N, n) rounded to the numbers of the log, within the limits."""
+    log = domain.loaded.log_format()
+    low, high = np.sort(log.to_log(np.stack(domain.of_commands)), axis=0)
+    return log.from_log(counts.rounded(log.to_log(q), low, high))
+
+
+def _state_after(lead_in: NDArray, track: Track, domain: Domain) -> Any:
+    """Return the state of the hysteresis after the commands of a lead-in, None without."""
+    play = domain.loaded.play
+    if play is None or len(lead_in) < 2:
+        return None
+    return play.apply(lead_in, None, _period(track))[1]
+
+
+def read_track(path: str | Path, log_format: LogFormat) -> Log:
+    """Return commands and times of a file, or of the track in a folder.
+
+    The tips of a track are its targets, and its groups are the statuses.
+    """
+    file = Path(path)
+    if file.is_dir():
+        file = file / "track.csv"
+    if not file.is_file():
+        raise FileNotFoundError(
+            f"`track` must be a file of commands, there is none at {file}."
+        )
+    columns = replace(log_format, groups=None)
+    first_line = "".join(TextFile.of(file).head()[:1])
+    if {*TARGET} <= {*first_line.split(",")}:
+        columns = log_format.of_tracks(TARGET)
+    header = log_columns(file, header_line=columns.header_line, decimal=columns.decimal)
+    time = None
+    for name in (TIME, log_format.time):
+        if time is None and name in header:
+            time = name
+    columns = replace(columns, time=time)
+    return load_log(file, **columns.reading)
+
+
+def _add_track(
+    report: Report[TrackRecord],
+    track: Track,
+    commands: Mapping[str, NDArray],
+    statuses: Sequence[str],
+    log: LogFormat,
+    digits: int,
+) -> None:
+    """Add commands with so many digits, and with backlash what actuators do, point by point."""
+    lengths = np.column_stack([track.x, track.target, track.error]) / METRES[log.x_unit]
+    head = [TIME, *log.q, *log.x, *TARGET, "error", "status"]
+    columns = [
+        _text(track.t),
+        *_text(log.to_log(commands["command"]), digits),
+        *_text(lengths),
+        statuses,
+    ]
+    if "actuator" in commands:
+        head += [f"effective_{name}" for name in log.q]
+        columns += [*_text(log.to_log(commands["actuator"]))]
+    report.table_file("track.csv", head, zip(*columns, strict=True))
+
+
+def _text(values: NDArray, digits: int = 9) -> NDArray:
+    return np.char.mod(f"%.{digits}g", values + 0.0).T  # no -0
+
+
+def _add_path(report: Report[TrackRecord], loaded: LoadedModel, track: Track) -> None:
+    plots = hybridkin.plots
+    figure, axes = plots.new_figure(11.0, 4.6, 1, 3)
+    display = plots.TrackingDisplay.from_tracks({f"solver on {loaded.kind}": track})
+    # The plane of the largest moves.
+    i, j = sorted(np.argsort(np.ptp(track.target, axis=0))[1:])
+    display.plot(axes[0], unit="mm", plane="xyz"[i] + "xyz"[j])
+    display.plot_time(axes[1], unit="mm")
+    errors = loaded.expected_errors(track.effective)
+    expected = {f"robot, {name}": values for name, values in errors.items()}
+    display.plot_error(axes[2], unit="mm", expected=expected)
+    caption = "Path and tip by the model; error of the solver"
+    if errors:
+        caption += ", and expected error of the robot."
+    report.figure("track", figure, caption)
+
+
+def _add_commands(
+    report: Report[TrackRecord],
+    domain: Domain,
+    t: NDArray,
+    commands: Mapping[str, NDArray],
+    n_lead: int,
+) -> None:
+    """Add the commands and their limits, in names, unit and sign of the robot's logs."""
+    loaded = domain.loaded
+    log_format = loaded.log_format()
+    counts: tuple[int, ...] = (loaded.n_actuators,)
+    if isinstance(loaded.chain, ArcChain):
+        counts = loaded.chain.actuators_per_segment
+    n = len(counts)
+    figure, axes = hybridkin.plots.new_figure(
+        7.0, 1.0 + 1.8 * n, n, 1, sharex=True, squeeze=False
+    )
+    low, high = domain.of_commands
+    display = hybridkin.plots.ActuatorDisplay(
+        commands, counts, t, names=log_format.q, limits=np.stack([low, high])
+    )
+    display.plot(axes[:, 0], unit=log_format.q_unit, per_unit=log_format.q_factor)
+    caption = (
+        "Commands and their limits, with the names, unit and sign of the robot's logs."
+    )
+    if n_lead:
+        for ax in axes[:, 0]:
+            ax.axvline(t[n_lead], color="0.6", linewidth=1.0)
+        caption += " The path begins at the grey line."
+    report.figure("commands", figure, caption)

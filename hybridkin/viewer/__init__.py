@@ -1,5 +1,0 @@
-"""A live 3D view of a robot in the browser: drag its target, move its actuators."""
-
-from hybridkin.viewer.live import LiveView, view
-
-__all__ = ["LiveView", "view"]

@@ -1,0 +1,53 @@
+"""What the figures of the commands show, in the words and units of the user."""
+
+import warnings
+
+import numpy as np
+import torch
+
+from hybridkin import HybridForwardModel, robots, save_model
+from hybridkin.app.workflow import open_model
+
+ROBOT = """name = "arm"
+routing = "base"
+[[segment]]
+radius = 0.01
+length = 0.1
+repeat = 2
+[log]
+q = ["left", "right", "up", "a", "b", "c"]
+x = ["x", "y", "z"]
+q_unit = "mm"
+x_unit = "mm"
+q_sign = -1
+[limits]
+q_min = -0.008
+q_max = 0.006
+"""
+
+
+def folder(tmp_path, held_out):
+    (tmp_path / "robot.toml").write_text(ROBOT, encoding="utf-8")
+    chain = robots.from_toml(tmp_path / "robot.toml")
+    q = np.random.default_rng(0).uniform(-0.007, 0.007, (60, 2, 3))
+    q = (q - q.mean(axis=2, keepdims=True)).reshape(60, 6).clip(-0.008, 0.006)
+    with torch.no_grad():
+        x = chain(torch.from_numpy(q)).numpy()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of tendons that contradict each other
+        model = HybridForwardModel(chain, "linear").fit(q, x + np.array([0.0, 0.003, 0.0]))
+    promise = {"at_rows": held_out["mean"], "per_distance": 0.0, "p95": 2.25}
+    training = {"saved": "hybrid, linear", "promise": promise}
+    save_model(model, tmp_path / "model.safetensors", training=training)
+    return open_model(tmp_path)
+
+
+def test_a_model_says_what_it_is_and_what_error_to_expect(tmp_path):
+    loaded = folder(tmp_path, {"mean": 0.004, "p95": 0.009})
+    assert loaded.kind == "hybrid, linear"
+    expected = loaded.expected_errors(np.zeros((3, 6)))
+    assert [*expected] == ["held-out motions, mean", "held-out motions, 95 %"]
+    np.testing.assert_allclose([*expected.values()], [[0.004] * 3, [0.009] * 3])
+    nominal = open_model(tmp_path / "robot.toml")
+    assert nominal.kind == "mechanical, nominal"
+    assert nominal.expected_errors(np.zeros((3, 6))) == {}

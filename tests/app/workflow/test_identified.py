@@ -1,0 +1,43 @@
+"""Whether a report calls a value identified that other, equally good sets contradict."""
+
+import numpy as np
+import pytest
+
+from hybridkin import datasets, robots
+from hybridkin._core.units import LogUnit
+from hybridkin.app.workflow.calibrated import Calibration, calibrated_parameters
+from hybridkin.app.workflow.compare import Mechanical
+from hybridkin.app.workflow.log import checked
+
+MILLIMETRES = LogUnit.of("m")
+
+
+def measured(q, x, motions):
+    return checked(datasets.Log(q, x, motions), None, base_is_free=True)
+
+
+def entries(robot, rows):
+    """Parameters of the calibration on rows, as in their report, and those without other sets."""
+    mechanical = Mechanical.of(robot, rows, "linear")
+    others = [*mechanical.rivals(rows, "linear")]
+    reported = Calibration.of(mechanical.start, mechanical.result, MILLIMETRES, (), others)
+    alone = calibrated_parameters(mechanical.start, mechanical.result, MILLIMETRES)
+    by_name = [{entry.name: entry for entry in found} for found in (reported.entries, alone)]
+    return mechanical.geometry, *by_name
+
+
+@pytest.mark.slow
+def test_a_tilt_that_other_sets_contradict_is_not_identified():
+    """A tilted base, a rest bend and shifted zeros explain the tips of the trunk alike."""
+    data = datasets.load_trunk()
+    robot = robots.RobotDescription("r", robots.bionic_handling_assistant(), "auto", None)
+    rows = measured(data.q, data.x, np.arange(len(data.q)) // 50)
+    geometry, shown, alone = entries(robot, rows)
+    assert geometry.name == "radii + base"
+    assert "radii + rest_bends + base" in [rival.name for rival in geometry.rivals]
+    for rival in geometry.rivals:
+        pairs = zip(geometry.errors[rival.name], geometry.errors[geometry.name], strict=True)
+        assert all(theirs <= 1.1 * ours for theirs, ours in pairs)
+    assert alone["base[rot y]"].identified
+    assert not shown["base[rot y]"].identified
+    assert all(shown[f"radii[{k}]"].identified for k in range(3))

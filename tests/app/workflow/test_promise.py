@@ -1,0 +1,89 @@
+"""What tracks promise: errors that grow with the distance from the log, and where paths lie."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from hybridkin import ConstantCurvatureChain, HybridForwardModel, IKStatus
+from hybridkin.app import workflow
+from hybridkin.app.workflow.domain import Domain
+from hybridkin.app.workflow.errors import Promise
+from hybridkin.app.workflow.reach import better_place, placed
+from hybridkin.ik import trajectories
+
+rng = np.random.default_rng(0)
+
+
+def test_errors_that_grow_with_the_distance_are_found():
+    far = rng.uniform(0.0, 2.0, 4000)
+    errors = (2e-3 + 3e-3 * far) * rng.exponential(size=4000)
+    promise = Promise.of(errors, far)
+    assert promise.at_rows == pytest.approx(2e-3, rel=0.1)
+    assert promise.per_distance == pytest.approx(3e-3, rel=0.1)
+    assert promise.p95 == pytest.approx(-np.log(0.05), rel=0.1)
+    assert np.mean(errors < promise.at(far).p95) == pytest.approx(0.95, abs=0.01)
+
+
+def test_no_promise_is_nothing_at_the_rows_of_the_log():
+    """Where a line through the errors starts at 0, the ratio of error and promise was infinite."""
+    far = np.repeat([0.0, 1.0, 2.0], 40)
+    errors = np.where(far > 0.0, 3e-3 * far - 1e-3, 1e-5)
+    promise = Promise.of(errors, far)
+    assert promise.at(far).mean == pytest.approx(np.full(120, errors.mean()))
+    assert promise.p95 == pytest.approx(5e-3 / errors.mean())
+
+
+@pytest.fixture(scope="module")
+def domain(tmp_path_factory):
+    chain = ConstantCurvatureChain([0.05, 0.05])
+    q = 0.25 + 0.05 * rng.uniform(-1.0, 1.0, (300, 6))
+    x = chain(torch.from_numpy(q)).numpy()
+    model = HybridForwardModel(chain, "linear").fit(q, x + 1e-3 * q[:, :3])
+    loaded = workflow.LoadedModel("robot", tmp_path_factory.mktemp("m") / "m", model)
+    return Domain(loaded, workflow.path_limits(loaded))
+
+
+def test_a_path_outside_is_moved_to_where_it_lies_inside(domain):
+    tips = domain.sample[1]
+    center = tips.mean(axis=0) + np.array([0.6, 0.0, 0.0])
+    far = trajectories.figure_eight(center, [0.04, 0.02], dt=0.1)
+    moved, share = placed(domain, far, 1e-4)
+    assert share == 1.0
+    np.testing.assert_allclose(np.diff(moved.x, axis=0), np.diff(far.x, axis=0), atol=1e-12)
+    assert "move its centre to (" in better_place(domain, far, 1e-4)
+    stays, share = placed(domain, moved, 1e-4)
+    assert share == 1.0
+    np.testing.assert_array_equal(stays.x, moved.x)
+
+
+def test_a_path_is_placed_where_its_promise_is_least(domain):
+    training = {
+        "saved": "h",
+        "held_out": {"h": {"mean": 2e-3, "p95": 5e-3}},
+        "promise": {"at_rows": 1e-3, "per_distance": 5e-3, "p95": 2.0},
+    }
+    loaded = replace(domain.loaded, header={"training": training})
+    model = HybridForwardModel(loaded.chain, "linear")
+    q = domain.sample[0][:200]
+    x = loaded.chain(torch.from_numpy(q)).numpy() + 1e-3 * q[:, :3]
+    model.fit(q, x, groups=np.arange(200) // 10)
+    loaded = replace(loaded, model=model)
+    promising = Domain(loaded, workflow.path_limits(loaded))
+    tips = promising.sample[1]
+    path = trajectories.figure_eight(tips.mean(axis=0), [0.01, 0.01], dt=0.1)
+    moved, share = placed(promising, path, 1e-4)
+    assert share == 1.0
+
+    def promise(shift):
+        solution = promising.solver().solve(path.x + shift, restarts=0)
+        if not (solution.status == IKStatus.CONVERGED).all():
+            return np.inf
+        return loaded.promised_errors(solution.q).mean.mean()
+
+    least = promise(moved.x[0] - path.x[0])
+    elsewhere = np.array([promise(tip - tips.mean(axis=0)) for tip in tips[::25]])
+    assert np.isfinite(elsewhere).sum() > 5
+    assert least < 0.8 * np.median(elsewhere[np.isfinite(elsewhere)])
+    assert least < 1.1 * elsewhere.min()
