@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hybridkin._core.actuators import ActuatorLayout
 from hybridkin._core.arrays import as_array, identity, whole
 from hybridkin._core.blocks import in_blocks
 from hybridkin._core.plan import NoKernel, Plan
@@ -30,7 +31,6 @@ from hybridkin.chains._arcs import (
 )
 from hybridkin.chains._checks import arc_geometry
 from hybridkin.chains._paths import bend_matrix, path_starts, reading_matrix
-from hybridkin.chains.chain import ActuatorLayout
 from hybridkin.chains.markers import MarkedChain
 
 if TYPE_CHECKING:
@@ -152,6 +152,10 @@ class ArcChain(MarkedChain):
     def has_one_arc_per_segment(self) -> bool:
         """Whether every segment is one arc."""
         return self.arcs_per_segment == 1
+
+    def unit_of(self, name: str) -> str:
+        """Return the unit of an entry of the geometry, or of a parameter of `calibrate`."""
+        return super().unit_of(ALIASES.get(name, name))
 
     @property
     def in_metres(self) -> bool:
