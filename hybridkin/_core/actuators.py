@@ -22,7 +22,7 @@ class ActuatorLayout(NamedTuple):
     segments : list of list of int
         The actuators of every segment, in order of their angles.
     balance : ndarray of shape (n, k)
-        Directions along which tendons that do not pull against each other never move.
+        Directions along which tendons that do not pull against each other never move [1].
     """
 
     rest: NDArray
