@@ -22,16 +22,17 @@ from hybridkin.app.checks.report import (
     LogReport,
 )
 from hybridkin.app.checks.residual import residual_findings
+from hybridkin.chains.length_driven import LengthDrivenChain
 from hybridkin.datasets.logs import Log
 
 if TYPE_CHECKING:
-    from hybridkin.chains.arc_chain import ArcChain
+    from hybridkin._core.model import ForwardModel
 
 
 def check_log(
     log: Log,
     *,
-    chain: ArcChain | None = None,
+    chain: ForwardModel | None = None,
     base_is_free: bool = True,
     drop_invalid: bool = True,
 ) -> LogReport:
@@ -52,10 +53,10 @@ def check_log(
     ----------
     log : Log
         As from `load_log`; from arrays ``Log(q, x, groups)``.
-    chain : ConstantCurvatureChain, ElasticTendonChain or ForceTendonChain, optional
+    chain : Chain, optional
         Nominal kinematics, or a calibrated chain (``calibrate(...).chain``), which distinguishes
-        orders of the columns better. None, or forces as q: units,
-        order, signs and axes are not checked.
+        orders of the columns better. None, or one whose q are no lengths (forces, joint angles):
+        units, order, signs and axes are not checked.
     base_is_free : bool, default=True
         Whether the pose of the base will be fitted. For tendons on a backbone of fixed length, a
         wrong sign of q then looks like a half turn of the base. It is reported if the base must
@@ -109,7 +110,8 @@ def check_log(
             findings += check(rows)
         if of_encoders:
             chain = None  # readings that are turns off look like wrong orders, signs and units
-        if chain is not None and chain.takes_lengths:
+        # Its checks compare radii, paths and lengths of arcs, which no other chain has.
+        if isinstance(chain, LengthDrivenChain):
             findings += geometry_findings(rows.log, chain, base_is_free)
         if not any(finding.kind in (*MISREAD, "encoder") for finding in findings):
             residual = [*residual_findings(rows.log, chain, rows.same_motion)]

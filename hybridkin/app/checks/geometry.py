@@ -45,8 +45,8 @@ from hybridkin.app.checks.report import LogFinding
 from hybridkin.datasets.logs import Log, column_names
 
 if TYPE_CHECKING:
-    from hybridkin.chains.arc_chain import ArcChain
-    from hybridkin.chains.chain import ActuatorLayout
+    from hybridkin._core.actuators import ActuatorLayout
+    from hybridkin.chains.length_driven import LengthDrivenChain
 
 _FACTORS = (1e-3, 1e-2, 1e-1, 10.0, 100.0, 1000.0)
 _ROWS = 500  # enough to distinguish a robot from its mirror image
@@ -100,7 +100,7 @@ _ADVICE = {
 
 
 def geometry_findings(
-    log: Log, chain: ArcChain, base_is_free: bool
+    log: Log, chain: LengthDrivenChain, base_is_free: bool
 ) -> list[LogFinding]:
     """Return contradictions to the chain: those of the first check that finds any."""
     findings = [*_negated_zeros(log, chain)]
@@ -122,7 +122,7 @@ def geometry_findings(
     return findings
 
 
-def _in_metres(log: Log, chain: ArcChain) -> tuple[Log, ArcChain]:
+def _in_metres(log: Log, chain: LengthDrivenChain) -> tuple[Log, LengthDrivenChain]:
     """Return the log and the chain with q in metres."""
     if chain.in_metres:
         return log, chain
@@ -142,7 +142,11 @@ class _Comparison:
     """
 
     def __init__(
-        self, log: Log, chain: ArcChain, layout: ActuatorLayout, base_is_free: bool
+        self,
+        log: Log,
+        chain: LengthDrivenChain,
+        layout: ActuatorLayout,
+        base_is_free: bool,
     ) -> None:
         self.log = log
         self.chain = chain
@@ -264,7 +268,7 @@ def _explained(error: float) -> str:
     return f"{100 * max(1 - error**2, 0.0):.0f} %"
 
 
-def _negated_zeros(log: Log, chain: ArcChain) -> Iterator[LogFinding]:
+def _negated_zeros(log: Log, chain: LengthDrivenChain) -> Iterator[LogFinding]:
     """Yield a finding if no row is near the zeros of tendons, but rows are near their negatives."""
     tendons = (~chain.absolute & (chain.rest != 0.0)).cpu().numpy()
     rest = chain.rest.detach().cpu().numpy()[tendons]

@@ -18,7 +18,7 @@ from torch import Tensor
 from hybridkin._core.rotations import nearest_rotation, rigid_motion
 
 if TYPE_CHECKING:
-    from hybridkin.chains.arc_chain import ArcChain
+    from hybridkin.chains.length_driven import LengthDrivenChain
 
 _ROWS = 60  # rows of the search; enough to distinguish two orders
 _MANY = 5  # for more actuators in a segment, or more segments, only pairs of columns are swapped
@@ -92,7 +92,9 @@ def _segments_listed(counts: Sequence[int], listed: Sequence[int]) -> list[int]:
     return order
 
 
-def misses(chain: ArcChain, qs: NDArray, x: NDArray, base_is_free: bool) -> NDArray:
+def misses(
+    chain: LengthDrivenChain, qs: NDArray, x: NDArray, base_is_free: bool
+) -> NDArray:
     """Return for each q (N, n) of qs (K, N, n) the relative error of the chain's tips.
 
     This is the rms distance of the tips x (N, 3) from those of the chain, after the best shift (for
@@ -108,7 +110,7 @@ def misses(chain: ArcChain, qs: NDArray, x: NDArray, base_is_free: bool) -> NDAr
     return (squared_error / squared_size).sqrt().numpy()
 
 
-def base_turn(chain: ArcChain, q: NDArray, x: NDArray) -> tuple[float, float]:
+def base_turn(chain: LengthDrivenChain, q: NDArray, x: NDArray) -> tuple[float, float]:
     """Return the rotation of the base about its axis that fits the tips, and its tilt [deg]."""
     tips, measured = _centred(chain, q[None], x)
     base = chain.base[:3, :3].double()
@@ -121,7 +123,9 @@ def base_turn(chain: ArcChain, q: NDArray, x: NDArray) -> tuple[float, float]:
     return float(np.degrees(twist)), float(np.degrees(tilt))
 
 
-def _centred(chain: ArcChain, qs: NDArray, x: NDArray) -> tuple[Tensor, Tensor]:
+def _centred(
+    chain: LengthDrivenChain, qs: NDArray, x: NDArray
+) -> tuple[Tensor, Tensor]:
     """Return the tips (K, N, 3) of the chain and the measured ones, each minus their mean."""
     rows = torch.from_numpy(np.ascontiguousarray(qs, dtype=np.float64))
     with torch.no_grad():
@@ -132,7 +136,7 @@ def _centred(chain: ArcChain, qs: NDArray, x: NDArray) -> tuple[Tensor, Tensor]:
 
 
 def better_way(
-    chain: ArcChain, q: NDArray, x: NDArray, base_is_free: bool
+    chain: LengthDrivenChain, q: NDArray, x: NDArray, base_is_free: bool
 ) -> tuple[NDArray, float]:
     """Return the best found way to read the columns, and its relative error (see `misses`).
 

@@ -11,9 +11,7 @@ from numpy.typing import NDArray
 from hybridkin._core.commands import Commands
 from hybridkin._core.model import ForwardModel
 from hybridkin.app.viewer.steered import SteeredRobot
-from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
-from hybridkin.chains.elastic_tendons import ElasticTendonChain
 from hybridkin.datasets import Log
 from hybridkin.plots.models import body_of
 
@@ -39,8 +37,8 @@ class Body:
         self._chain = robot.loaded.chain
         body = body_of(model, robot.q, _POINTS)
         self._thick = 0.015 * robot.size
-        if isinstance(self._chain, ArcChain):
-            self._thick = min(self._thick, 0.4 * float(self._chain.radii.min()))
+        least = robot.loaded.module.robot.least_radius
+        self._thick = min(self._thick, 0.4 * least)
         self._backbone = scene.add_spline_catmull_rom(
             "/robot/backbone",
             body["points"][0],
@@ -64,7 +62,7 @@ class Body:
                 point_shape="circle",
             )
         self._disks = None
-        if "disks" in body:
+        if body["disks"].size:
             self._disks = scene.add_line_segments(
                 "/robot/disks",
                 _rims(body["disks"]),
@@ -79,7 +77,7 @@ class Body:
             return
         self._backbone.points = body["points"][0]
         self._tip.position = robot.x
-        if self._disks is not None and "disks" in body:
+        if self._disks is not None:
             self._disks.points = _rims(body["disks"])
         if self._markers is not None:
             self._markers.points = self._marked(robot)
@@ -99,14 +97,13 @@ class Body:
 
     def _tensions(self, robot: SteeredRobot) -> tuple[NDArray, NDArray]:
         """Return colours (n, 3) of the actuators, and which are slack (n,)."""
-        chain = self._chain
-        if isinstance(chain, ElasticTendonChain):
-            with torch.no_grad():
-                tension = chain.tensions(torch.from_numpy(robot.q)).numpy()
-            fraction = tension / max(float(tension.max()), 1e-300)
-            return between(BLUE, RED, fraction), tension <= 0.0
-        fraction = (robot.q - robot.limits.q_min) / robot.span
-        return between(RED, BLUE, fraction), np.zeros(len(fraction), dtype=bool)
+        model = robot.loaded.module.robot
+        q = torch.from_numpy(robot.q)
+        low = torch.from_numpy(robot.limits.q_min)
+        with torch.no_grad():
+            pulled = model.pulled(q, low, low + torch.from_numpy(robot.span))
+            slack = model.slack(q)
+        return between(BLUE, RED, pulled.numpy()), slack.numpy()
 
 
 class Ghost:

@@ -17,7 +17,6 @@ from hybridkin._core.units import LogUnit
 from hybridkin.app import LogReport, check_log
 from hybridkin.app.workflow.report import Report
 from hybridkin.chains import robots
-from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
 from hybridkin.datasets import Log, load_log
 
@@ -270,9 +269,8 @@ def checked(log: Log, chain: Chain | None, base_is_free: bool) -> MeasuredLog:
 def _check(
     log: Log, chain: Chain | None, base_is_free: bool = True, drop_invalid: bool = True
 ) -> LogReport:
-    arcs = chain if isinstance(chain, ArcChain) else None
     return check_log(
-        log, chain=arcs, base_is_free=base_is_free, drop_invalid=drop_invalid
+        log, chain=chain, base_is_free=base_is_free, drop_invalid=drop_invalid
     )
 
 

@@ -19,7 +19,6 @@ from hybridkin._core.model import ForwardModel, as_forward_model
 from hybridkin._core.units import UNITS, LogUnit
 from hybridkin.app.workflow.errors import ExpectedErrors, HeldOutErrors, Promise
 from hybridkin.chains import robots
-from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
 from hybridkin.native.library import evaluate
 from hybridkin.saving.header import model_header
@@ -268,9 +267,7 @@ class LoadedModel:
         if self.description is not None and self.description.log is not None:
             return self.description.log
         names = tuple(f"q{i + 1}" for i in range(self.n_actuators))
-        unit = "m"
-        if isinstance(self.chain, ArcChain) and not self.chain.in_metres:
-            unit = "1"
+        unit = "m" if self.module.robot.in_metres else "1"
         return robots.LogFormat(names, ("x", "y", "z"), unit)
 
 

@@ -29,7 +29,6 @@ from hybridkin.app.workflow.report import (
     percent,
     quiet,
 )
-from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.robots import LogFormat
 from hybridkin.datasets import Log, load_log, log_columns
 from hybridkin.ik import trajectories
@@ -349,7 +348,7 @@ def _start(domain: Domain, start: ArrayLike | str) -> NDArray | None:
         if start == "path":
             return None
         if start == "rest":
-            if domain.tendons or ((low <= 0) & (high >= 0)).all():
+            if domain.all_tendons or ((low <= 0) & (high >= 0)).all():
                 return domain.rest
             return domain.preferred
         raise ValueError(f'`start` must be "rest", "path" or numbers, got {start!r}.')
@@ -653,9 +652,8 @@ def _add_commands(
     """Add the commands and their limits, in names, unit and sign of the robot's logs."""
     loaded = domain.loaded
     log_format = loaded.log_format()
-    counts: tuple[int, ...] = (loaded.n_actuators,)
-    if isinstance(loaded.chain, ArcChain):
-        counts = loaded.chain.actuators_per_segment
+    rings = loaded.module.robot.rings or (slice(0, loaded.n_actuators),)
+    counts = [ring.stop - ring.start for ring in rings]
     n = len(counts)
     figure, axes = hybridkin.plots.new_figure(
         7.0, 1.0 + 1.8 * n, n, 1, sharex=True, squeeze=False

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridkin._core.actuators import ActuatorLayout
 from hybridkin._core.arrays import as_array, number
 from hybridkin._core.commands import Commands
 from hybridkin.app.checks.causes.alignment import Alignment
@@ -22,7 +23,6 @@ from hybridkin.app.workflow.errors import Errors, ExpectedErrors
 from hybridkin.app.workflow.model import LoadedModel
 from hybridkin.app.workflow.report import Report, check_out, millimetres, percent
 from hybridkin.app.workflow.track import LEAD_IN, read_track
-from hybridkin.chains.chain import ActuatorLayout
 from hybridkin.chains.robots import LogFormat
 from hybridkin.datasets import Log, load_log, log_columns
 from hybridkin.hybrid.other_units import check_tips
@@ -370,12 +370,8 @@ def _evidence(
     order = np.argsort(rows, kind="stable")
     rows = rows[order]
     q = motion[rows]
-    bodies = [loaded.module]
-    layout = ActuatorLayout.independent(loaded.n_actuators)
-    if loaded.chain is not None:
-        robots = [loaded.chain, *loaded.chain.softer()]
-        bodies = [robot.tip_model for robot in robots]
-        layout = loaded.chain.actuator_layout
+    robot = loaded.module.robot
+    bodies = [body.tip_model for body in (robot, *robot.softer())]
     off_plane = _off_plane(loaded, q)
     low = motion.min(axis=0)
     high = motion.max(axis=0)
@@ -390,7 +386,7 @@ def _evidence(
         x=x[order],
         model=loaded.module,
         bodies=bodies,
-        actuators=_actuators(loaded.log_format(), layout),
+        actuators=_actuators(loaded.log_format(), robot.actuator_layout),
         inside=loaded.domain_distance(q - off_plane) <= 1.0,
         off_plane=off_plane,
         promised=expected,

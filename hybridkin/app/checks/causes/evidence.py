@@ -12,10 +12,10 @@ import torch
 from numpy.typing import NDArray
 from typing_extensions import Self
 
+from hybridkin._core.actuators import ActuatorLayout
 from hybridkin._core.model import ForwardModel
 from hybridkin.app.checks.causes.alignment import Alignment
 from hybridkin.app.checks.causes.motion import Motion
-from hybridkin.chains.chain import ActuatorLayout
 from hybridkin.native.library import evaluate
 
 _ENDS = 0.05  # of the rows: nothing changes this near to an end
