@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from inspect import signature
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -43,7 +45,7 @@ from hybridkin.ik._settings import (
 from hybridkin.ik._starts import nearest_starts
 from hybridkin.ik._step import control_step
 from hybridkin.ik._tracks import Loop, Path, followed
-from hybridkin.ik.results import IKSolution, IKStatus, Step, Track, score, statuses
+from hybridkin.ik.results import IKSolution, IKStatus, Step, Track, statuses
 from hybridkin.ik.tasks import as_task
 from hybridkin.ik.tracker import Plant, Tracker
 from hybridkin.ik.trajectories import Trajectory
@@ -649,14 +651,50 @@ class InverseKinematics:
         tracks: list[Track] = []
         for start in self._starts(target[:1], starts, timed.as_numpy):
             tracks.append(followed(settings, start, timed, on_model))
-            if score(tracks[-1]) == (len(target), len(target)):
+            if tracks[-1].score == (len(target), len(target)):
                 break
-        best = max(tracks, key=score)  # of equal tracks the first
+        best = max(tracks, key=attrgetter("score"))  # of equal tracks the first
         if alone:
             return best
         return followed(
             settings, torch.as_tensor(best.q[0], device=target.device), timed, loop
         )
+
+    def judged(self, track: Track, *, tol: float | Sequence[float] = _TOL) -> Track:
+        """Return a track with the errors and statuses of its tips, after a change of its commands.
+
+        Parameters
+        ----------
+        track : Track
+            A track of this solver with other `q`, and the `effective` and `x` of these.
+        tol : float or sequence of floats, default=1e-4
+            Largest error of a reached point, as for `track`.
+
+        Returns
+        -------
+        Track
+            With new `error` and `status`; points that were AT_LIMITS or SINGULAR and are missed
+            stay so.
+        """
+        task = self.settings.task
+        motion = as_tensor(track.effective, "effective")
+        x = as_tensor(track.x, "x")
+        target = as_tensor(track.target, "target")
+        before = as_tensor(track.status, "status")
+        e = task.difference(x, target)
+        status = statuses(
+            task,
+            motion,
+            e,
+            self.settings.tolerance(tol),
+            known=before != IKStatus.INVALID_INPUT,
+            held=before == IKStatus.AT_LIMITS,
+            singular=before == IKStatus.SINGULAR,
+        )
+        error, status = give_back(
+            [e.norm(dim=-1), status], (len(e),), is_numpy(track.q)
+        )
+        return replace(track, error=error, status=status)
 
     def _starts(
         self, target: Tensor, q0: Tensor | None, as_numpy: bool
