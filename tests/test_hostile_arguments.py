@@ -51,6 +51,7 @@ from hybridkin import (
     fit_play,
     jacobian,
     load_model,
+    open_model,
     plots,
     robots,
     save_model,
@@ -377,7 +378,7 @@ ENTRIES = {
             "groups": GROUPS,
         },
     ),
-    "workflow.open_model": (workflow.open_model, {"path": SAVED, "robot": ROBOT}),
+    "open_model": (open_model, {"model": SAVED, "robot": ROBOT}),
     "workflow.scaled_path": (workflow.scaled_path, {"path": PATH, "scale": 0.5}),
     "workflow.path_limits": (
         workflow.path_limits,
@@ -422,8 +423,7 @@ COSTLY = {
         choose_geometry,
         {"chain": trunk(), "q": Q, "x": X, "groups": GROUPS},
     ),
-    "LoadedModel.effective": (LOADED.effective, {"commands": Q}),
-    "LoadedModel.expected_errors": (LOADED.expected_errors, {"q": Q}),
+    "HybridForwardModel.was_fitted": (LOADED.was_fitted, {"X": Q, "y": X}),
     "RobotDescription.to_log": (DESCRIPTION.to_log, {"q": Q}),
     "RobotDescription.from_log": (DESCRIPTION.from_log, {"q": Q}),
     "fit_play": (

@@ -19,7 +19,13 @@ from hybridkin.app.workflow.fit_record import (
     write_markers,
 )
 from hybridkin.app.workflow.log import MeasuredLog, checked, write_check
-from hybridkin.app.workflow.model import LoadedModel
+from hybridkin.app.workflow.model import (
+    check_columns,
+    fitted_rows,
+    has_body,
+    held_out_errors,
+    kind_of,
+)
 from hybridkin.app.workflow.report import Report, check_out
 from hybridkin.datasets import Log
 
@@ -103,7 +109,7 @@ def _share(values: NDArray) -> float:
 
 
 def evaluate_log(
-    loaded: LoadedModel,
+    model: HybridForwardModel,
     log: Log,
     out: str | Path | None = None,
     *,
@@ -113,7 +119,7 @@ def evaluate_log(
 
     Parameters
     ----------
-    loaded : LoadedModel
+    model : HybridForwardModel
         The model, as from `open_model`.
     log : Log
         As from `read_log` or `datasets.load_log`.
@@ -135,15 +141,15 @@ def evaluate_log(
     """
     if out is not None:
         check_out(out, "evaluate", _FIGURES, force=force)
-    loaded.check_columns(log.q)
+    check_columns(model, log.q)
     measured = checked(log, None, base_is_free=False)
     measured.check(force)
-    if loaded.play is not None:
+    if model.play_ is not None:
         measured.check_order("A model with backlash (play)")
-    predicted = loaded.predict(measured.commands)
+    predicted = model.predict(measured.commands)
     markers = marker_distances(predicted, log.x)
-    errors = _row_errors(loaded, measured.commands, markers)
-    fitted = loaded.was_fitted(log.q, log.x, measured.motions)
+    errors = _row_errors(model, measured.commands, markers)
+    fitted = fitted_rows(model, log.q, log.x, measured.motions)
     fitted_errors = None
     new_errors = None
     if fitted is not None and fitted.any():
@@ -154,7 +160,7 @@ def evaluate_log(
     for name in dict.fromkeys(measured.motions):
         motions[str(name)] = errors.of(measured.motions == name)
     record = Evaluation(
-        model=str(loaded.path),
+        model=str(model.description_.path),
         log=log.source,
         log_check=measured.report,
         all=errors.of(np.ones(len(log.q), dtype=bool)),
@@ -162,23 +168,25 @@ def evaluate_log(
         fitted_rows=None if fitted is None else int(fitted.sum()),
         fitted=fitted_errors,
         new=new_errors,
-        held_out=None if fitted_errors is None else loaded.held_out,
+        held_out=None if fitted_errors is None else held_out_errors(model),
         markers=errors_of_markers(markers),
     )
-    report = Report(f"{loaded.name}: errors on {Path(log.source).name}", record)
-    _write_errors(report, loaded.hybrid)
+    report = Report(
+        f"{model.description_.name}: errors on {Path(log.source).name}", record
+    )
+    _write_errors(report, model)
     if out is not None:
-        _add_figures(report, loaded, measured, predicted)
+        _add_figures(report, model, measured, predicted)
         report.write(out)
     return report
 
 
 def _row_errors(
-    loaded: LoadedModel, commands: Commands, markers: NDArray
+    model: HybridForwardModel, commands: Commands, markers: NDArray
 ) -> _RowErrors:
     in_domain = np.full(len(commands), np.nan)
     in_radius = in_domain
-    hybrid = loaded.hybrid
+    hybrid = model
     if hybrid is not None:
         in_domain = hybrid.in_domain(commands).astype(float)
     if hybrid is not None and hybrid.radius_ is not None:
@@ -226,19 +234,19 @@ def _write_errors(
 
 def _add_figures(
     report: Report[Evaluation],
-    loaded: LoadedModel,
+    model: HybridForwardModel,
     log: MeasuredLog,
     predicted: NDArray,
 ) -> None:
     plots = hybridkin.plots
     errors = np.nanmean(marker_distances(predicted, log.x), axis=1)
-    add_histogram(report, {loaded.kind: errors}, "Tip errors of all rows.")
+    add_histogram(report, {kind_of(model): errors}, "Tip errors of all rows.")
     figure, ax = plots.new_figure(6.4, 5.2, subplot_kw={"projection": "3d"})
     row = int(np.argsort(errors)[int(0.95 * len(errors))])
     body = None
-    if loaded.chain is not None:
-        q = loaded.effective(log.commands)[row]
-        body = plots.BackboneDisplay.from_estimator(loaded.chain, q).points[0]
+    if has_body(model):
+        q = model.effective(log.commands)[row]
+        body = plots.BackboneDisplay.from_estimator(model.module_.robot, q).points[0]
     tips = plots.WorkspaceDisplay(log.x[:, -3:], predicted[:, -3:], body, row)
     tips.plot(ax, unit="mm")
     report.figure(

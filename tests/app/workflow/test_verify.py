@@ -12,6 +12,7 @@ from hybridkin import (
     ConstantCurvatureChain,
     HybridForwardModel,
     PlayOperator,
+    open_model,
     robots,
     save_model,
 )
@@ -57,7 +58,7 @@ def loaded(tmp_path_factory):
     model = HybridForwardModel(CHAIN, "quadratic").fit(q, x)
     path = tmp_path_factory.mktemp("model") / "model.safetensors"
     save_model(model, path, training=TRAINING)
-    return workflow.open_model(path)
+    return open_model(path)
 
 
 def written(path, q, x):
