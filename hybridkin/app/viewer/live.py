@@ -12,7 +12,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Self
 
-from hybridkin import Chain, ForwardModel, HybridForwardModel, open_model, trajectories
+from hybridkin import (
+    Chain,
+    ForwardModel,
+    HybridForwardModel,
+    as_forward_model,
+    open_model,
+    trajectories,
+)
 from hybridkin.app.viewer.drawing import BLUE, GREEN, ORANGE, RED, Body, Ghost, LogCloud
 from hybridkin.app.viewer.motions import (
     Loop,
@@ -91,8 +98,8 @@ def view(
     ...     print(shown.address)
     http://127.0.0.1:8080
     """
-    if isinstance(model, ForwardModel):
-        model = open_model(model)
+    if not isinstance(model, HybridForwardModel):
+        model = open_model(as_forward_model(model))
     if not has_body(model):
         raise TypeError(
             "`model` must be a chain, or a hybrid fitted on one, so that its body can be drawn; "

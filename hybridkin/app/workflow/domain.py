@@ -162,20 +162,19 @@ class Domain:
         the middle. For a model without a fit it is no tendon pulled, or for other robots the middle
         of the limits.
         """
-        trained = trained_range(self.model)
+        fitted = is_fitted(self.model)
         limits = self.limits
-        spanned = trained or limits
+        spanned = trained_range(self.model) if fitted else limits
         middle = 0.5 * (np.asarray(spanned.q_min) + np.asarray(spanned.q_max))
         middle = self._bent(middle)
         candidates = [middle]
         if self.all_tendons:
             candidates.append(self.rest)
-            if trained is None:
+            if not fitted:
                 candidates.reverse()
-        hybrid = self.model
-        if hybrid is not None and hybrid.fitted_module_.tested is not None:
-            tested = hybrid.fitted_module_.tested
-            rows = tested.rows.numpy(force=True) - hybrid.change_.shift
+        tested = self.model.fitted_module_.tested
+        if tested is not None:
+            rows = tested.rows.numpy(force=True) - self.model.change_.shift
             far = np.linalg.norm(rows - middle, axis=1)
             median = self._bent(np.median(rows, axis=0))
             candidates = [median, *candidates, rows[far.argmin()]]

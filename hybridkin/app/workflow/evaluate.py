@@ -24,6 +24,7 @@ from hybridkin.app.workflow.model import (
     fitted_rows,
     has_body,
     held_out_errors,
+    is_fitted,
     kind_of,
 )
 from hybridkin.app.workflow.report import Report, check_out
@@ -186,19 +187,16 @@ def _row_errors(
 ) -> _RowErrors:
     in_domain = np.full(len(commands), np.nan)
     in_radius = in_domain
-    hybrid = model
-    if hybrid is not None:
-        in_domain = hybrid.in_domain(commands).astype(float)
-    if hybrid is not None and hybrid.radius_ is not None:
-        _, radius = hybrid.predict(commands, return_radius=True)
+    if is_fitted(model):
+        in_domain = model.in_domain(commands).astype(float)
+    if model.radius_ is not None:
+        _, radius = model.predict(commands, return_radius=True)
         inside = np.nanmax(markers, axis=1) <= radius
         in_radius = np.where(np.isinf(radius), np.nan, inside)
     return _RowErrors(np.nanmean(markers, axis=1), in_domain, in_radius)
 
 
-def _write_errors(
-    report: Report[Evaluation], hybrid: HybridForwardModel | None
-) -> None:
+def _write_errors(report: Report[Evaluation], model: HybridForwardModel) -> None:
     """Add the errors to a report."""
     record = report.record
     write_check(report, record.log_check)
@@ -222,12 +220,12 @@ def _write_errors(
         entries |= {name: part for name, part in parts.items() if part is not None}
     largest_first = sorted(record.motions.items(), key=lambda item: -item[1].mean)
     columns = ["rows", "mean", "median", "p95", "max"]
-    if hybrid is not None:
+    if is_fitted(model):
         columns += ["share_in_domain", "share_in_radius"]
     report.errors(entries | dict(largest_first), columns)
-    if hybrid is not None and hybrid.radius_ is not None:
+    if model.radius_ is not None:
         report.text(
-            f"Estimated error radius: {hybrid.radius_}. Rows without a radius do not count."
+            f"Estimated error radius: {model.radius_}. Rows without a radius do not count."
         )
     write_markers(report, record.markers, "all rows")
 

@@ -23,7 +23,7 @@ from hybridkin.app.workflow.domain import Domain
 from hybridkin.app.workflow.errors import Errors, HeldOutErrors, Promise
 from hybridkin.app.workflow.fit_record import largest_errors
 from hybridkin.app.workflow.log import checked
-from hybridkin.app.workflow.model import domain_distance, tips_at, widths_in_log
+from hybridkin.app.workflow.model import domain_distance, fitted_rows, tips_at, widths_in_log
 from hybridkin.app.workflow.path import scaled_path
 from hybridkin.datasets import Log
 
@@ -179,7 +179,7 @@ def test_commands_exceed_the_limits_by_half_the_backlash_in_any_unit(tmp_path):
         described = workflow.path_limits(model, within_fit=False).commands
         ends = np.sort([described[0] * gains, described[1] * gains], axis=0)
         assert_allclose(ends, [LIMITS.q_min, LIMITS.q_max], rtol=1e-9)
-        of_log = np.ravel(model.play.width)
+        of_log = np.ravel(model.play_.width)
         if gains is GAINS:
             of_log = np.degrees(of_log)
         assert_allclose(widths_in_log(model), of_log, rtol=1e-12)
@@ -345,10 +345,10 @@ def test_a_motion_is_fitted_if_half_of_its_rows_are_whatever_its_name(tmp_path):
     motions = np.repeat(np.arange(5), 5 * LENGTHS)
     q, x = measured(model, GAINS, motions, far=len(motions))
     fitted = np.arange(150) % 5 < 1 + motions % 3  # 1 to 3 of 5 rows
-    model.model.fit(q[fitted], x[fitted])
+    model.fit(q[fitted], x[fitted])
     expected = fitted | (motions == 2)
     for names in (motions, np.array([*"zaqmk"])[motions], 10 - motions):
-        assert_array_equal(model.was_fitted(q, x, names), expected)
+        assert_array_equal(fitted_rows(model, q, x, names), expected)
 
 
 # ---------------------------------------------------------------- comparison, verification
