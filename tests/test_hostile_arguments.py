@@ -383,7 +383,7 @@ ENTRIES = {
     "workflow.path_limits": (
         workflow.path_limits,
         {
-            "loaded": LOADED,
+            "model": LOADED,
             "q_min": 0.1,
             "q_max": np.full(3, 0.4),
             "dq_max": 1.0,
@@ -394,7 +394,7 @@ ENTRIES = {
     "workflow.shape_path": (
         workflow.shape_path,
         {
-            "loaded": LOADED,
+            "model": LOADED,
             "limits": LIMITS,
             "shape": "spiral",
             "size": [0.02, 0.05],
@@ -406,7 +406,7 @@ ENTRIES = {
             "dt": 0.1,
         },
     ),
-    "workflow.describe": (workflow.describe, {"loaded": LOADED}),
+    "workflow.describe": (workflow.describe, {"model": LOADED}),
     "workflow.read_log": (
         workflow.read_log,
         {
@@ -439,20 +439,20 @@ COSTLY = {
     ),
     "evaluate_log": (
         workflow.evaluate_log,
-        {"loaded": LOADED, "log": LOG, "out": None, "force": True},
+        {"model": LOADED, "log": LOG, "out": None, "force": True},
     ),
     "verify_track": (
         workflow.verify_track,
-        {"loaded": LOADED, "track": SENT, "log": LOG, "out": None},
+        {"model": LOADED, "track": SENT, "log": LOG, "out": None},
     ),
     "next_rows": (
         workflow.next_rows,
-        {"loaded": LOADED, "out": OUT, "n": 2, "limits": LIMITS, "path": PATH},
+        {"model": LOADED, "out": OUT, "n": 2, "limits": LIMITS, "path": PATH},
     ),
     "track_path": (
         workflow.track_path,
         {
-            **{"loaded": LOADED, "path": PATH, "out": OUT, "limits": LIMITS, "start": "rest"},
+            **{"model": LOADED, "path": PATH, "out": OUT, "limits": LIMITS, "start": "rest"},
             **{"tol": 1e-3, "force": True},
         },
     ),
