@@ -1,4 +1,4 @@
-"""What the actuators of a robot are: rest, kind, segments and balance."""
+"""What the actuators of a robot are."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class ActuatorLayout(NamedTuple):
     segments : list of list of int
         The actuators of every segment, in order of their angles.
     balance : ndarray of shape (n, k)
-        Directions along which tendons that do not pull against each other never move.
+        Directions along which tendons that do not pull against each other never move [1].
     tendons : ndarray of shape (n,) of bool
         Which are tendons of given length.
     """

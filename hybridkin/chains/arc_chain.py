@@ -89,6 +89,23 @@ class ArcChain(MarkedChain):
     """A chain of circular arcs; subclasses define how the actuators shape them.
 
     A subclass defines `_arcs_and_slope` and `_arcs_and_change`.
+
+    Attributes
+    ----------
+    actuators_per_segment : tuple of int
+        Number of actuators of each of the S segments.
+    extensible : tuple of bool
+        Which segments change their length; the others have `lengths`.
+    takes_lengths : bool
+        Whether q holds lengths or their changes; else it holds forces.
+    radii, offsets : Tensor of shape (S,)
+        Radius of the circle of actuators, and rigid length after the segment [m].
+    angles, gains : Tensor of shape (n,)
+        Angles of the actuators about the backbone [rad], and metres per unit of q [m].
+    rest_bends : Tensor of shape (S, 2)
+        Bending of the segments at rest [rad].
+    lengths : Tensor of shape (S - E,) or None
+        Lengths of the segments but for E extensible ones [m]; None if all are.
     """
 
     _structure = (

@@ -127,8 +127,11 @@ class Chain(PoseModel):
         return set()
 
     def unit_of(self, name: str) -> str:
-        """Return the unit of an entry of the geometry: "m", "rad", "-" or another one."""
-        return self._units.get(name, "m")
+        """Return the unit of an entry of the geometry, or of a parameter of `calibrate`.
+
+        It is "m", "rad", "-" or another one.
+        """
+        return self._units.get(self.aliases.get(name, name), "m")
 
     def html_rows(self) -> dict[str, object]:
         """Return names and values that a notebook shows of the chain."""

@@ -20,6 +20,7 @@ from hybridkin._core.commands import Commands
 from hybridkin._core.distinct import targets_that_count
 from hybridkin._core.html import html_table
 from hybridkin._core.model import ForwardModel, as_forward_model
+from hybridkin._core.other_units import check_commands
 from hybridkin._core.plausible import PlausibleRows, UnknownRows
 from hybridkin.calibration.calibrate import CalibrationResult
 from hybridkin.chains.hysteresis import HysteresisOperator
@@ -34,7 +35,6 @@ from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._wrapped import in_columns, pose_difference
 from hybridkin.hybrid.cv_results import CvResults
 from hybridkin.hybrid.log_fit import HybridFit
-from hybridkin.hybrid.other_units import check_commands
 from hybridkin.learning.hidden_layer import check_inputs
 from hybridkin.native.library import evaluate
 
@@ -251,7 +251,8 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def _check_commands(self, rows: Rows) -> None:
         """Raise if actuator vectors have another unit than those of the fit."""
         turns = torch.as_tensor(self._robot.turns, device="cpu")
-        check_commands(rows, self.training_range_, bool(turns.all()))
+        low, high = self.training_range_
+        check_commands(rows.X, low, high, bool(turns.all()))
 
     def _warn_of_units(self, rows: Rows) -> None:
         """Warn if measured tips span far more than the robot, so they cannot be in metres."""

@@ -13,8 +13,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from hybridkin._core.directions import in_terms
-from hybridkin._core.units import METRES
 from hybridkin.app.checks.causes.alignment import Alignment, FreeBase, FreeOrigin
 from hybridkin.app.checks.causes.commands import (
     FirstRow,
@@ -42,11 +40,12 @@ from hybridkin.app.checks.order import (
     segment_columns,
 )
 from hybridkin.app.checks.report import LogFinding
-from hybridkin.datasets.logs import Log, column_names
+from hybridkin.datasets import Log
+from hybridkin.formats import METRES, in_terms
 
 if TYPE_CHECKING:
-    from hybridkin._core.actuators import ActuatorLayout
-    from hybridkin.chains.length_driven import LengthDrivenChain
+    from hybridkin import robots
+    from hybridkin.app.checks.order import LengthChain
 
 _FACTORS = (1e-3, 1e-2, 1e-1, 10.0, 100.0, 1000.0)
 _ROWS = 500  # enough to distinguish a robot from its mirror image
@@ -100,7 +99,7 @@ _ADVICE = {
 
 
 def geometry_findings(
-    log: Log, chain: LengthDrivenChain, base_is_free: bool
+    log: Log, chain: LengthChain, base_is_free: bool
 ) -> list[LogFinding]:
     """Return contradictions to the chain: those of the first check that finds any."""
     findings = [*_negated_zeros(log, chain)]
@@ -122,7 +121,7 @@ def geometry_findings(
     return findings
 
 
-def _in_metres(log: Log, chain: LengthDrivenChain) -> tuple[Log, LengthDrivenChain]:
+def _in_metres(log: Log, chain: LengthChain) -> tuple[Log, LengthChain]:
     """Return the log and the chain with q in metres."""
     if chain.in_metres:
         return log, chain
@@ -144,15 +143,15 @@ class _Comparison:
     def __init__(
         self,
         log: Log,
-        chain: LengthDrivenChain,
-        layout: ActuatorLayout,
+        chain: LengthChain,
+        layout: robots.ActuatorLayout,
         base_is_free: bool,
     ) -> None:
         self.log = log
         self.chain = chain
         self.layout = layout
         self.base_is_free = base_is_free
-        self.q_names = column_names(log, "q")
+        self.q_names = log.column_names("q")
         self.radii = chain.radii.detach().cpu().double().numpy()
         self.all_extensible = chain.lengths is None
         self.length = 0.0
@@ -268,7 +267,7 @@ def _explained(error: float) -> str:
     return f"{100 * max(1 - error**2, 0.0):.0f} %"
 
 
-def _negated_zeros(log: Log, chain: LengthDrivenChain) -> Iterator[LogFinding]:
+def _negated_zeros(log: Log, chain: LengthChain) -> Iterator[LogFinding]:
     """Yield a finding if no row is near the zeros of tendons, but rows are near their negatives."""
     tendons = (~chain.absolute & (chain.rest != 0.0)).cpu().numpy()
     rest = chain.rest.detach().cpu().numpy()[tendons]
@@ -452,7 +451,7 @@ def _exchanged_columns(comparison: _Comparison) -> Iterator[LogFinding]:
         exchanges.append((comparison.error(q, x), i, j))
     error, i, j = min(exchanges)
     if error < min(comparison.good_error, _FAR_BETTER * least):
-        axis = column_names(comparison.log, "x")[j]
+        axis = comparison.log.column_names("x")[j]
         reading = f"columns {comparison.q_names[i]!r} and {axis!r} exchanged"
         message = comparison.better(error, reading)
         yield LogFinding("exchanged", "warning", message, "exchange these two columns.")
@@ -486,7 +485,7 @@ def _unbalanced(comparison: _Comparison) -> Iterator[LogFinding]:
     yield LogFinding(kind, "warning", message, advice)
 
 
-def _few_changes(layout: ActuatorLayout) -> Iterator[list[NDArray]]:
+def _few_changes(layout: robots.ActuatorLayout) -> Iterator[list[NDArray]]:
     """Yield the ways with one change that balance can show, then those with more signs."""
     n = len(layout.rest)
     declared = np.eye(n, dtype=int)

@@ -9,11 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hybridkin._core.arrays import as_array
-from hybridkin._core.units import LogUnit
+from hybridkin import CalibrationResult, Chain
 from hybridkin.app.workflow.report import Report, millimetres
-from hybridkin.calibration.calibrate import CalibrationResult
-from hybridkin.chains.chain import Chain
+from hybridkin.formats import LogUnit
 
 IDENTIFIED = 10.0
 """A parameter is identified by the data if they narrow its prior at least this many times, and if
@@ -130,7 +128,7 @@ def _before_and_after(
 def _start_value(start: Chain, name: str) -> NDArray:
     """Return the start value of a parameter of `calibrate`."""
     part = start.part_of(name)
-    entry = as_array(start.geometry()[part.entry].detach())
+    entry = start.geometry()[part.entry].numpy(force=True)
     if name == "base":
         return entry
     return entry.ravel()[part.shown]
@@ -140,7 +138,7 @@ def _unit(start: Chain, name: str, k: int, q_unit: LogUnit) -> _Unit:
     """Return the unit of the k-th number of a parameter."""
     if name == "base" and k < 3:
         return _DEGREES
-    unit = start.unit_of(start.part_of(name).entry)
+    unit = start.unit_of(name)
     if unit.endswith(_PER_UNIT):
         of_what = unit.removesuffix(_PER_UNIT)
         scale, symbol = _SHOWN.get(of_what, (1.0, of_what))
@@ -238,8 +236,9 @@ def deviations(
             "are slack."
         )
     if "turns" in result.values or "angles" in result.values:
-        before = as_array(start.geometry()["angles"])
-        change = as_array(result.chain.geometry()["angles"]) - before
+        before = start.geometry()["angles"]
+        after = result.chain.geometry()["angles"]
+        change = (after - before).numpy(force=True)
         turned = (change - change[0] + np.pi) % (2.0 * np.pi) - np.pi
         most = np.degrees(np.abs(turned).max())
         if most > _TURN:

@@ -8,11 +8,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hybridkin._core.actuators import ActuatorLayout
-from hybridkin._core.arrays import as_array, real_array
+from hybridkin import InverseKinematics, robots
 from hybridkin.app.workflow.model import LoadedModel
-from hybridkin.chains import robots
-from hybridkin.ik.solver import InverseKinematics
+from hybridkin.arguments import real_array
 
 _WALKERS = 256
 _STEPS = 60
@@ -165,7 +163,7 @@ class Domain:
         hybrid = self.loaded.hybrid
         if hybrid is not None and hybrid.fitted_module_.tested is not None:
             tested = hybrid.fitted_module_.tested
-            rows = as_array(tested.rows) - hybrid.change_.shift
+            rows = tested.rows.numpy(force=True) - hybrid.change_.shift
             far = np.linalg.norm(rows - middle, axis=1)
             median = self._bent(np.median(rows, axis=0))
             candidates = [median, *candidates, rows[far.argmin()]]
@@ -178,7 +176,7 @@ class Domain:
         return self.rest + (q - self.rest) @ self.bending
 
     @cached_property
-    def _actuators(self) -> ActuatorLayout:
+    def _actuators(self) -> robots.ActuatorLayout:
         return self.loaded.module.robot.actuator_layout
 
     @property
