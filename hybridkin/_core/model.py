@@ -19,7 +19,7 @@ from hybridkin._core.blocks import check_tensor, check_vectors, in_blocks
 from hybridkin._core.frames import Frames, Marker
 from hybridkin._core.html import html_table
 from hybridkin._core.plan import NoKernel, Plan
-from hybridkin._core.plausible import PlausibleRows, UnknownRows
+from hybridkin._core.plausible import PlausibleRows
 from hybridkin._core.portable import PortableModule
 from hybridkin._core.stored import Layout, Stored
 
@@ -244,7 +244,7 @@ class ForwardModel(PortableModule):
 
     def plausible_rows(self) -> PlausibleRows:
         """Return bounds of rows that need no warning about units or contradictions."""
-        return UnknownRows.of(self.n_actuators)
+        return PlausibleRows.all_of(self.n_actuators)
 
     @property
     def size(self) -> float:
