@@ -323,9 +323,7 @@ def test_hybrids_of_it(kind):
 
 def test_markers_stand_side_by_side():
     g, q = drawn("mixed", 3)
-    many = g._around(
-        g.chain.with_markers([(0, 0.5), (1, 1.0, (0.0, 0.0, 0.01)), (2, 1.0)])
-    )
+    many = g._around(g.chain.with_markers([(0, 0.5), (1, 1.0, (0.0, 0.0, 0.01)), (2, 1.0)]))
     x, J = many.forward_and_jacobian(q)
     for k, tip in enumerate(many.each_tip()):
         at = slice(3 * k, 3 * k + 3)
