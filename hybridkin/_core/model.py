@@ -601,6 +601,24 @@ def _turned(v: Tensor, motion: Tensor) -> Tensor:
     return (v.unflatten(-1, (-1, 3)) @ motion[:3, :3].to(v).mT).flatten(-2)
 
 
+class ZeroModel(ForwardModel):
+    """The model x = 0 of n actuators: no mechanics, so that all of x is the residual."""
+
+    def __init__(self, n_actuators: int, n_outputs: int) -> None:
+        super().__init__()
+        self.n_actuators = n_actuators
+        self.n_outputs = n_outputs
+
+    def forward(self, q: Tensor) -> Tensor:
+        """Return zeros (..., m)."""
+        return q.new_zeros(*q.shape[:-1], self.n_outputs)
+
+    def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return zeros (..., m) and (..., m, n)."""
+        x = self(q)
+        return x, x.new_zeros(*x.shape, self.n_actuators)
+
+
 class FunctionModel(ForwardModel):
     """Any function q (..., n) -> x (..., m), torch to torch, as a forward model.
 
