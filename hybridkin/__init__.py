@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from hybridkin.chains.creep import CreepOperator
     from hybridkin.chains.elastic_tendons import ElasticTendonChain
     from hybridkin.chains.force_tendons import ForceTendonChain
-    from hybridkin.chains.length_driven import LengthDrivenChain
     from hybridkin.chains.play import PlayOperator
     from hybridkin.chains.prandtl_ishlinskii import (
         PrandtlIshlinskiiOperator,
@@ -53,7 +52,6 @@ __all__ = [
     "IKSolution",
     "IKStatus",
     "InverseKinematics",
-    "LengthDrivenChain",
     "ModelDescription",
     "PlayFit",
     "PlayOperator",
@@ -89,7 +87,6 @@ _NAMES_OF = {
     "chains.creep": ("CreepOperator",),
     "chains.elastic_tendons": ("ElasticTendonChain",),
     "chains.force_tendons": ("ForceTendonChain",),
-    "chains.length_driven": ("LengthDrivenChain",),
     "chains.play": ("PlayOperator",),
     "chains.prandtl_ishlinskii": ("PrandtlIshlinskiiOperator",),
     "chains.rigid": ("RigidChain",),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
@@ -19,7 +19,7 @@ from hybridkin._core.blocks import check_tensor, check_vectors, in_blocks
 from hybridkin._core.frames import Frames, Marker
 from hybridkin._core.html import html_table
 from hybridkin._core.plan import NoKernel, Plan
-from hybridkin._core.plausible import PlausibleRows, UnknownRows
+from hybridkin._core.plausible import PlausibleRows
 from hybridkin._core.portable import PortableModule
 from hybridkin._core.stored import Layout, Stored
 
@@ -214,6 +214,10 @@ class ForwardModel(PortableModule):
         """Return one model for each point of the robot: a chain of K markers has K."""
         return [self]
 
+    def softer(self) -> Sequence[ForwardModel]:
+        """Return the same robot with actuators that give way, where that may matter."""
+        return []
+
     def unit_messages(self, q: Tensor, name: str, factor: float = 1.0) -> list[str]:
         """Return warnings if q (N, n) holds values too large to be metres or radians.
 
@@ -240,7 +244,7 @@ class ForwardModel(PortableModule):
 
     def plausible_rows(self) -> PlausibleRows:
         """Return bounds of rows that need no warning about units or contradictions."""
-        return UnknownRows.of(self.n_actuators)
+        return PlausibleRows.all_of(self.n_actuators)
 
     @property
     def size(self) -> float:
@@ -371,10 +375,6 @@ class ForwardModel(PortableModule):
         from pytorch_kinematics import Transform3d  # takes a second and loads pyplot
 
         return Transform3d(matrix=self.pose(q))
-
-    def softer(self) -> list[ForwardModel]:
-        """Return the same robot with actuators that give way, where that may matter."""
-        return []
 
     # The robot after a change.
 
@@ -599,6 +599,24 @@ def moved_points(x: Tensor, motion: Tensor) -> Tensor:
 def _turned(v: Tensor, motion: Tensor) -> Tensor:
     """Return vectors (..., 3), or several of them in (..., m), rotated by a motion (4, 4)."""
     return (v.unflatten(-1, (-1, 3)) @ motion[:3, :3].to(v).mT).flatten(-2)
+
+
+class ZeroModel(ForwardModel):
+    """The model x = 0 of n actuators: no mechanics, so that all of x is the residual."""
+
+    def __init__(self, n_actuators: int, n_outputs: int) -> None:
+        super().__init__()
+        self.n_actuators = n_actuators
+        self.n_outputs = n_outputs
+
+    def forward(self, q: Tensor) -> Tensor:
+        """Return zeros (..., m)."""
+        return q.new_zeros(*q.shape[:-1], self.n_outputs)
+
+    def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return zeros (..., m) and (..., m, n)."""
+        x = self(q)
+        return x, x.new_zeros(*x.shape, self.n_actuators)
 
 
 class FunctionModel(ForwardModel):

@@ -25,7 +25,7 @@ CONSTRAINTS = {
     ],
     "coupling": [StrOptions({"parallel", "serial"})],
     "calibrate": [StrOptions({"auto", "default"}), "array-like", None],
-    "guard": [StrOptions({"leverage", "box"}), None],
+    "guard": [StrOptions({"leverage"}), None],
     "play": [StrOptions({"auto"}), Real, "array-like", HysteresisOperator, None],
     "coverage": [Interval(Real, 0, 1, closed="neither"), None],
     "output": [StrOptions({"position", "pose"})],

@@ -164,7 +164,7 @@ READERS = {
         [TOML],
         [hostile.damaged, hostile.renumbered, hostile.described],
         lambda path, k: _read_chain(
-            open_model(path).mechanical_model_ if k % 2 else robots.from_toml(path)
+            open_model(path).mechanical_model_ if k % 2 else robots.read_description(path).chain
         ),
         "robot.toml",
     ),

@@ -12,8 +12,6 @@ import torch
 from joblib import Parallel, delayed, effective_n_jobs
 from numpy.typing import NDArray
 from sklearn.linear_model import LinearRegression
-from sklearn.pipeline import Pipeline, make_pipeline
-from sklearn.preprocessing import MinMaxScaler, PolynomialFeatures
 
 from hybridkin import (
     CalibrationResult,
@@ -224,13 +222,6 @@ class Mechanical:
             yield from calibrated_parameters(rival.chain, result, rows.q_unit)
 
 
-def quadratic() -> Pipeline:
-    """Return a plain quadratic polynomial by least squares."""
-    return make_pipeline(
-        MinMaxScaler((-1, 1)), PolynomialFeatures(2), LinearRegression()
-    )
-
-
 def models_to_save(
     robot: robots.RobotDescription, mechanical: Mechanical, settings: FitSettings
 ) -> dict[str, HybridForwardModel]:
@@ -239,7 +230,7 @@ def models_to_save(
     without_error_model = DATA_LINEAR if robot.chain is None else CALIBRATED
     models = {
         without_error_model: HybridForwardModel(model, "drop"),
-        DATA_QUADRATIC: HybridForwardModel(None, quadratic()),
+        DATA_QUADRATIC: HybridForwardModel(None, "quadratic"),
     }
     network = growing_network(0)
     if settings.auto:
