@@ -13,12 +13,12 @@ if TYPE_CHECKING:
     from hybridkin.calibration.calibrate import CalibrationResult, calibrate
     from hybridkin.calibration.play_fit import PlayFit, fit_play
     from hybridkin.chains import robots
-    from hybridkin.chains.arc_chain import ArcChain
     from hybridkin.chains.chain import Chain
     from hybridkin.chains.constant_curvature import ConstantCurvatureChain
     from hybridkin.chains.creep import CreepOperator
     from hybridkin.chains.elastic_tendons import ElasticTendonChain
     from hybridkin.chains.force_tendons import ForceTendonChain
+    from hybridkin.chains.length_driven import LengthDrivenChain
     from hybridkin.chains.play import PlayOperator
     from hybridkin.chains.prandtl_ishlinskii import (
         PrandtlIshlinskiiOperator,
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from hybridkin.saving.saved_model import load_model, save_model
 
 __all__ = [
-    "ArcChain",
     "CalibrationResult",
     "Chain",
     "Commands",
@@ -52,6 +51,7 @@ __all__ = [
     "IKSolution",
     "IKStatus",
     "InverseKinematics",
+    "LengthDrivenChain",
     "PlayFit",
     "PlayOperator",
     "PrandtlIshlinskiiOperator",
@@ -80,12 +80,12 @@ _NAMES_OF = {
     "_core.model": ("ForwardModel", "as_forward_model", "jacobian"),
     "calibration.calibrate": ("CalibrationResult", "calibrate"),
     "calibration.play_fit": ("PlayFit", "fit_play"),
-    "chains.arc_chain": ("ArcChain",),
     "chains.chain": ("Chain",),
     "chains.constant_curvature": ("ConstantCurvatureChain",),
     "chains.creep": ("CreepOperator",),
     "chains.elastic_tendons": ("ElasticTendonChain",),
     "chains.force_tendons": ("ForceTendonChain",),
+    "chains.length_driven": ("LengthDrivenChain",),
     "chains.play": ("PlayOperator",),
     "chains.prandtl_ishlinskii": ("PrandtlIshlinskiiOperator",),
     "chains.rigid": ("RigidChain",),

@@ -14,7 +14,6 @@ from hybridkin._core.commands import Commands
 from hybridkin.calibration.calibrate import CalibrationResult, calibrate, fit_geometry
 from hybridkin.calibration.hysteresis_log import HysteresisLog
 from hybridkin.calibration.hysteresis_search import search_width
-from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.play import PlayOperator
 
@@ -125,10 +124,7 @@ def fit_play(
     >>> fit.kept, fit.width
     (True, 0.0004)
     """
-    size = 1.0
-    if isinstance(chain, ArcChain):
-        size = float(chain.gains.detach().abs().mean())
-    tried = _WIDTHS / size
+    tried = _WIDTHS / chain.mean_gain
     if widths is not None:
         tried = real_array(widths, "widths").ravel()
     tried = np.unique([0.0, *tried]).tolist()

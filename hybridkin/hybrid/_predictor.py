@@ -21,14 +21,11 @@ from hybridkin._core.distinct import targets_that_count
 from hybridkin._core.html import html_table
 from hybridkin._core.model import ForwardModel, as_forward_model
 from hybridkin._core.other_units import check_commands
-from hybridkin._core.plausible import PlausibleRows
-from hybridkin._core.units import motion_message
+from hybridkin._core.plausible import PlausibleRows, UnknownRows
 from hybridkin.calibration.calibrate import CalibrationResult
-from hybridkin.chains.chain import Chain
 from hybridkin.chains.hysteresis import HysteresisOperator
 from hybridkin.hybrid._adapt import Change
 from hybridkin.hybrid._drift import Drift
-from hybridkin.hybrid._fit import known_tips
 from hybridkin.hybrid._hysteresis import Past
 from hybridkin.hybrid._module import Hybrid
 from hybridkin.hybrid._pace import each_pace
@@ -66,9 +63,9 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     _fitted: HybridFit
     _past: Past | None
     _drift: Drift
-    _plausible_rows: PlausibleRows | None = None
+    _plausible_rows: PlausibleRows = UnknownRows.of(0)
     # Those that need no other check, and do not change by hysteresis.
-    _plain_rows: PlausibleRows | None = None
+    _plain_rows: PlausibleRows = UnknownRows.of(0)
 
     def predict(
         self,
@@ -245,31 +242,25 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """Return names and values of what the fit found, which a notebook shows."""
 
     @property
-    def _chain(self) -> Chain | None:
-        """The mechanical model if it is a chain."""
-        if isinstance(self.mechanical_model_, Chain):
-            return self.mechanical_model_
-        return None
+    def _robot(self) -> ForwardModel:
+        """The mechanical model; without one the module, which knows no robot either."""
+        return (
+            self.module_ if self.mechanical_model_ is None else self.mechanical_model_
+        )
 
     def _check_commands(self, rows: Rows) -> None:
         """Raise if actuator vectors have another unit than those of the fit."""
-        chain = self._chain
-        turns = chain is not None and bool(
-            torch.as_tensor(chain.turns, device="cpu").all()
-        )
+        turns = torch.as_tensor(self._robot.turns, device="cpu")
         low, high = self.training_range_
-        check_commands(rows.X, low, high, turns)
+        check_commands(rows.X, low, high, bool(turns.all()))
 
     def _warn_of_units(self, rows: Rows) -> None:
         """Warn if measured tips span far more than the robot, so they cannot be in metres."""
-        chain = self._chain
-        if chain is None or not rows.counts.any():
+        if not rows.counts.any():
             return
-        measured, tips = known_tips(chain, rows.take(np.flatnonzero(rows.counts)))
-        message = motion_message(
-            "y", torch.cat([tips, measured]), tips, float(chain.reach)
-        )
-        if message is not None:
+        rows = rows.take(np.flatnonzero(rows.counts))
+        tips = torch.from_numpy(rows.tips)
+        for message in self._robot.tip_messages(rows.q, tips, "y", calibrated=True):
             warnings.warn(message, stacklevel=3)
 
     def _doubts(self, q: NDArray) -> list[str]:
@@ -277,20 +268,17 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
         Negative lengths are extrapolation, no error.
         """
-        chain = self._chain
-        plausible = self._plausible_rows
-        if chain is None or (plausible and plausible.hold(q)):
+        if self._plausible_rows.hold(q):
             return []
+        robot = self._robot
         rows = torch.from_numpy(q)
-        messages = [*chain.unit_messages(rows, "X"), chain.contradiction(rows, "X")]
-        return [message for message in messages if message is not None]
+        return [*robot.unit_messages(rows, "X"), *robot.contradictions(rows, "X")]
 
     def _distances(self, q: NDArray) -> tuple[NDArray]:
         """Return the distance from the domain of rows q (N, n): infinite without a shape."""
         (distance,) = self._tips(q, value=False, distance=True, enough=1.0)
-        plausible = self._plausible_rows
-        if self._chain is not None and not (plausible and plausible.hold(q)):
-            has_shape = self._chain.has_shape(torch.from_numpy(q))
+        if not self._plausible_rows.hold(q):
+            has_shape = self._robot.has_shape(torch.from_numpy(q))
             distance = np.where(has_shape.numpy(), distance, np.inf)
         return (distance,)
 
@@ -345,10 +333,8 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if mechanical is not None:
             mechanical = self.change_.after(mechanical.without_errors)
         self.mechanical_model_ = mechanical
-        self._plausible_rows = None
-        self._plain_rows = None
-        if self._chain is not None:
-            self._plausible_rows = self._chain.plausible_rows()
+        self._plausible_rows = self._robot.plausible_rows()
+        self._plain_rows = UnknownRows.of(self.n_features_in_)
         if self.play_ is None and "feature_names_in_" not in vars(self):
             self._plain_rows = self._plausible_rows
 
@@ -381,8 +367,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         warn: bool = True,
     ) -> list[NDArray]:
         """Return the results of a function of rows q for the rows of X, in the dtype of X."""
-        plain = self._plain_rows
-        if plain is not None and plain.hold_row(X):
+        if self._plain_rows.hold_row(X):
             rows = X
             q = X
         else:

@@ -14,7 +14,8 @@ from sklearn.linear_model import LinearRegression
 
 from hybridkin._core.arrays import LARGEST
 from hybridkin._core.estimators import estimator_of, params_of, restore_columns
-from hybridkin._core.model import PortableModule, as_forward_model
+from hybridkin._core.model import as_forward_model
+from hybridkin._core.portable import PortableModule
 from hybridkin._core.stored import (
     KINDS_OF_MODELS,
     Restore,

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 import hybridkin
-from hybridkin import ArcChain, Chain, Commands, ForwardModel, as_forward_model, robots
+from hybridkin import Chain, Commands, ForwardModel, as_forward_model, robots
 from hybridkin._core.digests import row_digests
 from hybridkin.app.workflow.errors import ExpectedErrors, HeldOutErrors, Promise
 from hybridkin.arguments import as_path, shaped
@@ -264,9 +264,7 @@ class LoadedModel:
         if self.description is not None and self.description.log is not None:
             return self.description.log
         names = tuple(f"q{i + 1}" for i in range(self.n_actuators))
-        unit = "m"
-        if isinstance(self.chain, ArcChain) and not self.chain.in_metres:
-            unit = "1"
+        unit = "m" if self.module.robot.in_metres else "1"
         return robots.LogFormat(names, ("x", "y", "z"), unit)
 
 
