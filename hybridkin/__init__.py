@@ -27,12 +27,14 @@ if TYPE_CHECKING:
     from hybridkin.chains.series import HysteresisSeries
     from hybridkin.hybrid.choose_rows import choose_rows
     from hybridkin.hybrid.estimator import HybridForwardModel
+    from hybridkin.hybrid.model_description import ModelDescription
     from hybridkin.ik import tasks, trajectories
     from hybridkin.ik.results import IKSolution, IKStatus, Step, Track
     from hybridkin.ik.solver import InverseKinematics
     from hybridkin.ik.tracker import Tracker
     from hybridkin.learning.elm import ELMRegressor
     from hybridkin.learning.elm_cv import ELMRegressorCV
+    from hybridkin.saving.opened_model import open_model
     from hybridkin.saving.saved_model import load_model, save_model
 
 __all__ = [
@@ -52,6 +54,7 @@ __all__ = [
     "IKStatus",
     "InverseKinematics",
     "LengthDrivenChain",
+    "ModelDescription",
     "PlayFit",
     "PlayOperator",
     "PrandtlIshlinskiiOperator",
@@ -68,6 +71,7 @@ __all__ = [
     "jacobian",
     "load_model",
     "native",
+    "open_model",
     "plots",
     "robots",
     "save_model",
@@ -91,6 +95,8 @@ _NAMES_OF = {
     "chains.rigid": ("RigidChain",),
     "chains.series": ("HysteresisSeries",),
     "hybrid.choose_rows": ("choose_rows",),
+    "hybrid.model_description": ("ModelDescription",),
+    "saving.opened_model": ("open_model",),
     "hybrid.estimator": ("HybridForwardModel",),
     "ik.results": ("IKSolution", "IKStatus", "Step", "Track"),
     "ik.solver": ("InverseKinematics",),

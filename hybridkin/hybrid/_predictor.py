@@ -14,9 +14,11 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.metrics import r2_score
 from sklearn.utils.validation import check_is_fitted
+from typing_extensions import Self
 
 from hybridkin._core.arrays import labels
 from hybridkin._core.commands import Commands
+from hybridkin._core.digests import row_digests
 from hybridkin._core.distinct import targets_that_count
 from hybridkin._core.html import html_table
 from hybridkin._core.model import ForwardModel, as_forward_model
@@ -35,6 +37,7 @@ from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._wrapped import in_columns, pose_difference
 from hybridkin.hybrid.cv_results import CvResults
 from hybridkin.hybrid.log_fit import HybridFit
+from hybridkin.hybrid.model_description import ModelDescription
 from hybridkin.learning.hidden_layer import check_inputs
 from hybridkin.native.library import evaluate
 
@@ -60,6 +63,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     cv_results_: CvResults | None
     play_: HysteresisOperator | None
     radius_: Radius | None
+    description_: ModelDescription
     _fitted: HybridFit
     _past: Past | None
     _drift: Drift
@@ -178,6 +182,30 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """
         inside = self._evaluated(self._distances, X, warn=False)[0] <= 1.0
         return inside & self._are_states_seen(X)
+
+    def described(self, description: ModelDescription) -> Self:
+        """Return this estimator with another `description_`."""
+        self.description_ = description
+        return self
+
+    def was_fitted(self, X: object, y: ArrayLike) -> NDArray[np.bool_]:
+        """Return which rows are rows of the fit, to a micrometre, shape (N,).
+
+        Parameters
+        ----------
+        X : array-like of shape (N, n) or Commands
+            Actuator vectors, as for `fit`.
+        y : array-like of shape (N, m)
+            Measured tips [m].
+
+        Returns
+        -------
+        ndarray of bool of shape (N,)
+            All False for a nominal model, which no rows were fitted to.
+        """
+        check_is_fitted(self, "module_")
+        q = check_inputs(self, Commands.of(X).q)
+        return np.isin(row_digests(q, y), self._fitted.fitted_rows)
 
     def effective(self, X: object) -> NDArray:
         """Return what the actuators do for commands X [unit of q]; without `play`, X itself.
@@ -321,6 +349,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self._drift = fit.no_drift
         self._past = None
         self._follow_robot()
+        self.description_ = ModelDescription.of(self.module_, self.n_features_in_)
 
     def _follow_robot(self) -> None:
         """Set the module and its mechanical model after the change and the drift of the robot."""

@@ -14,7 +14,7 @@ from sklearn.linear_model import LinearRegression
 
 from hybridkin._core.arrays import LARGEST
 from hybridkin._core.estimators import estimator_of, params_of, restore_columns
-from hybridkin._core.model import as_forward_model
+from hybridkin._core.model import ForwardModel, as_forward_model
 from hybridkin._core.portable import PortableModule
 from hybridkin._core.stored import (
     KINDS_OF_MODELS,
@@ -38,7 +38,7 @@ from hybridkin.chains.prandtl_ishlinskii import PrandtlIshlinskiiOperator
 from hybridkin.chains.series import HysteresisSeries
 from hybridkin.hybrid._adapt import Change
 from hybridkin.hybrid._drift import Drift
-from hybridkin.hybrid._module import Hybrid
+from hybridkin.hybrid._module import Hybrid, HybridModule
 from hybridkin.hybrid._pace import PaceRange
 from hybridkin.hybrid._radius import Radius
 from hybridkin.hybrid._range import TrainingRange
@@ -49,6 +49,7 @@ from hybridkin.hybrid.estimator import HybridForwardModel
 from hybridkin.hybrid.log_fit import HybridFit
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.elm_cv import ELMRegressorCV
+from hybridkin.native.export import usual_range
 
 # Regressors that a file may name as the setting `error_model`.
 _OPERATOR = "operator"  # `play` was one: that of the fit
@@ -200,6 +201,32 @@ def hybrid_of(stored: Stored, training: object) -> HybridForwardModel:
         raise ValueError("the arrays do not fit together") from error
     if not (torch.isfinite(x).all() and torch.isfinite(J).all()):
         raise ValueError("the arrays do not give finite numbers")
+    return model
+
+
+def nominal_hybrid(mechanical: ForwardModel) -> HybridForwardModel:
+    """Return a model that no rows were fitted to as a fitted one, without a correction.
+
+    Its training range is unknown: from minus infinity to infinity.
+    """
+    n = mechanical.n_actuators
+    middle, half = usual_range(mechanical, n)
+    q = torch.from_numpy(np.stack([middle - half, middle + half]))
+    model = HybridForwardModel(mechanical, "drop")
+    model.n_features_in_ = n
+    error_model = model._checked_error_model()
+    module = HybridModule(mechanical, [], q.new_zeros(0))
+    model._take(
+        HybridFit(
+            module=module,
+            error=FittedError(None, [], error_model),
+            kind=None,
+            fitted_rows=np.empty(0),
+            single_output=False,
+            training_range=TrainingRange(np.full(n, -inf), np.full(n, inf)),
+            no_drift=Drift.of_range(q, mechanical.n_outputs),
+        )
+    )
     return model
 
 
