@@ -5,8 +5,6 @@ import pickle
 import pytest
 import torch
 
-from hybridkin._core import model
-
 
 @pytest.mark.parametrize("written", ["cpu", "cuda:7", "mps:0"])
 def test_tensors_are_restored_on_a_device_that_exists(written):
