@@ -8,6 +8,6 @@ import torch
 
 @pytest.mark.parametrize("written", ["cpu", "cuda:7", "mps:0"])
 def test_tensors_are_restored_on_a_device_that_exists(written):
-    pickled = model._Pickled(torch.arange(3.0))
+    pickled = portable._Pickled(torch.arange(3.0))
     pickled.device = written
     assert torch.equal(pickle.loads(pickle.dumps(pickled)), torch.arange(3.0))
