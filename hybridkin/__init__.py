@@ -11,20 +11,14 @@ if TYPE_CHECKING:
     from hybridkin._core.commands import Commands
     from hybridkin._core.model import ForwardModel, as_forward_model, jacobian
     from hybridkin.calibration.calibrate import CalibrationResult, calibrate
-    from hybridkin.calibration.play_fit import PlayFit, fit_play
     from hybridkin.chains import robots
     from hybridkin.chains.constant_curvature import ConstantCurvatureChain
-    from hybridkin.chains.creep import CreepOperator
     from hybridkin.chains.elastic_tendons import ElasticTendonChain
     from hybridkin.chains.force_tendons import ForceTendonChain
-    from hybridkin.chains.play import PlayOperator
-    from hybridkin.chains.prandtl_ishlinskii import (
-        PrandtlIshlinskiiOperator,
-    )
     from hybridkin.chains.rigid import RigidChain
-    from hybridkin.chains.series import HysteresisSeries
     from hybridkin.hybrid.choose_rows import choose_rows
     from hybridkin.hybrid.estimator import HybridForwardModel
+    from hybridkin.hysteresis.value import Hysteresis
     from hybridkin.ik import tasks, trajectories
     from hybridkin.ik.results import IKSolution, IKStatus, Step, Track
     from hybridkin.ik.solver import InverseKinematics
@@ -37,20 +31,16 @@ __all__ = [
     "CalibrationResult",
     "Commands",
     "ConstantCurvatureChain",
-    "CreepOperator",
     "ELMRegressor",
     "ELMRegressorCV",
     "ElasticTendonChain",
     "ForceTendonChain",
     "ForwardModel",
     "HybridForwardModel",
-    "HysteresisSeries",
+    "Hysteresis",
     "IKSolution",
     "IKStatus",
     "InverseKinematics",
-    "PlayFit",
-    "PlayOperator",
-    "PrandtlIshlinskiiOperator",
     "RigidChain",
     "Step",
     "Track",
@@ -60,7 +50,6 @@ __all__ = [
     "calibrate",
     "choose_rows",
     "datasets",
-    "fit_play",
     "jacobian",
     "load_model",
     "native",
@@ -75,17 +64,13 @@ _NAMES_OF = {
     "_core.commands": ("Commands",),
     "_core.model": ("ForwardModel", "as_forward_model", "jacobian"),
     "calibration.calibrate": ("CalibrationResult", "calibrate"),
-    "calibration.play_fit": ("PlayFit", "fit_play"),
     "chains.constant_curvature": ("ConstantCurvatureChain",),
-    "chains.creep": ("CreepOperator",),
     "chains.elastic_tendons": ("ElasticTendonChain",),
     "chains.force_tendons": ("ForceTendonChain",),
-    "chains.play": ("PlayOperator",),
-    "chains.prandtl_ishlinskii": ("PrandtlIshlinskiiOperator",),
     "chains.rigid": ("RigidChain",),
-    "chains.series": ("HysteresisSeries",),
     "hybrid.choose_rows": ("choose_rows",),
     "hybrid.estimator": ("HybridForwardModel",),
+    "hysteresis.value": ("Hysteresis",),
     "ik.results": ("IKSolution", "IKStatus", "Step", "Track"),
     "ik.solver": ("InverseKinematics",),
     "ik.tracker": ("Tracker",),

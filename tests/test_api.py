@@ -20,6 +20,7 @@ FLOORS = [
     {"app"},
     {"saving"},
     {"hybrid"},
+    {"hysteresis"},
     {"calibration"},
     {"chains", "learning", "ik"},
     {"native"},

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.autograd import grad
 
+from hybridkin._core.actuation import DIRECT, Actuation
 from hybridkin._core.arrays import as_array
 from hybridkin._core.blocks import check_tensor
 from hybridkin._core.derived import KEPT, entries_of
@@ -203,6 +204,11 @@ class ForwardModel(PortableModule):
         return 0.0
 
     @property
+    def hysteresis(self) -> Actuation:
+        """The hysteresis between commands and q, which is what the actuators do; maybe none."""
+        return DIRECT
+
+    @property
     def has_pose(self) -> bool:
         """Whether the model has poses of the tip, as a chain has."""
         return False
@@ -210,6 +216,11 @@ class ForwardModel(PortableModule):
     @property
     def robot(self) -> ForwardModel:
         """The model with the geometry: the mechanical model of a hybrid, else the model itself."""
+        return self
+
+    @property
+    def without_hysteresis(self) -> ForwardModel:
+        """The model of actuators that do what they are commanded."""
         return self
 
     @property

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from typing_extensions import Self
 
+from hybridkin._core.actuation import Actuation
 from hybridkin._core.arrays import as_array
 from hybridkin._core.blocks import check_vectors, in_blocks
 from hybridkin._core.model import ForwardModel, PoseModel
@@ -65,6 +66,16 @@ class Wrapped(PoseModel):
     def plane(self) -> tuple[Tensor, Tensor] | None:
         """The plane of the log."""
         return self.model.plane
+
+    @property
+    def hysteresis(self) -> Actuation:
+        """The hysteresis between commands and q."""
+        return self.model.hysteresis
+
+    @property
+    def without_hysteresis(self) -> ForwardModel:
+        """The model of actuators that do what they are commanded."""
+        return self.around(self.model.without_hysteresis)
 
     def around(self, model: ForwardModel) -> ForwardModel:
         """Return another model, changed like this one."""
@@ -308,6 +319,16 @@ class Stacked(Hybrid):
         ]
         return torch.stack(missed).amax(0)
 
+    @property
+    def hysteresis(self) -> Actuation:
+        """The hysteresis between commands and q, which is that of the tip."""
+        return self.tip_model.hysteresis
+
+    def behind(self, hysteresis: Actuation) -> Self:
+        """Return the same model with another hysteresis; this model does not change."""
+        tips = [tip.behind(hysteresis) for tip in self._tips()]
+        return type(self)(self.mechanical, tips)
+
     def with_drift(self, drift: AffineModule) -> Self:
         """Return the same model with another drift; this model does not change."""
         tips = []
@@ -423,6 +444,15 @@ class WithPose(Hybrid, PoseModel):
         """Return how much farther targets are than f reaches with the longest correction."""
         longest = torch.as_tensor(self.learned.longest_correction, device=x.device)
         return self.mechanical.misses(x, largest) - longest
+
+    @property
+    def hysteresis(self) -> Actuation:
+        """The hysteresis between commands and q."""
+        return self.learned.hysteresis
+
+    def behind(self, hysteresis: Actuation) -> Self:
+        """Return the same model with another hysteresis; this model does not change."""
+        return type(self)(self.mechanical, self.learned.behind(hysteresis))
 
     def with_drift(self, drift: AffineModule) -> Self:
         """Return the same model with another drift; this model does not change."""

@@ -16,8 +16,8 @@ from hybridkin._core.named_rows import named_places
 from hybridkin._core.runs import RunOrder
 from hybridkin._core.units import FRAMES, duration_in_words
 from hybridkin.app.checks.report import LogFinding
-from hybridkin.chains.reversals import Coarseness
 from hybridkin.datasets.logs import Log, column_names
+from hybridkin.hysteresis.reversals import Coarseness
 
 _FROZEN_ROWS = 3  # fewer rows may be chance
 _FROZEN_WAY = 0.1  # part of an actuator's range over which the tip must have moved
@@ -257,7 +257,7 @@ def same_commands(rows: LogRows) -> Iterator[LogFinding]:
     )
     advice = (
         "this is noise, or backlash (also called play) if the robot came from another side, "
-        "which --play auto (play=) can fit; other models cannot have a smaller error."
+        "which --hysteresis auto (hysteresis=) can fit; other models cannot have a smaller error."
     )
     yield rows.finding("same command", message, advice, different[repeated], "note")
 

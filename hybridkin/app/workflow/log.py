@@ -141,7 +141,7 @@ class MeasuredLog(Log):
         counts = np.zeros(len(self.q))
         counts[rows] = 1.0
         # Reading a description loads no calibration.
-        from hybridkin.calibration.hysteresis_log import needed_rows
+        from hybridkin.hysteresis.log import needed_rows
 
         needed = needed_rows(self.commands.run_of_rows, rows)
         return replace(self, counts=counts).rows(needed)

@@ -13,8 +13,7 @@ from hybridkin.app.checks.causes.cause import Cause
 from hybridkin.app.checks.causes.commands import ActuatorCause
 from hybridkin.app.checks.causes.evidence import Evidence
 from hybridkin.app.checks.causes.motion import Motion
-from hybridkin.chains.creep import CreepOperator
-from hybridkin.chains.play import PlayOperator
+from hybridkin.hysteresis.value import Hysteresis
 
 _PERIODS = 63  # at most, as in a control loop
 _MOST = 0.25  # of the duration: else the ends of the motion decide
@@ -103,7 +102,7 @@ class Backlash(_Hysteresis):
     def effective(self, motion: Motion, parameters: NDArray) -> NDArray:
         """Return the motion (T, n) behind the backlash [unit of q]."""
         width = max(float(parameters[0]), 0.0)
-        return motion.after(PlayOperator(width))
+        return motion.after(Hysteresis.backlash(width))
 
     def amount(self, evidence: Evidence, parameters: NDArray) -> str:
         """Return the width in words."""
@@ -117,9 +116,7 @@ class Creep(_Hysteresis):
     """A share of every change comes late."""
 
     name = "creep"
-    remedy = (
-        "fit named motions with times (--play auto), or move slowly and wait for rest"
-    )
+    remedy = "fit named motions with times (--hysteresis auto), or move slowly and wait for rest"
     n_parameters = 2
 
     def starts(self, evidence: Evidence) -> Sequence[NDArray]:
@@ -147,7 +144,7 @@ class Creep(_Hysteresis):
     def effective(self, motion: Motion, parameters: NDArray) -> NDArray:
         """Return the motion (T, n) of which a part comes late [unit of q]."""
         late_part, time = self._share_and_time(motion, parameters)
-        return motion.after(CreepOperator([late_part], [time]))
+        return motion.after(Hysteresis.creep([late_part], [time]))
 
     def amount(self, evidence: Evidence, parameters: NDArray) -> str:
         """Return the share and the time constant in words."""
