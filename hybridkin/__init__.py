@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from hybridkin._core.model import ForwardModel, as_forward_model, jacobian
     from hybridkin.calibration.calibrate import CalibrationResult, calibrate
     from hybridkin.chains import robots
+    from hybridkin.chains.arc_chain import ArcChain
+    from hybridkin.chains.chain import Chain
     from hybridkin.chains.constant_curvature import ConstantCurvatureChain
     from hybridkin.chains.elastic_tendons import ElasticTendonChain
     from hybridkin.chains.force_tendons import ForceTendonChain
@@ -28,7 +30,9 @@ if TYPE_CHECKING:
     from hybridkin.saving.saved_model import load_model, save_model
 
 __all__ = [
+    "ArcChain",
     "CalibrationResult",
+    "Chain",
     "Commands",
     "ConstantCurvatureChain",
     "ELMRegressor",
@@ -64,6 +68,8 @@ _NAMES_OF = {
     "_core.commands": ("Commands",),
     "_core.model": ("ForwardModel", "as_forward_model", "jacobian"),
     "calibration.calibrate": ("CalibrationResult", "calibrate"),
+    "chains.arc_chain": ("ArcChain",),
+    "chains.chain": ("Chain",),
     "chains.constant_curvature": ("ConstantCurvatureChain",),
     "chains.elastic_tendons": ("ElasticTendonChain",),
     "chains.force_tendons": ("ForceTendonChain",),

@@ -353,7 +353,7 @@ class Tracker(Portable):
         settings = self._settings
         like = self._like
         target = settings.points(x_target, "x_target", like, lead="")
-        feed_forward = None
+        feed_forward = like.new_zeros(1, sum(settings.task.parts))
         if dx is not None:
             shape = (sum(settings.task.parts),)
             velocity = settings.points(dx, "dx", like, lead="", shape=shape)
@@ -369,7 +369,7 @@ class Tracker(Portable):
         periods: list[float],
         plant: Plant | None,
         feedback: str | None,
-        progress: Callable[[int, int], None] | None,
+        progress: Callable[[int, int], None],
     ) -> list[Tensor]:
         """Return columns with a row for every point of the path (T, ...).
 
@@ -387,8 +387,7 @@ class Tracker(Portable):
         held = damped = torch.zeros(1, dtype=torch.bool, device=targets.device)
         rows = []
         for i, target in enumerate(targets.split(1)):
-            if progress is not None:
-                progress(i, n)
+            progress(i, n)
             tip = None
             if plant is not None:
                 tip = self._measured(plant, i)
@@ -475,7 +474,7 @@ class _InTorch:
         self,
         period: float | None,
         target: Tensor | None,
-        feed_forward: Tensor | None,
+        feed_forward: Tensor,
         tip: Tensor | None,
         age: float,
     ) -> Tick:
@@ -499,8 +498,8 @@ class _InTorch:
             before = used + task.difference(self._last.x, target) - model_error
         seconds = period or settings.dt
         last = self._last.step.dq * (seconds / self._period)
-        at = None
-        if settings.tip_limits is not None:
+        at = x
+        if settings.tip_limits.n > 0:
             at = x + readings.offset
         rest = self._rest.seen(settings, before, used, J)
         control = partial(
@@ -509,10 +508,10 @@ class _InTorch:
             effective,
             J,
             used,
-            feed_forward,
-            seconds,
-            last,
             at,
+            seconds,
+            feed_forward,
+            last,
             least=rest.least(used),
         )
         step = self._lead.step(control, J, seconds, last)

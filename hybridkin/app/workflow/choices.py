@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from typing import Any
 
-from hybridkin._core.units import LogUnit
+from hybridkin import ELMRegressorCV, HybridForwardModel
 from hybridkin.app.workflow.report import millimetres
-from hybridkin.hybrid.cv_results import CvResults
-from hybridkin.hybrid.estimator import HybridForwardModel
-from hybridkin.learning.elm_cv import ELMRegressorCV
+from hybridkin.formats import LogUnit
 
 
 def choice_in_words(model: HybridForwardModel, unit: LogUnit) -> str:
@@ -27,7 +27,7 @@ def choice_in_words(model: HybridForwardModel, unit: LogUnit) -> str:
     return model.error_model
 
 
-def _weights(results: CvResults) -> dict[str, float]:
+def _weights(results: Mapping[str, Any]) -> dict[str, float]:
     """Return the weights of the chosen error models, largest first."""
     chosen = {}
     for name, weight in results["weights"].items():
@@ -41,7 +41,7 @@ def memory_in_words(model: HybridForwardModel, unit: LogUnit) -> str:
     return model.hysteresis_.in_words(unit)
 
 
-def auto_in_short(results: CvResults, hysteresis: str) -> str:
+def auto_in_short(results: Mapping[str, Any], hysteresis: str) -> str:
     """Return the parts, the calibrated parameters and the hysteresis that "auto" chose."""
     weights = _weights(results)
     words = next(iter(weights))

@@ -15,9 +15,15 @@ from sklearn.linear_model import LinearRegression
 from sklearn.pipeline import Pipeline, make_pipeline
 from sklearn.preprocessing import MinMaxScaler, PolynomialFeatures
 
-from hybridkin._core.arrays import whole
-from hybridkin._core.commands import Commands
-from hybridkin._core.model import ForwardModel
+from hybridkin import (
+    CalibrationResult,
+    Chain,
+    Commands,
+    ForwardModel,
+    HybridForwardModel,
+    Hysteresis,
+    robots,
+)
 from hybridkin._core.turns import one_thread
 from hybridkin.app.workflow.calibrated import CalibratedParameter, calibrated_parameters
 from hybridkin.app.workflow.choices import (
@@ -25,21 +31,20 @@ from hybridkin.app.workflow.choices import (
     choice_in_words,
     memory_in_words,
 )
+from hybridkin.app.workflow.errors import marker_distances
 from hybridkin.app.workflow.log import MeasuredLog
 from hybridkin.app.workflow.report import Progress, quiet
-from hybridkin.calibration.calibrate import CalibrationResult, fit_geometry
+from hybridkin.arguments import whole
+from hybridkin.calibration.calibrate import fit_geometry
 from hybridkin.calibration.choice import GeometryChoice, choose_geometry
-from hybridkin.calibration.measured import distances, folds
-from hybridkin.chains.chain import Chain
-from hybridkin.chains.robots import RobotDescription
-from hybridkin.hybrid.estimator import HybridForwardModel, prepared, with_fit
+from hybridkin.calibration.measured import folds
+from hybridkin.hybrid.estimator import prepared, with_fit
 from hybridkin.hybrid.held_out import HeldOut, Predictions, chosen_blend
 from hybridkin.hybrid.log_distance import held_out_distances
 from hybridkin.hybrid.log_fit import FitStart, HybridFit, fit_to_log
-from hybridkin.hysteresis.value import Hysteresis
 from hybridkin.learning.elm_cv import growing_network
 from hybridkin.learning.regressor_modules import error_module
-from hybridkin.native.library import evaluate
+from hybridkin.native import evaluate
 
 NOMINAL = "mechanical, nominal"
 CALIBRATED = "mechanical, calibrated"
@@ -131,7 +136,8 @@ class Comparison:
     def markers(self) -> dict[str, NDArray]:
         """Error of every marker of each row (N, K) by model [m], NaN if it was not measured."""
         return {
-            name: distances(tips, self.measured) for name, tips in self.tips.items()
+            name: marker_distances(tips, self.measured)
+            for name, tips in self.tips.items()
         }
 
     @cached_property
@@ -178,7 +184,7 @@ class Mechanical:
     @classmethod
     def of(
         cls,
-        robot: RobotDescription,
+        robot: robots.RobotDescription,
         rows: MeasuredLog,
         loss: str,
         of_all: Mechanical | None = None,
@@ -232,7 +238,7 @@ def quadratic() -> Pipeline:
 
 
 def models_to_save(
-    robot: RobotDescription, mechanical: Mechanical, settings: FitSettings
+    robot: robots.RobotDescription, mechanical: Mechanical, settings: FitSettings
 ) -> dict[str, HybridForwardModel]:
     """Return the unfitted models of the comparison by name."""
     model = mechanical.model
@@ -254,7 +260,7 @@ def models_to_save(
 
 
 def _auto(
-    robot: RobotDescription, calibrated: ForwardModel, settings: FitSettings
+    robot: robots.RobotDescription, calibrated: ForwardModel, settings: FitSettings
 ) -> HybridForwardModel:
     """Return the hybrid with error_model="auto".
 
@@ -306,7 +312,7 @@ class FittedModels(NamedTuple):
 
 def fit_to_all(
     rows: MeasuredLog,
-    robot: RobotDescription,
+    robot: robots.RobotDescription,
     settings: FitSettings,
     mechanical: Mechanical,
     progress: Progress = quiet,
@@ -337,7 +343,7 @@ def fit_to_all(
 
 def compare_by_group(
     rows: MeasuredLog,
-    robot: RobotDescription,
+    robot: robots.RobotDescription,
     settings: FitSettings,
     fitted: FittedModels,
     *,
@@ -444,7 +450,7 @@ class _FoldResult(NamedTuple):
 
 @one_thread()  # the processes share the cores already
 def _one_fold(
-    robot: RobotDescription,
+    robot: robots.RobotDescription,
     settings: FitSettings,
     rows: MeasuredLog,
     training_rows: NDArray,
@@ -523,7 +529,7 @@ def _blended(
 
 
 def _nominal(
-    robot: RobotDescription, chain: Chain, rows: MeasuredLog, loss: str
+    robot: robots.RobotDescription, chain: Chain, rows: MeasuredLog, loss: str
 ) -> Chain:
     """Return the described chain, with a fitted base if the base is calibrated."""
     if not robot.base_is_free:

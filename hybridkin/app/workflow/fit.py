@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from hybridkin import HybridForwardModel, robots, save_model
 from hybridkin.app.workflow.calibrated import Calibration, deviations
 from hybridkin.app.workflow.choices import auto_in_words, choice_in_words
 from hybridkin.app.workflow.compare import (
@@ -40,18 +41,16 @@ from hybridkin.app.workflow.fit_record import (
 from hybridkin.app.workflow.log import MeasuredLog, checked
 from hybridkin.app.workflow.model import LoadedModel
 from hybridkin.app.workflow.report import Progress, Report, check_out, quiet
-from hybridkin.chains.robots import RobotDescription
 from hybridkin.datasets import Log
-from hybridkin.hybrid.estimator import HybridForwardModel, prepared, with_fit
+from hybridkin.hybrid.estimator import prepared, with_fit
 from hybridkin.hybrid.log_fit import fit_to_log
-from hybridkin.saving.saved_model import save_model
 
 _FILES = ("model.safetensors", "robot.toml", "held_out.png", "error_histogram.png")
 
 
 def fit_log(
     log: Log,
-    robot: RobotDescription,
+    robot: robots.RobotDescription,
     out: str | Path,
     settings: FitSettings = DEFAULTS,
     *,
@@ -165,7 +164,9 @@ def fit_log(
     return report
 
 
-def _check(log: MeasuredLog, robot: RobotDescription, settings: FitSettings) -> None:
+def _check(
+    log: MeasuredLog, robot: robots.RobotDescription, settings: FitSettings
+) -> None:
     """Raise if the log or the settings do not allow a comparison by motions."""
     n_motions = len(np.unique(log.motions))
     if n_motions < 3:
@@ -225,7 +226,7 @@ def _in_words(loaded: LoadedModel, model: HybridForwardModel) -> list[str]:
 
 
 def _add_model(
-    report: Report[FitRecord], model: HybridForwardModel, robot: RobotDescription
+    report: Report[FitRecord], model: HybridForwardModel, robot: robots.RobotDescription
 ) -> None:
     """Add the model and the description of its robot to the files of a report."""
     training = training_notes(report.record)

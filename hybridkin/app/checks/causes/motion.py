@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Self
 
-from hybridkin.hysteresis.value import Hysteresis
+from hybridkin import Hysteresis
 
 
 @dataclass(frozen=True, eq=False)
