@@ -5,6 +5,8 @@ import pickle
 import pytest
 import torch
 
+from hybridkin._core import portable
+
 
 @pytest.mark.parametrize("written", ["cpu", "cuda:7", "mps:0"])
 def test_tensors_are_restored_on_a_device_that_exists(written):
