@@ -306,7 +306,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if self._plausible_rows.hold(q):
             return []
         robot = self._robot
-        rows = torch.from_numpy(q)
+        rows = torch.tensor(q, device="cpu")
         return [*robot.unit_messages(rows, "X"), *robot.contradictions(rows, "X")]
 
     def _distances(self, q: NDArray) -> tuple[NDArray]:
