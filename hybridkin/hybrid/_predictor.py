@@ -313,7 +313,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """Return the distance from the domain of rows q (N, n): infinite without a shape."""
         (distance,) = self._tips(q, value=False, distance=True, enough=1.0)
         if not self._plausible_rows.hold(q):
-            has_shape = self._robot.has_shape(torch.from_numpy(q))
+            has_shape = self._robot.has_shape(torch.tensor(q, device="cpu"))
             distance = np.where(has_shape.numpy(), distance, np.inf)
         return (distance,)
 
