@@ -40,9 +40,8 @@ from sklearn.model_selection import GroupKFold
 
 from hybridkin import (
     Commands,
-    CreepOperator,
     HybridForwardModel,
-    PlayOperator,
+    Hysteresis,
     native,
     open_model,
     save_model,
@@ -161,12 +160,12 @@ def _payload(run: Run) -> NDArray:
 
 def _backlash(run: Run) -> NDArray:
     width = 0.06 * np.ptp(run.q, axis=0).max()
-    return run.robot.tips(PlayOperator(width).apply(run.q)[0])
+    return run.robot.tips(Hysteresis.backlash(width).apply(run.q)[0])
 
 
 def _creep(run: Run) -> NDArray:
     steps = np.full(len(run.q), PERIOD)
-    return run.robot.tips(CreepOperator([0.3], [1.0]).apply(run.q, dt=steps)[0])
+    return run.robot.tips(Hysteresis.creep([0.3], [1.0]).apply(run.q, dt=steps)[0])
 
 
 def _misread(run: Run) -> NDArray:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.autograd import grad
 
+from hybridkin._core.actuation import DIRECT, Actuation
 from hybridkin._core.actuators import ActuatorLayout
 from hybridkin._core.arrays import identity
 from hybridkin._core.blocks import check_tensor, check_vectors, in_blocks
@@ -138,6 +139,11 @@ class ForwardModel(PortableModule):
     # What is known of the body.
 
     @property
+    def hysteresis(self) -> Actuation:
+        """The hysteresis between commands and q, which is what the actuators do; maybe none."""
+        return DIRECT
+
+    @property
     def has_pose(self) -> bool:
         """Whether the model has poses of the tip, as a chain has."""
         return False
@@ -198,6 +204,11 @@ class ForwardModel(PortableModule):
     @property
     def robot(self) -> ForwardModel:
         """The model with the geometry: the mechanical model of a hybrid, else the model itself."""
+        return self
+
+    @property
+    def without_hysteresis(self) -> ForwardModel:
+        """The model of actuators that do what they are commanded."""
         return self
 
     @property
@@ -451,6 +462,16 @@ class Wrapped(PoseModel):
     def plane(self) -> tuple[Tensor, Tensor] | None:
         """The plane of the log."""
         return self.model.plane
+
+    @property
+    def hysteresis(self) -> Actuation:
+        """The hysteresis between commands and q."""
+        return self.model.hysteresis
+
+    @property
+    def without_hysteresis(self) -> ForwardModel:
+        """The model of actuators that do what they are commanded."""
+        return self.around(self.model.without_hysteresis)
 
     def around(self, model: ForwardModel) -> ForwardModel:
         """Return another model, changed like this one."""

@@ -12,8 +12,8 @@ from torch import Tensor
 from hybridkin import robots
 from hybridkin.app.workflow.errors import HeldOutErrors
 from hybridkin.app.workflow.model import (
+    hysteresis_in_words,
     is_fitted,
-    log_unit,
     trained_range,
     widths_in_log,
 )
@@ -42,7 +42,7 @@ class Description:
         That of its chain, see ``Chain.geometry``.
     auto : dict or None
         The choices of "auto", see ``HybridForwardModel.cv_results_``.
-    play : list of float or None
+    hysteresis : list of float or None
         Widths of the hysteresis of one or all actuators, in the unit of the robot's logs.
     domain : Limits
         Training range.
@@ -62,7 +62,7 @@ class Description:
     n_actuators: int
     geometry: Mapping[str, Tensor]
     auto: Mapping[str, Any] | None
-    play: list[float] | None
+    hysteresis: list[float] | None
     domain: robots.Limits
     log_format: robots.LogFormat
     limits: robots.Limits
@@ -98,7 +98,7 @@ def describe(model: HybridForwardModel) -> Report[Description]:
         n_actuators=model.n_features_in_,
         geometry=robot.geometry(),
         auto=model.cv_results_,
-        play=widths_in_log(model),
+        hysteresis=widths_in_log(model),
         domain=trained_range(model),
         log_format=known.log,
         limits=known.limits,
@@ -107,8 +107,8 @@ def describe(model: HybridForwardModel) -> Report[Description]:
         versions=known.versions,
     )
     hysteresis = ""
-    if model.play_ is not None:
-        hysteresis = f"The actuators have {model.play_.in_words(log_unit(model))}."
+    if model.hysteresis_:
+        hysteresis = f"The actuators have {hysteresis_in_words(model)}."
     return _report(record, rows, hysteresis)
 
 
@@ -142,7 +142,7 @@ def describe_robot(robot: robots.RobotDescription) -> Report[Description]:
         n_actuators=n,
         geometry=robot.chain.geometry(),
         auto=None,
-        play=None,
+        hysteresis=None,
         domain=robots.Limits(),
         log_format=log,
         limits=robot.limits,

@@ -145,8 +145,8 @@ def evaluate_log(
     check_columns(model, log.q)
     measured = checked(log, None, base_is_free=False)
     measured.check(force)
-    if model.play_ is not None:
-        measured.check_order("A model with backlash (play)")
+    if model.hysteresis_:
+        measured.check_order("A model with hysteresis")
     predicted = model.predict(measured.commands)
     markers = marker_distances(predicted, log.x)
     errors = _row_errors(model, measured.commands, markers)

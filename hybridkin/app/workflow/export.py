@@ -8,7 +8,7 @@ import numpy as np
 
 from hybridkin import HybridForwardModel
 from hybridkin.app.workflow.domain import Domain, PathLimits, path_limits
-from hybridkin.app.workflow.model import log_unit
+from hybridkin.app.workflow.model import hysteresis_in_words
 from hybridkin.app.workflow.report import Report
 from hybridkin.arguments import one_of
 from hybridkin.native import export_c, export_fmu, export_mex
@@ -91,9 +91,9 @@ def _about_q(model: HybridForwardModel) -> str:
         terms.append(f"q[{i}] = {factors[i]:g} * {name}")
     unit = "" if log.q_unit == "1" else f" in {log.q_unit}"
     about_q = f"q from the columns of the log{unit}: {', '.join(terms)}."
-    if model.play_ is None:
+    if not model.hysteresis_:
         return about_q
     return (
-        f"{about_q} The actuators have {model.play_.in_words(log_unit(model))}: x(q) is that of "
+        f"{about_q} The actuators have {hysteresis_in_words(model)}: x(q) is that of "
         "what the actuators do; steps return commands for it."
     )

@@ -64,18 +64,14 @@ def commands_for(
 
     The times (N,) of the rows matter with creep [s]; without them the robot rests at each row.
     """
-    if model.play_ is None:
-        return q
     steps = _LONG if time is None else np.diff(time, prepend=time[:1])
-    commands, _ = model.play_.command(q, dt=steps)
+    commands, _ = model.hysteresis_.command(q, dt=steps)
     return commands
 
 
-def half_width(model: HybridForwardModel) -> NDArray | float:
+def half_width(model: HybridForwardModel) -> NDArray:
     """Return half the width of the hysteresis, in the unit of q; 0 without."""
-    if model.play_ is None:
-        return 0.0
-    return 0.5 * model.play_.width
+    return 0.5 * model.hysteresis_.width
 
 
 def log_unit(model: HybridForwardModel) -> LogUnit:
@@ -83,12 +79,17 @@ def log_unit(model: HybridForwardModel) -> LogUnit:
     return LogUnit.of(model.description_.log.q_unit)
 
 
+def hysteresis_in_words(model: HybridForwardModel) -> str:
+    """Return the hysteresis of the actuators in words, its widths in the unit of logs."""
+    return model.hysteresis_.in_words(log_unit(model))
+
+
 def widths_in_log(model: HybridForwardModel) -> list[float] | None:
     """Return widths of the hysteresis of one or all actuators, in the unit of logs, or None."""
-    if model.play_ is None:
+    if not model.hysteresis_:
         return None
     size = UNITS.get(model.description_.log.q_unit, 1.0)
-    return np.ravel(model.play_.width / size).tolist()
+    return np.ravel(model.hysteresis_.width / size).tolist()
 
 
 def check_columns(model: HybridForwardModel, q: NDArray) -> None:

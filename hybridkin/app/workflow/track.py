@@ -21,9 +21,9 @@ from hybridkin.app.workflow.errors import Errors
 from hybridkin.app.workflow.model import (
     domain_distance,
     expected_errors,
+    hysteresis_in_words,
     is_fitted,
     kind_of,
-    log_unit,
     plane_in_words,
     promised_errors,
     tips_at,
@@ -84,7 +84,7 @@ class TrackRecord:
         "before" and "after": mean error of the solver before and after commands were rounded [m].
     backend : str
         What computed the steps: "compiled", or "torch: " and the reason.
-    play : list of float or None
+    hysteresis : list of float or None
         Widths of the hysteresis of one or all actuators, in the unit of the robot's logs.
     lead_in : int
         Number of rows that lead from the robot's configuration to the path.
@@ -109,7 +109,7 @@ class TrackRecord:
     expected_inside: Mapping[str, float]
     rounded: Mapping[str, float] | None
     backend: str
-    play: list[float] | None
+    hysteresis: list[float] | None
     lead_in: int
     limits: PathLimits
     delay: float = 0.0
@@ -140,9 +140,9 @@ def _write(report: Report[TrackRecord], model: HybridForwardModel, better: str) 
         f"Period: {duration_in_words(record.period)} from row to row. Send the commands at these "
         "times: lag and creep are those of this pace."
     )
-    if model.play_ is not None:
+    if model.hysteresis_:
         report.text(
-            f"The actuators have {model.play_.in_words(log_unit(model))}: a command crosses the "
+            f"The actuators have {hysteresis_in_words(model)}: a command crosses the "
             "width when its actuator reverses, and leads where they creep. Send q; effective_... "
             "is the motion of the actuators."
         )
@@ -264,7 +264,7 @@ def track_path(
     stands = _start(domain, start)
     check_reach(domain, path, tol, out_of_reach, progress)
     attempts = Attempts(progress)
-    if model.play_ is None or stands is None:
+    if not model.hysteresis_ or stands is None:
         track = best_track(domain, path, tol, attempts)
         lead_in = _lead_in(track, stands, domain)
     else:
@@ -309,7 +309,7 @@ def track_path(
         expected_inside=_expected(model, track, track.status == IKStatus.CONVERGED),
         rounded=rounded,
         backend=domain.solver().tracker(track.q[0]).backend,
-        play=widths_in_log(model),
+        hysteresis=widths_in_log(model),
         lead_in=n_lead,
         limits=domain.limits,
         delay=delay,
@@ -318,7 +318,7 @@ def track_path(
     report = Report(f"{model.description_.name}: a path of {len(path)} points", record)
     _write(report, model, better)
     commands = {"command": whole.q}
-    if model.play_ is not None:
+    if model.hysteresis_:
         commands["actuator"] = whole.effective
     _add_path(report, model, track)
     _add_commands(report, domain, whole.t, commands, n_lead)
@@ -377,10 +377,10 @@ def _lead_in(track: Track, start: NDArray | None, domain: Domain) -> NDArray:
         return track.q[:1]
     limits = domain.limits
     end = track.effective[0]
-    play = domain.model.play_
-    if play is not None:
+    hysteresis = domain.model.hysteresis_
+    if hysteresis:
         # With creep only a start: the track then begins with the state after these commands.
-        led, _ = play.command(np.stack([start, end]), dt=1.0)
+        led, _ = hysteresis.command(np.stack([start, end]), dt=1.0)
         end = led[1].clip(*domain.limits.commands)
     way = end - start
     dt = _period(track)
@@ -408,8 +408,8 @@ def _with_lead_in(track: Track, lead_in: NDArray, model: HybridForwardModel) -> 
     n = len(lead_in)
     dt = _period(track)
     effective = lead_in
-    if model.play_ is not None and n > 0:
-        effective, _ = model.play_.apply(lead_in, None, dt)
+    if model.hysteresis_ and n > 0:
+        effective, _ = model.hysteresis_.apply(lead_in, None, dt)
     x = tips_at(model, effective)
     return replace(
         track,
@@ -456,9 +456,9 @@ def best_track(
     """
     commands, tips = domain.sample
     state = None
-    if lead_in is not None and domain.model.play_ is not None:
+    if lead_in is not None and domain.model.hysteresis_:
         commands = lead_in[-1]
-        _, state = domain.model.play_.apply(lead_in, None, _period(path))
+        _, state = domain.model.hysteresis_.apply(lead_in, None, _period(path))
     way = np.linalg.norm(np.diff(path.x, axis=0), axis=1).max(initial=0.0)
     extent = np.linalg.norm(np.ptp(tips, axis=0))
     least = max(1, math.ceil(way / (_STEP * extent)))
@@ -499,11 +499,11 @@ def _alone(track: Track, domain: Domain, tol: float, state: Any) -> Track:
     With hysteresis other commands can do the same at the points: what an actuator does between
     them, such as a reversal, depends on all commands. The better ones of both are kept.
     """
-    play = domain.model.play_
-    if play is None:
+    hysteresis = domain.model.hysteresis_
+    if not hysteresis:
         return track
     commands = [track.q]
-    exact, _ = play.command(track.effective, state, _steps(track))
+    exact, _ = hysteresis.command(track.effective, state, _steps(track))
     exact = _within_speeds(exact.clip(*domain.limits.commands), track, domain)
     if exact is not None:
         commands.append(exact)
@@ -541,8 +541,8 @@ def _with_commands(
     """Return a track with commands q (N, n) that are sent alone, and what they do."""
     model = domain.model
     effective = q
-    if model.play_ is not None:
-        effective, _ = model.play_.apply(q, state, _steps(track))
+    if model.hysteresis_:
+        effective, _ = model.hysteresis_.apply(q, state, _steps(track))
     x = tips_at(model, effective)
     sent = replace(track, q=q, effective=effective, x=x)
     return domain.solver().judged(sent, tol=tol)
@@ -557,10 +557,10 @@ def _rounded(q: NDArray, counts: Counts, domain: Domain) -> NDArray:
 
 def _state_after(lead_in: NDArray, track: Track, domain: Domain) -> Any:
     """Return the state of the hysteresis after the commands of a lead-in, None without."""
-    play = domain.model.play_
-    if play is None or len(lead_in) < 2:
+    hysteresis = domain.model.hysteresis_
+    if not hysteresis or len(lead_in) < 2:
         return None
-    return play.apply(lead_in, None, _period(track))[1]
+    return hysteresis.apply(lead_in, None, _period(track))[1]
 
 
 def read_track(path: str | Path, log_format: robots.LogFormat) -> Log:
