@@ -1,4 +1,4 @@
-"""What the actuators of a robot are."""
+"""What the actuators of a robot are: rest, kind, segments and balance."""
 
 from __future__ import annotations
 

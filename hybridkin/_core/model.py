@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.autograd import grad
 
+from hybridkin._core.actuation import DIRECT, Actuation
 from hybridkin._core.actuators import ActuatorLayout
 from hybridkin._core.arrays import identity
 from hybridkin._core.blocks import check_tensor, check_vectors, in_blocks
@@ -138,6 +139,11 @@ class ForwardModel(PortableModule):
     # What is known of the body.
 
     @property
+    def hysteresis(self) -> Actuation:
+        """The hysteresis between commands and q, which is what the actuators do; maybe none."""
+        return DIRECT
+
+    @property
     def has_pose(self) -> bool:
         """Whether the model has poses of the tip, as a chain has."""
         return False
@@ -201,6 +207,11 @@ class ForwardModel(PortableModule):
         return self
 
     @property
+    def without_hysteresis(self) -> ForwardModel:
+        """The model of actuators that do what they are commanded."""
+        return self
+
+    @property
     def without_errors(self) -> ForwardModel:
         """The model without errors of its structure; the model itself if it knows none."""
         return self
@@ -213,10 +224,6 @@ class ForwardModel(PortableModule):
     def each_tip(self) -> list[Any]:
         """Return one model for each point of the robot: a chain of K markers has K."""
         return [self]
-
-    def softer(self) -> Sequence[ForwardModel]:
-        """Return the same robot with actuators that give way, where that may matter."""
-        return []
 
     def unit_messages(self, q: Tensor, name: str, factor: float = 1.0) -> list[str]:
         """Return warnings if q (N, n) holds values too large to be metres or radians.
@@ -376,6 +383,10 @@ class ForwardModel(PortableModule):
 
         return Transform3d(matrix=self.pose(q))
 
+    def softer(self) -> list[ForwardModel]:
+        """Return the same robot with actuators that give way, where that may matter."""
+        return []
+
     # The robot after a change.
 
     def shifted(self, shift: Tensor) -> ForwardModel:
@@ -451,6 +462,16 @@ class Wrapped(PoseModel):
     def plane(self) -> tuple[Tensor, Tensor] | None:
         """The plane of the log."""
         return self.model.plane
+
+    @property
+    def hysteresis(self) -> Actuation:
+        """The hysteresis between commands and q."""
+        return self.model.hysteresis
+
+    @property
+    def without_hysteresis(self) -> ForwardModel:
+        """The model of actuators that do what they are commanded."""
+        return self.around(self.model.without_hysteresis)
 
     def around(self, model: ForwardModel) -> ForwardModel:
         """Return another model, changed like this one."""

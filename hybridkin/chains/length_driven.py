@@ -23,7 +23,15 @@ _REACHES = 50.0  # and in sizes of the robot
 
 
 class LengthDrivenChain(ArcChain):
-    """A chain of arcs whose actuators have given lengths, or changes of length."""
+    """A chain of arcs whose actuators have given lengths, or changes of length.
+
+    Attributes
+    ----------
+    in_metres : bool
+        Whether q is in metres; else `metres` converts it.
+    radii : Tensor of shape (S,)
+        Radius of the circle of actuators of each segment [m].
+    """
 
     takes_lengths: ClassVar[bool] = True
 

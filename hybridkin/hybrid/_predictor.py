@@ -14,19 +14,20 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.metrics import r2_score
 from sklearn.utils.validation import check_is_fitted
+from typing_extensions import Self
 
 from hybridkin._core.arrays import labels
 from hybridkin._core.commands import Commands
+from hybridkin._core.digests import row_digests
 from hybridkin._core.distinct import targets_that_count
 from hybridkin._core.html import html_table
 from hybridkin._core.model import ForwardModel, as_forward_model
 from hybridkin._core.other_units import check_commands
 from hybridkin._core.plausible import PlausibleRows, UnknownRows
 from hybridkin.calibration.calibrate import CalibrationResult
-from hybridkin.chains.hysteresis import HysteresisOperator
 from hybridkin.hybrid._adapt import Change
 from hybridkin.hybrid._drift import Drift
-from hybridkin.hybrid._hysteresis import Past
+from hybridkin.hybrid._hysteresis import NO_PAST, Past
 from hybridkin.hybrid._module import Hybrid
 from hybridkin.hybrid._pace import each_pace
 from hybridkin.hybrid._radius import Radius
@@ -35,6 +36,8 @@ from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._wrapped import in_columns, pose_difference
 from hybridkin.hybrid.cv_results import CvResults
 from hybridkin.hybrid.log_fit import HybridFit
+from hybridkin.hybrid.model_description import ModelDescription
+from hybridkin.hysteresis.value import Hysteresis
 from hybridkin.learning.hidden_layer import check_inputs
 from hybridkin.native.library import evaluate
 
@@ -58,10 +61,10 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     error_model_: object
     candidates_: dict[str, Hybrid] | None
     cv_results_: CvResults | None
-    play_: HysteresisOperator | None
     radius_: Radius | None
+    description_: ModelDescription
     _fitted: HybridFit
-    _past: Past | None
+    _past: Past
     _drift: Drift
     _plausible_rows: PlausibleRows = UnknownRows.of(0)
     # Those that need no other check, and do not change by hysteresis.
@@ -78,11 +81,12 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Parameters
         ----------
         X : array-like of shape (N, n) or Commands
-            Actuator vectors; with `play` in order of time, for several runs or times as `Commands`.
+            Actuator vectors; with `hysteresis` in order of time, as `Commands` for several runs or
+            times.
         return_radius : bool, default=False
             Whether to return the estimated error radius as well; requires `coverage`.
         groups : array-like of shape (N,), optional
-            Motion of every row, only used with `play`: as in a fit, each motion is a run.
+            Motion of every row, only used with `hysteresis`: as in a fit, each motion is a run.
 
         Returns
         -------
@@ -124,7 +128,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     ) -> float:
         """Return R^2 of `predict`, averaged over the columns of y, without missing markers.
 
-        Of rows of weight 0, y is ignored; with `play` they move the actuators.
+        Of rows of weight 0, y is ignored; with `hysteresis` they move the actuators.
         """
         x = self.predict(X)
         y = targets_that_count(y, sample_weight, "y")
@@ -160,10 +164,10 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         directions that no training row moved, the domain ends after a tenth of the range. The
         errors of rows outside the domain are not known, even where eps has its full weight.
 
-        With `play`, smooth friction and creep have states, which follow from the commands of a run.
-        A row is outside if its states are farther from those of the log than a tenth of the range,
-        and than groups of the log are from each other: for example in a run that begins where no
-        run of the log was, or after a long rest. With creep a row is outside as well if its run
+        Friction and creep have states, which follow from the commands of a run. A row is outside if
+        its states are farther from those of the log than a tenth of the range, and than groups of
+        the log are from each other: for example in a run that begins where no run of the log was,
+        or after a long rest. With creep a row is outside as well if its run
         moves faster or slower than the log did, over any time constant of creep.
 
         Parameters
@@ -179,8 +183,32 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         inside = self._evaluated(self._distances, X, warn=False)[0] <= 1.0
         return inside & self._are_states_seen(X)
 
+    def described(self, description: ModelDescription) -> Self:
+        """Return this estimator with another `description_`."""
+        self.description_ = description
+        return self
+
+    def was_fitted(self, X: object, y: ArrayLike) -> NDArray[np.bool_]:
+        """Return which rows are rows of the fit, to a micrometre, shape (N,).
+
+        Parameters
+        ----------
+        X : array-like of shape (N, n) or Commands
+            Actuator vectors, as for `fit`.
+        y : array-like of shape (N, m)
+            Measured tips [m].
+
+        Returns
+        -------
+        ndarray of bool of shape (N,)
+            All False for a nominal model, which no rows were fitted to.
+        """
+        check_is_fitted(self, "module_")
+        q = check_inputs(self, Commands.of(X).q)
+        return np.isin(row_digests(q, y), self._fitted.fitted_rows)
+
     def effective(self, X: object) -> NDArray:
-        """Return what the actuators do for commands X [unit of q]; without `play`, X itself.
+        """Return what the actuators do for commands X [unit of q]; without `hysteresis`, X itself.
 
         Parameters
         ----------
@@ -200,9 +228,11 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         check_is_fitted(self, "module_")
         commands = Commands.of(X)
         rows = check_inputs(self, commands.q)
-        if self.play_ is None or not len(rows):
+        if not self.hysteresis_ or not len(rows):
             return rows
-        return self.play_.apply_by_group(rows, commands.run_of_rows, commands.time)
+        return self.hysteresis_.apply_by_group(
+            rows, commands.run_of_rows, commands.time
+        )
 
     def error_weight(self, X: object) -> NDArray:
         """Return the weight w(q) in [0, 1] of the error model at each row, shape (N,)."""
@@ -210,6 +240,11 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return self._evaluated(
             lambda q: evaluate(weight, q + self.change_.shift), X, warn=False
         )[0]
+
+    @property
+    def hysteresis_(self) -> Hysteresis:
+        """The hysteresis between the commands and what the actuators do; maybe none."""
+        return self._fitted.hysteresis
 
     @property
     def training_range_(self) -> TrainingRange:
@@ -271,14 +306,14 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if self._plausible_rows.hold(q):
             return []
         robot = self._robot
-        rows = torch.from_numpy(q)
+        rows = torch.tensor(q, device="cpu")
         return [*robot.unit_messages(rows, "X"), *robot.contradictions(rows, "X")]
 
     def _distances(self, q: NDArray) -> tuple[NDArray]:
         """Return the distance from the domain of rows q (N, n): infinite without a shape."""
         (distance,) = self._tips(q, value=False, distance=True, enough=1.0)
         if not self._plausible_rows.hold(q):
-            has_shape = self._robot.has_shape(torch.from_numpy(q))
+            has_shape = self._robot.has_shape(torch.tensor(q, device="cpu"))
             distance = np.where(has_shape.numpy(), distance, np.inf)
         return (distance,)
 
@@ -286,26 +321,30 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """Return whether the log had the states inside of the hysteresis, and such a pace (N,)."""
         commands = Commands.of(X)
         states_of_log = self._states_of_log
-        if self.play_ is None or states_of_log is None:
+        if not self.hysteresis_ or states_of_log is None:
             return np.ones(len(commands), dtype=bool)
         rows = check_inputs(self, commands.q)
         low, high = states_of_log.moved(-self.change_.shift)
         seen = np.ones(len(commands), dtype=bool)
-        states = self.play_.each_inner_state(rows, commands.run_of_rows, commands.time)
+        states = self.hysteresis_.each_inner_state(
+            rows, commands.run_of_rows, commands.time
+        )
         for k, state in enumerate(states):
             seen &= ((low[k] <= state) & (state <= high[k])).all(axis=1)
         if self._fitted.pace is not None and commands.time is not None:
             paces = each_pace(
-                rows, commands.run_of_rows, commands.time, self.play_.time_constants
+                rows,
+                commands.run_of_rows,
+                commands.time,
+                self.hysteresis_.time_constants,
             )
             seen &= self._fitted.pace.holds(paces, len(rows))
         return seen
 
     @property
     def _states_of_log(self) -> TrainingRange | None:
-        """Range of the states inside of `play_` in the log; None if it is not that of the fit."""
-        fit = self._fitted
-        return fit.state_range if self.play_ is fit.play else None
+        """Range of the states inside of `hysteresis_` in the log; None without any."""
+        return self._fitted.state_range
 
     def _take(self, fit: HybridFit) -> None:
         """Become the model of a fit; the robot has not changed since."""
@@ -315,12 +354,12 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.calibration_ = fit.calibration
         self.cv_results_ = fit.error.comparison
         self.candidates_ = fit.error.candidates
-        self.play_ = fit.play
         self.radius_ = fit.radius
         self.change_ = Change.none(self.n_features_in_)
         self._drift = fit.no_drift
-        self._past = None
+        self._past = NO_PAST
         self._follow_robot()
+        self.description_ = ModelDescription.of(self.module_, self.n_features_in_)
 
     def _follow_robot(self) -> None:
         """Set the module and its mechanical model after the change and the drift of the robot."""
@@ -335,7 +374,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.mechanical_model_ = mechanical
         self._plausible_rows = self._robot.plausible_rows()
         self._plain_rows = UnknownRows.of(self.n_features_in_)
-        if self.play_ is None and "feature_names_in_" not in vars(self):
+        if not self.hysteresis_ and "feature_names_in_" not in vars(self):
             self._plain_rows = self._plausible_rows
 
     def _tips(

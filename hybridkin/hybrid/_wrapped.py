@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from typing_extensions import Self
 
+from hybridkin._core.actuation import Actuation
 from hybridkin._core.arrays import as_array
 from hybridkin._core.blocks import in_blocks
 from hybridkin._core.model import ForwardModel, PoseModel
@@ -91,6 +92,16 @@ class Stacked(Hybrid):
             tip.misses(x, largest) for tip, x in zip(self._tips(), targets, strict=True)
         ]
         return torch.stack(missed).amax(0)
+
+    @property
+    def hysteresis(self) -> Actuation:
+        """The hysteresis between commands and q, which is that of the tip."""
+        return self.tip_model.hysteresis
+
+    def behind(self, hysteresis: Actuation) -> Self:
+        """Return the same model with another hysteresis; this model does not change."""
+        tips = [tip.behind(hysteresis) for tip in self._tips()]
+        return type(self)(self.mechanical, tips)
 
     def with_drift(self, drift: AffineModule) -> Self:
         """Return the same model with another drift; this model does not change."""
@@ -207,6 +218,15 @@ class WithPose(Hybrid, PoseModel):
         """Return how much farther targets are than f reaches with the longest correction."""
         longest = torch.as_tensor(self.learned.longest_correction, device=x.device)
         return self.mechanical.misses(x, largest) - longest
+
+    @property
+    def hysteresis(self) -> Actuation:
+        """The hysteresis between commands and q."""
+        return self.learned.hysteresis
+
+    def behind(self, hysteresis: Actuation) -> Self:
+        """Return the same model with another hysteresis; this model does not change."""
+        return type(self)(self.mechanical, self.learned.behind(hysteresis))
 
     def with_drift(self, drift: AffineModule) -> Self:
         """Return the same model with another drift; this model does not change."""

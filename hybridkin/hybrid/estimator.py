@@ -27,19 +27,19 @@ from hybridkin.calibration.measured import (
     check_unscaled,
     with_missing_markers,
 )
-from hybridkin.chains.hysteresis import HysteresisOperator, checked_times
 from hybridkin.hybrid._adapt import (
     PARAMETERS,
     check_parameters,
     likeliest_change,
 )
 from hybridkin.hybrid._html import fitted_rows
-from hybridkin.hybrid._hysteresis import continued
+from hybridkin.hybrid._hysteresis import NO_PAST, choice_of, continued
 from hybridkin.hybrid._predictor import HybridPredictor
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._settings import CONSTRAINTS, error_model_of
 from hybridkin.hybrid._spec import ErrorModel, Spec, residuals
 from hybridkin.hybrid.log_fit import HybridFit, fit_to_log
+from hybridkin.hysteresis.value import Hysteresis, checked_times
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.hidden_layer import check_rows
 
@@ -105,13 +105,12 @@ class HybridForwardModel(HybridPredictor):
         where no held-out group has tested the model. With a guard, f_hyb differs from f_mech by at
         most 1.5 times the longest correction of a training row. f_mech has the errors of its
         structure, if these are learned; they have no guard.
-    play : float, array-like of shape (n,), HysteresisOperator or "auto", optional
+    hysteresis : float, array-like of shape (n,), Hysteresis or "auto", default=0.0
         Backlash (also called play) of the actuators [unit of q]. Rows are then commands in order of
         time, see `Commands`, and the model maps the motion of the actuators. "auto" chooses by the
-        error on held-out groups: nothing, a `PlayOperator`, a `PrandtlIshlinskiiOperator`, or
-        a `CreepOperator`, alone or after one of them (`HysteresisSeries`). Each run of the log
-        starts without hysteresis, see `fit`. An operator is taken as it is. Trackers send commands
-        that lead by it. Default: no backlash, rows in any order.
+        error on held-out groups: nothing, backlash, friction, or creep, alone or after one of them.
+        Each run of the log starts without hysteresis, see `fit`. A `Hysteresis` is taken as it is.
+        Trackers send commands that lead by it. Default: none, rows in any order.
     coverage : float, optional
         Share of tips, 0.9 for example, within the radius of ``predict(Q, return_radius=True)``, if
         new groups are like those of the log. It needs ``coverage / (1 - coverage)`` groups, 9 for
@@ -157,18 +156,20 @@ class HybridForwardModel(HybridPredictor):
         each of three folds.
     candidates_ : dict of str to nn.Module, or None
         For error_model="auto": every candidate of ``cv_results_``, fitted to all rows; a module
-        from q to x as ``module_``, with `play` from the motion of the actuators. `adapt` and
+        from q to x as ``module_``, with `hysteresis` from the motion of the actuators. `adapt` and
         `partial_fit` do not change them. A model from a file has none.
     calibration_ : CalibrationResult or None
         The result of the calibration.
-    play_ : HysteresisOperator or None
-        The hysteresis; None if there is none, or if "auto" found no significant gain.
+    hysteresis_ : Hysteresis
+        The hysteresis; empty and falsy if there is none, or if "auto" found no significant gain.
     radius_ : Radius or None
         With `coverage`: the radius ``inside`` the domain [m], infinite with too few groups.
         `adapt` and `partial_fit` do not change it.
+    description_ : ModelDescription
+        Robot, log and file of the model; of one from `open_model`, what these say.
     training_range_ : TrainingRange
-        ``low`` and ``high`` (n,), the least and the largest q of the fit [unit of q]; with `play`
-        of the motion of the actuators. `adapt` moves it with the actuator zeros.
+        ``low`` and ``high`` (n,), the least and the largest q of the fit [unit of q]; with
+        `hysteresis` of the motion of the actuators. `adapt` moves it with the actuator zeros.
     n_features_in_ : int
         Number of actuators n.
     feature_names_in_ : ndarray of shape (n,)
@@ -198,7 +199,7 @@ class HybridForwardModel(HybridPredictor):
         coupling: str = "parallel",
         calibrate: Sequence[str] | str | None = None,
         guard: str | None = "leverage",
-        play: ArrayLike | HysteresisOperator | str | None = None,
+        hysteresis: ArrayLike | Hysteresis | str = 0.0,
         coverage: float | None = None,
         output: str = "position",
         random_state: int | np.random.RandomState | None = None,
@@ -208,7 +209,7 @@ class HybridForwardModel(HybridPredictor):
         self.coupling = coupling
         self.calibrate = calibrate
         self.guard = guard
-        self.play = play
+        self.hysteresis = hysteresis
         self.coverage = coverage
         self.output = output
         self.random_state = random_state
@@ -233,13 +234,13 @@ class HybridForwardModel(HybridPredictor):
         ----------
         X : array-like of shape (N, n) or Commands
             Actuator vectors q [m]; for revolute joints [rad]. `Commands` have runs and times: with
-            `play`, hysteresis goes on within a run, also from group to group.
+            `hysteresis`, hysteresis goes on within a run, also from group to group.
         y : array-like of shape (N, m) or (N,)
             Measured tip positions x [m]; poses (N, 6); K markers (N, 3 K), NaN if missing.
         sample_weight : array-like of shape (N,), optional
             How many times each row counts: a weight of 2 is the same row twice, 0 leaves it out,
-            whatever y holds there, also NaN. With `play`, rows of weight 0 still move actuators.
-            Equal rows are held out together.
+            whatever y holds there, also NaN. With `hysteresis`, rows of weight 0
+            still move actuators. Equal rows are held out together.
         groups : array-like of shape (N,), optional
             Motion of every row. Whole motions are held out by the calibration
             (``calibration_.cv_rmse``), by error models that choose by groups, and for the radius.
@@ -288,7 +289,7 @@ class HybridForwardModel(HybridPredictor):
     ) -> HybridForwardModel:
         """Update the model with new measurements in order of time, after a payload or wear.
 
-        With `play`, hysteresis goes on from the last call; a new run of `Commands` starts anew.
+        Hysteresis goes on from the last call; a new run of `Commands` starts anew.
 
         The mechanical model and the error model do not change. The new residual is learned as an
         affine function of q in which old measurements fade: ``f_hyb(q) + B [1, q]``. This follows
@@ -302,7 +303,7 @@ class HybridForwardModel(HybridPredictor):
             Measured tips [m].
         sample_weight : array-like of shape (N,), optional
             How many times each row counts: a weight of 2 is the same row twice, 0 leaves it out,
-            whatever y holds there. With `play`, rows of weight 0 still move the actuators.
+            whatever y holds there. With `hysteresis`, rows of weight 0 still move the actuators.
         decay : float, default=0.98
             Factor in (0, 1] by which every new row multiplies the weights of all earlier rows. 0.98
             forgets within about fifty measurements.
@@ -323,8 +324,8 @@ class HybridForwardModel(HybridPredictor):
             _check_positive("alpha", alpha, np.inf)
         rows = self._checked_rows(X, y, sample_weight, reset=False)
         self._check_commands(rows)
-        if self.play_ is not None:
-            moved, self._past = continued(self.play_, rows, self._past)
+        if self.hysteresis_:
+            moved, self._past = continued(self.hysteresis_, rows, self._past)
             rows = replace(rows, X=moved)
         self._warn_of_units(rows)
         rows = self.change_.before(rows, self.output)
@@ -361,7 +362,7 @@ class HybridForwardModel(HybridPredictor):
         Parameters
         ----------
         X : array-like of shape (k, n) or Commands
-            New actuator vectors, one or more; with `play` in order of time, as for `fit`.
+            New actuator vectors, one or more; with `hysteresis` in order of time, as for `fit`.
         y : array-like of shape (k, m) or (k,)
             Measured tips [m]; poses (k, 6), see `output`.
         parameters : sequence of str, default=("base", "actuator_zeros")
@@ -400,8 +401,8 @@ class HybridForwardModel(HybridPredictor):
         check_is_fitted(self, "module_")
         rows = self._checked_rows(X, y, None, groups, reset=False, weighted=False)
         check_parameters(parameters, rows.tips.shape[1] % 3 == 0)
-        if self.play_ is not None:
-            rows = rows.effective(self.play_)
+        if self.hysteresis_:
+            rows = rows.effective(self.hysteresis_)
         self._check_commands(rows)
         with torch.no_grad():
             predicted = self.fitted_module_(rows.q).numpy()
@@ -419,9 +420,14 @@ class HybridForwardModel(HybridPredictor):
         if message is not None:
             warnings.warn(message, stacklevel=2)
         self._drift = self._fitted.no_drift
-        self._past = None
+        self._past = NO_PAST
         self._follow_robot()
         return self
+
+    @property
+    def follows_order(self) -> bool:
+        """Whether the order of the rows of a fit counts: there may be a `hysteresis`."""
+        return bool(choice_of(self.hysteresis))
 
     def html_rows(self) -> dict[str, object]:
         """Return names and values of what the fit found, which a notebook shows."""
@@ -487,7 +493,7 @@ class HybridForwardModel(HybridPredictor):
         X = commands.q
         y = table(targets_that_count(y, weights, "y"), "y")
         advice = LEAVE_OUT
-        if weighted and self.play is not None:
+        if weighted and self.follows_order:
             advice = WEIGH_ZERO
         missing = self._missing_markers(y, advice)
         y = None if y is None else np.where(missing, 0.0, y)
@@ -502,7 +508,7 @@ class HybridForwardModel(HybridPredictor):
             groups = labels(groups, len(X))
         weights = cast("NDArray | None", weights)
         rows = Rows(X, y, weights, groups, commands.runs, commands.time)
-        if rows.time is not None and self.play is not None:
+        if rows.time is not None and self.follows_order:
             times = checked_times(rows.time, rows.run_of_rows)
             if reset:  # a fit may find creep, which depends on the unit of time
                 check_seconds(times, rows.run_of_rows)
@@ -535,7 +541,7 @@ class HybridForwardModel(HybridPredictor):
             names,
             self.guard,
             self.output,
-            self.play,
+            choice_of(self.hysteresis),
             self.coverage,
         )
 

@@ -12,10 +12,9 @@ from typing_extensions import Self
 from hybridkin._core.digests import row_digests
 from hybridkin.calibration.calibrate import CalibrationResult
 from hybridkin.calibration.choice import GeometryChoice
-from hybridkin.chains.hysteresis import HysteresisOperator
 from hybridkin.hybrid._drift import Drift
 from hybridkin.hybrid._fit import few_rows, fit_hybrid, fit_messages
-from hybridkin.hybrid._hysteresis import moved_without, play_of
+from hybridkin.hybrid._hysteresis import moved_without
 from hybridkin.hybrid._module import Hybrid
 from hybridkin.hybrid._pace import Pace, PaceRange, each_pace, pace_range
 from hybridkin.hybrid._radius import Radius, conformal_radius
@@ -25,6 +24,7 @@ from hybridkin.hybrid._spec import UNREFINED, FitStart, FittedError, Refinement,
 from hybridkin.hybrid._worse import worse_than_mechanical
 from hybridkin.hybrid.cv_results import CvResults
 from hybridkin.hybrid.held_out import MEAN_LENGTH
+from hybridkin.hysteresis.value import NO_HYSTERESIS, Hysteresis
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,7 @@ class HybridFit:
         How fast the commands moved, with creep.
     no_drift : Drift
         The drift before any measurement.
-    calibration, play, radius
+    calibration, hysteresis, radius
         The attributes of the model.
     geometry : GeometryChoice or None
         How the parameters to calibrate were chosen.
@@ -67,7 +67,7 @@ class HybridFit:
     calibration: CalibrationResult | None = None
     geometry: GeometryChoice | None = None
     refinement: Refinement = UNREFINED
-    play: HysteresisOperator | None = None
+    hysteresis: Hysteresis = NO_HYSTERESIS
     state_range: TrainingRange | None = None
     pace: PaceRange | None = None
     radius: Radius | None = None
@@ -111,27 +111,27 @@ def fit_to_log(
     commands = log.distinct()
     messages = few_rows(commands, spec)
     chosen = spec.with_geometry_chosen(commands, geometry)
-    play, of_play = play_of(chosen, log.in_runs())
+    hysteresis, of_hysteresis = chosen.hysteresis.of(chosen, log.in_runs())
     rows = commands
     measured = commands
     states = None
     pace = None
     moved = None
-    if play is not None:
+    if hysteresis:
         spec = replace(spec, commanded=commands.directions)
         chosen = replace(chosen, commanded=commands.directions)
         measured = log.take(log.counted)
-        states = state_range(_states(play, log), measured, np.ptp(log.X, axis=0))
-        pace = _pace(play, log, measured)
+        states = state_range(_states(hysteresis, log), measured, np.ptp(log.X, axis=0))
+        pace = _pace(hysteresis, log, measured)
         moved = partial(moved_without, chosen, log)
-        rows = log.effective(play).distinct()
+        rows = log.effective(hysteresis).distinct()
     fitted = fit_hybrid(chosen, rows)
     fitted.take_low_rank(rows.q)
     radius, of_radius = conformal_radius(spec, measured, moved)
-    messages += [*of_play, *of_radius, *fit_messages(fitted.spec, rows)]
-    messages += worse_than_mechanical(fitted, _by_motion(log, rows, play))
+    messages += [*of_hysteresis, *of_radius, *fit_messages(fitted.spec, rows)]
+    messages += worse_than_mechanical(fitted, _by_motion(log, rows, hysteresis))
     return HybridFit(
-        module=fitted.module,
+        module=fitted.module.behind(hysteresis),
         error=fitted.error,
         kind=fitted.error.kind,
         fitted_rows=commands.digests(),
@@ -141,7 +141,7 @@ def fit_to_log(
         calibration=fitted.spec.calibration,
         geometry=chosen.geometry,
         refinement=chosen.refinement,
-        play=play,
+        hysteresis=hysteresis,
         state_range=states,
         pace=pace,
         radius=radius,
@@ -149,29 +149,28 @@ def fit_to_log(
     )
 
 
-def _states(play: HysteresisOperator, log: Rows) -> NDArray:
+def _states(hysteresis: Hysteresis, log: Rows) -> NDArray:
     """Return the inner states (K, R, n) of hysteresis after the rows that count."""
     states = [np.empty((len(log.counted), 0, log.X.shape[1]))]
-    for state in play.each_inner_state(log.X, log.run_of_rows, log.time):
+    for state in hysteresis.each_inner_state(log.X, log.run_of_rows, log.time):
         states.append(state[log.counted, None])
     return np.concatenate(states, axis=1)
 
 
-def _pace(play: HysteresisOperator, log: Rows, measured: Rows) -> PaceRange | None:
+def _pace(hysteresis: Hysteresis, log: Rows, measured: Rows) -> PaceRange | None:
     """Return the range of paces of the rows that count; None without creep."""
-    if log.time is None or not play.creeps:
+    if log.time is None or not hysteresis.needs_time:
         return None
     paces = []
-    for pace in each_pace(log.X, log.run_of_rows, log.time, play.time_constants):
+    times = hysteresis.time_constants
+    for pace in each_pace(log.X, log.run_of_rows, log.time, times):
         paces.append(Pace(pace.speeds[log.counted], pace.shown[log.counted]))
     return pace_range(paces, measured)
 
 
-def _by_motion(log: Rows, rows: Rows, play: HysteresisOperator | None) -> Rows:
+def _by_motion(log: Rows, rows: Rows, hysteresis: Hysteresis) -> Rows:
     """Return the rows of a fit with the groups to hold out: those of the log, else its runs."""
     if log.groups is not None or log.runs is None:
         return rows
     by_run = replace(log, groups=log.runs)
-    if play is not None:
-        by_run = by_run.effective(play)
-    return by_run.distinct()
+    return by_run.effective(hysteresis).distinct()

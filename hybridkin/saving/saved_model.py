@@ -93,6 +93,7 @@ def save_model(
     header: Header = {"versions": versions, "created": created}
     results: Header = {}
     if isinstance(model, HybridForwardModel):
+        _check_fitted_to_rows(model)
         stored = stored_hybrid(model)
         results = training_of(model)
         header["units"] = _units(model.module_, model.output)
@@ -163,6 +164,14 @@ def load_model(path: str | Path, *, device: str | torch.device | None = None) ->
     module = model if isinstance(model, ForwardModel) else model.module_
     module.to(at)
     return model
+
+
+def _check_fitted_to_rows(model: HybridForwardModel) -> None:
+    """Raise if no rows were fitted to a model."""
+    if "module_" in vars(model) and not np.isfinite(model.training_range_.low).all():
+        raise ValueError(
+            "`model` was not fitted to rows; save its `mechanical_model`, the chain."
+        )
 
 
 def _checked(training: Mapping[str, object] | None) -> Header:

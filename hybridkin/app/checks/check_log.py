@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridkin import ConstantCurvatureChain, ElasticTendonChain
+from hybridkin import ForwardModel
 from hybridkin.app.checks.columns import COLUMN_CHECKS, LogRows
 from hybridkin.app.checks.encoders import encoder_findings
 from hybridkin.app.checks.geometry import geometry_findings
@@ -23,9 +22,6 @@ from hybridkin.app.checks.report import (
 from hybridkin.app.checks.residual import residual_findings
 from hybridkin.datasets import Log
 from hybridkin.formats import named_places
-
-if TYPE_CHECKING:
-    from hybridkin import ForwardModel
 
 _LARGEST = 1e75  # fourth powers of larger numbers overflow
 
@@ -112,7 +108,7 @@ def check_log(
         if of_encoders:
             chain = None  # readings that are turns off look like wrong orders, signs and units
         # Its checks compare radii, paths and lengths of arcs, which no other chain has.
-        if isinstance(chain, (ConstantCurvatureChain, ElasticTendonChain)):
+        if isinstance(chain, LengthDrivenChain):
             findings += geometry_findings(rows.log, chain, base_is_free)
         if not any(finding.kind in (*MISREAD, "encoder") for finding in findings):
             residual = [*residual_findings(rows.log, chain, rows.same_motion)]

@@ -38,7 +38,7 @@ def _weights(results: Mapping[str, Any]) -> dict[str, float]:
 
 def memory_in_words(model: HybridForwardModel, unit: LogUnit) -> str:
     """Return the hysteresis of a fitted model in words; empty without one."""
-    return "" if model.play_ is None else model.play_.in_words(unit)
+    return model.hysteresis_.in_words(unit)
 
 
 def auto_in_short(results: Mapping[str, Any], hysteresis: str) -> str:
@@ -79,14 +79,13 @@ def auto_in_words(model: HybridForwardModel, unit: LogUnit) -> list[str]:
         f"{', '.join(listed)}.",
         f"Expected on new motions like these: {expected}.",
     ]
-    if model.play_ is not None:
+    if model.hysteresis_:
         sentences.append(
-            f"The actuators have {model.play_.in_words(unit)}. Predictions depend on the order of "
-            "the rows in a motion, with creep on their times."
+            f"The actuators have {model.hysteresis_.in_words(unit)}. Predictions depend on the "
+            "order of the rows in a motion, with creep on their times."
         )
-    elif model.play is not None:
+    elif model.follows_order:
         sentences.append(
-            "Auto looked for backlash (play), other hysteresis and creep, but none lowered the "
-            "errors."
+            "Auto looked for backlash (play), friction and creep, but none lowered the errors."
         )
     return sentences

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from joblib import Parallel, delayed, effective_n_jobs
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from sklearn.linear_model import LinearRegression
 
 from hybridkin import (
@@ -19,6 +19,7 @@ from hybridkin import (
     Commands,
     ForwardModel,
     HybridForwardModel,
+    Hysteresis,
     robots,
 )
 from hybridkin._core.turns import one_thread
@@ -72,10 +73,10 @@ class FitSettings:
     auto : bool
         Whether to compare and save ``error_model="auto"``; it takes most of the time. Without it,
         the comparison has fewer hybrids, and the best of them or the calibrated model is saved.
-    play : float, "auto", "detect" or None
-        Backlash (also called play) of the actuators [m] in that hybrid, see `HybridForwardModel`.
-        It requires `auto`, and named motions in order of time. "detect": "auto" if the log allows
-        it and backlash lowers the held-out errors of a network, else None.
+    hysteresis : float, Hysteresis, "auto" or "detect"
+        Hysteresis of the actuators in that hybrid, see `HybridForwardModel`. It requires `auto`,
+        and named motions in order of time. "detect": "auto" if the log allows it and shows some,
+        else none.
     max_rows : int or None
         Largest number of rows whose measurements count; of a longer log some motions are used, and
         some rows of each. All rows of these motions move the actuators. None: all rows count.
@@ -85,7 +86,7 @@ class FitSettings:
     coverage: float | None = None
     n_folds: int = 5
     auto: bool = True
-    play: float | str | None = "detect"
+    hysteresis: ArrayLike | Hysteresis | str = "detect"
     max_rows: int | None = 2000
 
     def __post_init__(self) -> None:
@@ -95,6 +96,11 @@ class FitSettings:
             whole(self.max_rows, "max_rows", 2)
         if not isinstance(self.auto, bool):
             raise ValueError(f"`auto` must be True or False, got {self.auto!r:.80}.")
+
+    @property
+    def follows_order(self) -> bool:
+        """Whether the order of the rows counts for the hybrid: there may be a hysteresis."""
+        return HybridForwardModel(hysteresis=self.hysteresis).follows_order
 
 
 DEFAULTS = FitSettings()
@@ -252,25 +258,27 @@ def _auto(
     It calibrates by least squares in each of its own folds. For another loss, which bounds
     outliers, it gets the calibrated chain and does not calibrate.
     """
-    model = HybridForwardModel(calibrated, "auto", play=settings.play, random_state=0)
+    model = HybridForwardModel(
+        calibrated, "auto", hysteresis=settings.hysteresis, random_state=0
+    )
     if settings.loss == "linear" and robot.chain is not None:
         model.set_params(mechanical_model=robot.chain, calibrate=robot.calibrate)
     return model
 
 
-def with_play_detected(
+def with_hysteresis_detected(
     settings: FitSettings, rows: MeasuredLog, mechanical: Mechanical
 ) -> FitSettings:
-    """Return settings whose `play` is not "detect"."""
-    if settings.play != "detect":
+    """Return settings whose `hysteresis` is not "detect"."""
+    if settings.hysteresis != "detect":
         return settings
-    play = None
+    hysteresis = 0.0
     in_order = rows.named and not rows.n_late
     if mechanical.start is not None and settings.auto and in_order:
-        model = HybridForwardModel(mechanical.model, "drop", play="auto")
+        model = HybridForwardModel(mechanical.model, "drop", hysteresis="auto")
         fitted = fit_to_log(*prepared(model, *columns_to_fit(model, rows)))
-        play = None if fitted.play is None else "auto"
-    return replace(settings, play=play)
+        hysteresis = "auto" if fitted.hysteresis else 0.0
+    return replace(settings, hysteresis=hysteresis)
 
 
 def columns_to_fit(
@@ -280,7 +288,7 @@ def columns_to_fit(
 
     Rows that do not count move the actuators; a model without hysteresis does not need them.
     """
-    if model.play is None:
+    if not model.follows_order:
         rows = rows.measured
     return rows.commands, rows.x, rows.motions, rows.counts
 
@@ -348,7 +356,7 @@ def compare_by_group(
     robot : RobotDescription
         Nominal kinematics, and the parameters to calibrate.
     settings : FitSettings
-        Loss, folds and models, see `with_play_detected`.
+        Loss, folds and models, see `with_hysteresis_detected`.
     fitted : FittedModels
         The models fitted to all rows, see `fit_to_all`.
     n_jobs : int, optional
@@ -405,7 +413,7 @@ def compare_by_group(
         tips[AUTO], words = _blended(measured, fold, candidates, autos)
         for of_fold, chosen in zip(choices, words, strict=True):
             of_fold[AUTO] = chosen
-    if settings.play is None:  # it is the calibrated model
+    if not settings.follows_order:  # it is the calibrated model
         tips.pop(BACKLASH, None)
     in_order = {}
     for name in sorted(tips, key=lambda name: _KINDS.index(name.partition(",")[0])):

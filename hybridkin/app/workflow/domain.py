@@ -92,8 +92,8 @@ def path_limits(
     trained = robots.Limits()
     if within_fit or not _has_ends(described):
         trained = loaded.trained_range or trained
-    limits = dict(vars(described.narrowed(loaded.half_play).intersect(trained)))
-    given = vars(robots.Limits(**overrides).narrowed(loaded.half_play))
+    limits = dict(vars(described.narrowed(loaded.half_width).intersect(trained)))
+    given = vars(robots.Limits(**overrides).narrowed(loaded.half_width))
     for name in overrides:
         limit = given[name]
         # Of one given end, scaled to actuators of both signs, some entries are open.
@@ -247,7 +247,7 @@ class Domain:
     @property
     def of_commands(self) -> tuple[NDArray, NDArray]:
         """Limits of commands, which lead what the actuators do by up to half the width."""
-        half = self.loaded.half_play
+        half = self.loaded.half_width
         return self.limits.q_min - half, self.limits.q_max + half
 
     def postures(self, n: int) -> NDArray:
