@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridkin import ForwardModel
+from hybridkin import ForwardModel, LengthDrivenChain
 from hybridkin.app.checks.columns import COLUMN_CHECKS, LogRows
 from hybridkin.app.checks.encoders import encoder_findings
 from hybridkin.app.checks.geometry import geometry_findings
