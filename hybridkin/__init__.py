@@ -12,14 +12,15 @@ if TYPE_CHECKING:
     from hybridkin._core.model import ForwardModel, as_forward_model, jacobian
     from hybridkin.calibration.calibrate import CalibrationResult, calibrate
     from hybridkin.chains import robots
-    from hybridkin.chains.arc_chain import ArcChain
     from hybridkin.chains.chain import Chain
     from hybridkin.chains.constant_curvature import ConstantCurvatureChain
     from hybridkin.chains.elastic_tendons import ElasticTendonChain
     from hybridkin.chains.force_tendons import ForceTendonChain
+    from hybridkin.chains.length_driven import LengthDrivenChain
     from hybridkin.chains.rigid import RigidChain
     from hybridkin.hybrid.choose_rows import choose_rows
     from hybridkin.hybrid.estimator import HybridForwardModel
+    from hybridkin.hybrid.model_description import ModelDescription
     from hybridkin.hysteresis.value import Hysteresis
     from hybridkin.ik import tasks, trajectories
     from hybridkin.ik.results import IKSolution, IKStatus, Step, Track
@@ -27,10 +28,10 @@ if TYPE_CHECKING:
     from hybridkin.ik.tracker import Tracker
     from hybridkin.learning.elm import ELMRegressor
     from hybridkin.learning.elm_cv import ELMRegressorCV
+    from hybridkin.saving.opened_model import open_model
     from hybridkin.saving.saved_model import load_model, save_model
 
 __all__ = [
-    "ArcChain",
     "CalibrationResult",
     "Chain",
     "Commands",
@@ -45,6 +46,8 @@ __all__ = [
     "IKSolution",
     "IKStatus",
     "InverseKinematics",
+    "LengthDrivenChain",
+    "ModelDescription",
     "RigidChain",
     "Step",
     "Track",
@@ -57,6 +60,7 @@ __all__ = [
     "jacobian",
     "load_model",
     "native",
+    "open_model",
     "plots",
     "robots",
     "save_model",
@@ -68,13 +72,15 @@ _NAMES_OF = {
     "_core.commands": ("Commands",),
     "_core.model": ("ForwardModel", "as_forward_model", "jacobian"),
     "calibration.calibrate": ("CalibrationResult", "calibrate"),
-    "chains.arc_chain": ("ArcChain",),
     "chains.chain": ("Chain",),
     "chains.constant_curvature": ("ConstantCurvatureChain",),
     "chains.elastic_tendons": ("ElasticTendonChain",),
     "chains.force_tendons": ("ForceTendonChain",),
+    "chains.length_driven": ("LengthDrivenChain",),
     "chains.rigid": ("RigidChain",),
     "hybrid.choose_rows": ("choose_rows",),
+    "hybrid.model_description": ("ModelDescription",),
+    "saving.opened_model": ("open_model",),
     "hybrid.estimator": ("HybridForwardModel",),
     "hysteresis.value": ("Hysteresis",),
     "ik.results": ("IKSolution", "IKStatus", "Step", "Track"),

@@ -688,7 +688,7 @@ META = ROWS.to("meta")
 @pytest.mark.parametrize(
     ("name", "call"),
     [
-        ("q", lambda: trunk().contradiction(META)),
+        ("q", lambda: trunk().contradictions(META)),
         ("q", lambda: trunk().metres(ROWS[:, :0])),
         ("n_points", lambda: trunk().backbone(ROWS, 2.5)),
         ("n_points", lambda: trunk().backbone(ROWS, 2**63)),

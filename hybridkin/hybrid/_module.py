@@ -12,8 +12,9 @@ from typing_extensions import Self
 
 from hybridkin._core.actuation import DIRECT, Actuation
 from hybridkin._core.blocks import in_blocks
-from hybridkin._core.model import ForwardModel, PortableModule
+from hybridkin._core.model import ForwardModel
 from hybridkin._core.plan import CHAINS, NoKernel, Plan
+from hybridkin._core.portable import PortableModule
 from hybridkin._core.stored import Layout, Stored
 from hybridkin.hybrid._guards import GroupDistance, Guard, LeverageGuard, Plane
 from hybridkin.learning.regressor_modules import AffineModule

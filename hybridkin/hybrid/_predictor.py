@@ -14,20 +14,19 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.metrics import r2_score
 from sklearn.utils.validation import check_is_fitted
+from typing_extensions import Self
 
 from hybridkin._core.arrays import labels
 from hybridkin._core.commands import Commands
+from hybridkin._core.digests import row_digests
 from hybridkin._core.distinct import targets_that_count
 from hybridkin._core.html import html_table
 from hybridkin._core.model import ForwardModel, as_forward_model
 from hybridkin._core.other_units import check_commands
-from hybridkin._core.plausible import PlausibleRows
-from hybridkin._core.units import motion_message
+from hybridkin._core.plausible import PlausibleRows, UnknownRows
 from hybridkin.calibration.calibrate import CalibrationResult
-from hybridkin.chains.chain import Chain
 from hybridkin.hybrid._adapt import Change
 from hybridkin.hybrid._drift import Drift
-from hybridkin.hybrid._fit import known_tips
 from hybridkin.hybrid._hysteresis import NO_PAST, Past
 from hybridkin.hybrid._module import Hybrid
 from hybridkin.hybrid._pace import each_pace
@@ -37,6 +36,7 @@ from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._wrapped import in_columns, pose_difference
 from hybridkin.hybrid.cv_results import CvResults
 from hybridkin.hybrid.log_fit import HybridFit
+from hybridkin.hybrid.model_description import ModelDescription
 from hybridkin.hysteresis.value import Hysteresis
 from hybridkin.learning.hidden_layer import check_inputs
 from hybridkin.native.library import evaluate
@@ -62,12 +62,13 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     candidates_: dict[str, Hybrid] | None
     cv_results_: CvResults | None
     radius_: Radius | None
+    description_: ModelDescription
     _fitted: HybridFit
     _past: Past
     _drift: Drift
-    _plausible_rows: PlausibleRows | None = None
+    _plausible_rows: PlausibleRows = UnknownRows.of(0)
     # Those that need no other check, and do not change by hysteresis.
-    _plain_rows: PlausibleRows | None = None
+    _plain_rows: PlausibleRows = UnknownRows.of(0)
 
     def predict(
         self,
@@ -182,6 +183,30 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         inside = self._evaluated(self._distances, X, warn=False)[0] <= 1.0
         return inside & self._are_states_seen(X)
 
+    def described(self, description: ModelDescription) -> Self:
+        """Return this estimator with another `description_`."""
+        self.description_ = description
+        return self
+
+    def was_fitted(self, X: object, y: ArrayLike) -> NDArray[np.bool_]:
+        """Return which rows are rows of the fit, to a micrometre, shape (N,).
+
+        Parameters
+        ----------
+        X : array-like of shape (N, n) or Commands
+            Actuator vectors, as for `fit`.
+        y : array-like of shape (N, m)
+            Measured tips [m].
+
+        Returns
+        -------
+        ndarray of bool of shape (N,)
+            All False for a nominal model, which no rows were fitted to.
+        """
+        check_is_fitted(self, "module_")
+        q = check_inputs(self, Commands.of(X).q)
+        return np.isin(row_digests(q, y), self._fitted.fitted_rows)
+
     def effective(self, X: object) -> NDArray:
         """Return what the actuators do for commands X [unit of q]; without `hysteresis`, X itself.
 
@@ -252,31 +277,25 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """Return names and values of what the fit found, which a notebook shows."""
 
     @property
-    def _chain(self) -> Chain | None:
-        """The mechanical model if it is a chain."""
-        if isinstance(self.mechanical_model_, Chain):
-            return self.mechanical_model_
-        return None
+    def _robot(self) -> ForwardModel:
+        """The mechanical model; without one the module, which knows no robot either."""
+        return (
+            self.module_ if self.mechanical_model_ is None else self.mechanical_model_
+        )
 
     def _check_commands(self, rows: Rows) -> None:
         """Raise if actuator vectors have another unit than those of the fit."""
-        chain = self._chain
-        turns = chain is not None and bool(
-            torch.as_tensor(chain.turns, device="cpu").all()
-        )
+        turns = torch.as_tensor(self._robot.turns, device="cpu")
         low, high = self.training_range_
-        check_commands(rows.X, low, high, turns)
+        check_commands(rows.X, low, high, bool(turns.all()))
 
     def _warn_of_units(self, rows: Rows) -> None:
         """Warn if measured tips span far more than the robot, so they cannot be in metres."""
-        chain = self._chain
-        if chain is None or not rows.counts.any():
+        if not rows.counts.any():
             return
-        measured, tips = known_tips(chain, rows.take(np.flatnonzero(rows.counts)))
-        message = motion_message(
-            "y", torch.cat([tips, measured]), tips, float(chain.reach)
-        )
-        if message is not None:
+        rows = rows.take(np.flatnonzero(rows.counts))
+        tips = torch.from_numpy(rows.tips)
+        for message in self._robot.tip_messages(rows.q, tips, "y", calibrated=True):
             warnings.warn(message, stacklevel=3)
 
     def _doubts(self, q: NDArray) -> list[str]:
@@ -284,20 +303,17 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
         Negative lengths are extrapolation, no error.
         """
-        chain = self._chain
-        plausible = self._plausible_rows
-        if chain is None or (plausible and plausible.hold(q)):
+        if self._plausible_rows.hold(q):
             return []
-        rows = torch.from_numpy(q)
-        messages = [*chain.unit_messages(rows, "X"), chain.contradiction(rows, "X")]
-        return [message for message in messages if message is not None]
+        robot = self._robot
+        rows = torch.tensor(q, device="cpu")
+        return [*robot.unit_messages(rows, "X"), *robot.contradictions(rows, "X")]
 
     def _distances(self, q: NDArray) -> tuple[NDArray]:
         """Return the distance from the domain of rows q (N, n): infinite without a shape."""
         (distance,) = self._tips(q, value=False, distance=True, enough=1.0)
-        plausible = self._plausible_rows
-        if self._chain is not None and not (plausible and plausible.hold(q)):
-            has_shape = self._chain.has_shape(torch.from_numpy(q))
+        if not self._plausible_rows.hold(q):
+            has_shape = self._robot.has_shape(torch.tensor(q, device="cpu"))
             distance = np.where(has_shape.numpy(), distance, np.inf)
         return (distance,)
 
@@ -343,6 +359,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self._drift = fit.no_drift
         self._past = NO_PAST
         self._follow_robot()
+        self.description_ = ModelDescription.of(self.module_, self.n_features_in_)
 
     def _follow_robot(self) -> None:
         """Set the module and its mechanical model after the change and the drift of the robot."""
@@ -355,10 +372,8 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if mechanical is not None:
             mechanical = self.change_.after(mechanical.without_errors)
         self.mechanical_model_ = mechanical
-        self._plausible_rows = None
-        self._plain_rows = None
-        if self._chain is not None:
-            self._plausible_rows = self._chain.plausible_rows()
+        self._plausible_rows = self._robot.plausible_rows()
+        self._plain_rows = UnknownRows.of(self.n_features_in_)
         if not self.hysteresis_ and "feature_names_in_" not in vars(self):
             self._plain_rows = self._plausible_rows
 
@@ -391,8 +406,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         warn: bool = True,
     ) -> list[NDArray]:
         """Return the results of a function of rows q for the rows of X, in the dtype of X."""
-        plain = self._plain_rows
-        if plain is not None and plain.hold_row(X):
+        if self._plain_rows.hold_row(X):
             rows = X
             q = X
         else:

@@ -24,7 +24,7 @@ from hybridkin.chains.structural import StructuralChain
 from hybridkin.hybrid._drift import too_far
 from hybridkin.hybrid._module import Hybrid, TipCorrection
 from hybridkin.hybrid._rows import Rows
-from hybridkin.hybrid._wrapped import pose_errors, posed
+from hybridkin.hybrid._wrapped import pose_errors
 from hybridkin.hybrid.cv_results import CvResults
 from hybridkin.hybrid.held_out import MEAN_LENGTH, Predictions
 from hybridkin.hybrid.structure_fit import StructureFit
@@ -328,7 +328,7 @@ def residuals(
     if mechanical is None:
         return y
     if output == "pose":
-        return pose_errors(posed(mechanical), q, y)
+        return pose_errors(mechanical, q, y)
     with torch.no_grad():
         tips = mechanical(q).numpy()
     if not countable(tips).all():

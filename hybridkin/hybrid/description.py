@@ -14,7 +14,8 @@ from sklearn.linear_model import LinearRegression
 
 from hybridkin._core.arrays import LARGEST
 from hybridkin._core.estimators import estimator_of, params_of, restore_columns
-from hybridkin._core.model import PortableModule, as_forward_model
+from hybridkin._core.model import ForwardModel, as_forward_model
+from hybridkin._core.portable import PortableModule
 from hybridkin._core.stored import (
     KINDS_OF_MODELS,
     Restore,
@@ -32,7 +33,7 @@ from hybridkin.chains import (  # noqa: F401
 )
 from hybridkin.hybrid._adapt import Change
 from hybridkin.hybrid._drift import Drift
-from hybridkin.hybrid._module import Hybrid
+from hybridkin.hybrid._module import Hybrid, HybridModule
 from hybridkin.hybrid._pace import PaceRange
 from hybridkin.hybrid._radius import Radius
 from hybridkin.hybrid._range import TrainingRange
@@ -48,6 +49,7 @@ from hybridkin.hysteresis.stages.friction import Friction
 from hybridkin.hysteresis.value import Hysteresis
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.elm_cv import ELMRegressorCV
+from hybridkin.native.export import usual_range
 
 # Regressors that a file may name as the setting `error_model`.
 # The setting `hysteresis` was a value, that of the fit; the last one is that of first files.
@@ -197,6 +199,32 @@ def hybrid_of(stored: Stored, training: object) -> HybridForwardModel:
         raise ValueError("the arrays do not fit together") from error
     if not (torch.isfinite(x).all() and torch.isfinite(J).all()):
         raise ValueError("the arrays do not give finite numbers")
+    return model
+
+
+def nominal_hybrid(mechanical: ForwardModel) -> HybridForwardModel:
+    """Return a model that no rows were fitted to as a fitted one, without a correction.
+
+    Its training range is unknown: from minus infinity to infinity.
+    """
+    n = mechanical.n_actuators
+    middle, half = usual_range(mechanical, n)
+    q = torch.from_numpy(np.stack([middle - half, middle + half]))
+    model = HybridForwardModel(mechanical, "drop")
+    model.n_features_in_ = n
+    error_model = model._checked_error_model()
+    module = HybridModule(mechanical, [], q.new_zeros(0))
+    model._take(
+        HybridFit(
+            module=module,
+            error=FittedError(None, [], error_model),
+            kind=None,
+            fitted_rows=np.empty(0),
+            single_output=False,
+            training_range=TrainingRange(np.full(n, -inf), np.full(n, inf)),
+            no_drift=Drift.of_range(q, mechanical.n_outputs),
+        )
+    )
     return model
 
 

@@ -12,13 +12,13 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.validation import check_is_fitted
-from torch import nn
+from torch import Tensor, nn
 
 from hybridkin._core.arrays import labels, number, table
 from hybridkin._core.clock import check_seconds
 from hybridkin._core.commands import Commands
 from hybridkin._core.distinct import targets_that_count
-from hybridkin._core.model import PoseModel, as_forward_model
+from hybridkin._core.model import ForwardModel, as_forward_model
 from hybridkin._core.other_units import check_tips
 from hybridkin.calibration.measured import (
     LEAVE_OUT,
@@ -27,14 +27,11 @@ from hybridkin.calibration.measured import (
     check_unscaled,
     with_missing_markers,
 )
-from hybridkin.chains.chain import Chain
-from hybridkin.chains.markers import MarkedChain
 from hybridkin.hybrid._adapt import (
     PARAMETERS,
     check_parameters,
     likeliest_change,
 )
-from hybridkin.hybrid._fit import known_tips
 from hybridkin.hybrid._html import fitted_rows
 from hybridkin.hybrid._hysteresis import NO_PAST, choice_of, continued
 from hybridkin.hybrid._predictor import HybridPredictor
@@ -169,6 +166,8 @@ class HybridForwardModel(HybridPredictor):
     radius_ : Radius or None
         With `coverage`: the radius ``inside`` the domain [m], infinite with too few groups.
         `adapt` and `partial_fit` do not change it.
+    description_ : ModelDescription
+        Robot, log and file of the model; of one from `open_model`, what these say.
     training_range_ : TrainingRange
         ``low`` and ``high`` (n,), the least and the largest q of the fit [unit of q]; with
         `hysteresis` of the motion of the actuators. `adapt` moves it with the actuator zeros.
@@ -409,10 +408,9 @@ class HybridForwardModel(HybridPredictor):
         with torch.no_grad():
             predicted = self.fitted_module_(rows.q).numpy()
         check_tips(rows.tips[:, : predicted.shape[1]], predicted, "y")
-        if self._chain is not None:  # wherever its base is
-            measured, _ = known_tips(self._chain, rows)
-            for message in self._chain.far_messages(measured, "y"):
-                warnings.warn(message, stacklevel=2)
+        measured = torch.from_numpy(rows.tips[:, : self._robot.n_outputs])
+        for message in self._robot.far_messages(measured, "y"):  # wherever its base is
+            warnings.warn(message, stacklevel=2)
         self.change_, message = likeliest_change(
             self.fitted_module_,
             rows,
@@ -453,7 +451,7 @@ class HybridForwardModel(HybridPredictor):
         names = self.calibrate
         if names is None or isinstance(names, str):
             return error_model
-        if [*names] and not isinstance(mechanical, Chain):
+        if [*names] and not _geometry(mechanical):
             raise TypeError(
                 f"`mechanical_model` must be a chain to `calibrate` {self.calibrate!r}, got "
                 f"{type(mechanical).__name__}, which has no geometry."
@@ -461,7 +459,8 @@ class HybridForwardModel(HybridPredictor):
         return error_model
 
     def _check_pose_settings(self, error_model: ErrorModel) -> None:
-        if not isinstance(self.mechanical_model, PoseModel):
+        mechanical = self.mechanical_model
+        if mechanical is None or not as_forward_model(mechanical).has_pose:
             raise TypeError(
                 "`mechanical_model` must be a PoseModel with pose_and_jacobian(q) for "
                 f"output='pose'; all chains are. Got {type(self.mechanical_model).__name__}; for "
@@ -519,7 +518,7 @@ class HybridForwardModel(HybridPredictor):
     def _missing_markers(self, y: Any, advice: str) -> NDArray[np.bool_]:
         """Return which entries of y (N, 3 K) are missing markers; each row must keep a marker."""
         mechanical = self.mechanical_model
-        allowed = mechanical is None or isinstance(mechanical, MarkedChain)
+        allowed = mechanical is None or as_forward_model(mechanical).markers
         if not allowed or self.output == "pose" or np.ndim(y) != 2 or y.shape[1] % 3:
             return np.zeros(np.shape(y), dtype=bool)
         return np.isnan(with_missing_markers(y, "y", advice))
@@ -527,24 +526,16 @@ class HybridForwardModel(HybridPredictor):
     def _spec(self, error_model: ErrorModel, rows: Rows) -> Spec:
         """Return the settings as a specification, with a copy of the mechanical model."""
         mechanical = self.mechanical_model
+        names = ()
         if mechanical is not None:
             mechanical = as_forward_model(copy.deepcopy(mechanical)).frozen()
             # A function does not tell how many, but its rows do.
             mechanical.n_actuators = mechanical.n_actuators or rows.X.shape[1]
-        names = ()
-        if isinstance(mechanical, Chain):
-            check_unscaled("X", rows.X, "actuator vectors [m or rad]")
-            check_unscaled("y", rows.tips[rows.counts > 0.0], "tip positions [m]")
-            mechanical.check_actuators(rows.q, "X")
-            names = self.calibrate
-            if names is None and error_model.chooses:
-                names = "auto"
-            elif names is None:
-                names = ()
-            elif names == "default":
-                names = mechanical.default_parameters
-            elif not isinstance(names, str):
-                names = tuple(names)
+            if mechanical.geometry():
+                check_unscaled("X", rows.X, "actuator vectors [m or rad]")
+                check_unscaled("y", rows.tips[rows.counts > 0.0], "tip positions [m]")
+                mechanical.check_actuators(rows.q, "X")
+                names = self._names_to_calibrate(mechanical, error_model)
         return Spec(
             mechanical,
             error_model,
@@ -554,6 +545,22 @@ class HybridForwardModel(HybridPredictor):
             choice_of(self.hysteresis),
             self.coverage,
         )
+
+    def _names_to_calibrate(
+        self, mechanical: ForwardModel, error_model: ErrorModel
+    ) -> tuple[str, ...] | str:
+        """Return the parameters of a chain to calibrate, or "auto"."""
+        names = self.calibrate
+        if names is None:
+            return "auto" if error_model.chooses else ()
+        if names == "default":
+            return mechanical.default_parameters
+        return names if isinstance(names, str) else tuple(names)
+
+
+def _geometry(mechanical: object) -> dict[str, Tensor]:
+    """Return the geometry of a mechanical model; empty if there is none."""
+    return {} if mechanical is None else as_forward_model(mechanical).geometry()
 
 
 def _check_positive(name: str, value: object, high: float) -> None:

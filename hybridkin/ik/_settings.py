@@ -32,9 +32,9 @@ from hybridkin._core.kernel_numbers import (
     IK_PULLS,
     IK_WEIGHTS,
 )
-from hybridkin._core.model import Portable
 from hybridkin._core.named_rows import without_warnings
 from hybridkin._core.plan import NoKernel, Plan
+from hybridkin._core.portable import Portable
 from hybridkin.ik._feedback import expected_innovation
 from hybridkin.ik._half_spaces import HalfSpaces
 from hybridkin.ik._posture import FixedPosture, Function, NoPosture, PostureFunction

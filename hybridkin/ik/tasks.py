@@ -6,7 +6,7 @@ import copy
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Protocol, TypeAlias, TypeVar, cast, runtime_checkable
+from typing import TYPE_CHECKING, TypeAlias, TypeVar, cast
 
 import torch
 from numpy.typing import ArrayLike, NDArray
@@ -540,13 +540,6 @@ class AxisTask(_OfPoses):
             )
 
 
-@runtime_checkable
-class _WithPoints(Protocol):
-    """A chain whose tip can be moved to another point of its backbone."""
-
-    def with_tip(self, at: float) -> ForwardModel: ...
-
-
 class PointsTask(Task):
     """Task to bring several points of the backbone to target points: 3 P rows, targets (P, 3).
 
@@ -576,11 +569,8 @@ class PointsTask(Task):
     def __init__(
         self, chain: object, at: Sequence[float], weights: Sequence[float] | None = None
     ) -> None:
-        if not isinstance(chain, _WithPoints):
-            raise TypeError(
-                f"`chain` must have with_tip(at), e.g. a chain of arcs, got {type(chain).__name__}."
-            )
-        self.models = tuple(chain.with_tip(number(a, "at")) for a in at)
+        model = as_forward_model(chain)
+        self.models = tuple(model.with_tip(number(a, "at")) for a in at)
         n = len(at)
         if weights is None:
             weights = (1.0,) * n

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from hybridkin._core.arrays import as_array, as_tensor, is_numpy, number
 from hybridkin._core.kernel_numbers import IK_ON_TIME
-from hybridkin._core.model import Portable
+from hybridkin._core.portable import Portable
 from hybridkin.ik._compiled import Follower, Tick, core_of, why_torch
 from hybridkin.ik._feedback import MOST_PERIODS, Feedback, Readings
 from hybridkin.ik._gram import row_gram

@@ -23,7 +23,6 @@ from hybridkin import (
 from hybridkin._core.rotations import rotation, rotation_vector
 from hybridkin.hybrid._adapt import _SCALES, _likeliest_scales, _whitened
 from hybridkin.hybrid._drift import MISFITS, SWITCH
-from hybridkin.hybrid._wrapped import shifted
 
 SHIFT = 0.006 * np.array([1.0, -0.5, 0.8, -1.2, 0.3, 0.9, -1.0, 0.6, -0.7])
 TURN, WAY = torch.tensor([0.1, -0.06, 0.08], dtype=torch.float64), np.array([0.03, -0.05, 0.02])
@@ -176,7 +175,7 @@ def test_a_chain_with_shifted_zeros_is_the_chain_of_shifted_actuators(make, gain
     chain = make() if gains is None else make(gains=gains)
     rng = np.random.default_rng(0)
     q, shift = (torch.from_numpy(1e-3 * rng.standard_normal(size)) for size in ((9, 7), 7))
-    moved_chain = shifted(chain, shift)
+    moved_chain = chain.shifted(shift)
     assert isinstance(moved_chain, type(chain))
     assert_close(moved_chain(q), chain(q + shift), rtol=0, atol=1e-12)
     assert (moved_chain(q) - chain(q)).abs().max() > 1e-4

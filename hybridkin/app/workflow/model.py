@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 
 import hybridkin
 from hybridkin import (
-    ArcChain,
     Chain,
     Commands,
     ForwardModel,
@@ -267,9 +266,7 @@ class LoadedModel:
         if self.description is not None and self.description.log is not None:
             return self.description.log
         names = tuple(f"q{i + 1}" for i in range(self.n_actuators))
-        unit = "m"
-        if isinstance(self.chain, ArcChain) and not self.chain.in_metres:
-            unit = "1"
+        unit = "m" if self.module.robot.in_metres else "1"
         return robots.LogFormat(names, ("x", "y", "z"), unit)
 
 

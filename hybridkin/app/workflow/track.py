@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import hybridkin
-from hybridkin import ArcChain, IKStatus, Track, robots, trajectories
+from hybridkin import IKStatus, Track, robots, trajectories
 from hybridkin.app.workflow.counts import Counts
 from hybridkin.app.workflow.domain import Domain, PathLimits, path_limits
 from hybridkin.app.workflow.errors import Errors
@@ -344,7 +344,7 @@ def _start(domain: Domain, start: ArrayLike | str) -> NDArray | None:
         if start == "path":
             return None
         if start == "rest":
-            if domain.tendons or ((low <= 0) & (high >= 0)).all():
+            if domain.all_tendons or ((low <= 0) & (high >= 0)).all():
                 return domain.rest
             return domain.preferred
         raise ValueError(f'`start` must be "rest", "path" or numbers, got {start!r}.')
@@ -633,9 +633,8 @@ def _add_commands(
     """Add the commands and their limits, in names, unit and sign of the robot's logs."""
     loaded = domain.loaded
     log_format = loaded.log_format()
-    counts: tuple[int, ...] = (loaded.n_actuators,)
-    if isinstance(loaded.chain, ArcChain):
-        counts = loaded.chain.actuators_per_segment
+    rings = loaded.module.robot.rings or (slice(0, loaded.n_actuators),)
+    counts = [ring.stop - ring.start for ring in rings]
     n = len(counts)
     figure, axes = hybridkin.plots.new_figure(
         7.0, 1.0 + 1.8 * n, n, 1, sharex=True, squeeze=False
