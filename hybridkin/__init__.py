@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from hybridkin.chains.constant_curvature import ConstantCurvatureChain
     from hybridkin.chains.elastic_tendons import ElasticTendonChain
     from hybridkin.chains.force_tendons import ForceTendonChain
+    from hybridkin.chains.length_driven import LengthDrivenChain
     from hybridkin.chains.rigid import RigidChain
     from hybridkin.hybrid.choose_rows import choose_rows
     from hybridkin.hybrid.estimator import HybridForwardModel
@@ -45,6 +46,7 @@ __all__ = [
     "IKSolution",
     "IKStatus",
     "InverseKinematics",
+    "LengthDrivenChain",
     "ModelDescription",
     "RigidChain",
     "Step",
@@ -74,6 +76,7 @@ _NAMES_OF = {
     "chains.constant_curvature": ("ConstantCurvatureChain",),
     "chains.elastic_tendons": ("ElasticTendonChain",),
     "chains.force_tendons": ("ForceTendonChain",),
+    "chains.length_driven": ("LengthDrivenChain",),
     "chains.rigid": ("RigidChain",),
     "hybrid.choose_rows": ("choose_rows",),
     "hybrid.model_description": ("ModelDescription",),

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridkin import ConstantCurvatureChain, ElasticTendonChain, ForwardModel
+from hybridkin import ForwardModel, LengthDrivenChain
 from hybridkin.app.checks.columns import COLUMN_CHECKS, LogRows
 from hybridkin.app.checks.encoders import encoder_findings
 from hybridkin.app.checks.geometry import geometry_findings
@@ -108,7 +108,7 @@ def check_log(
         if of_encoders:
             chain = None  # readings that are turns off look like wrong orders, signs and units
         # Its checks compare radii, paths and lengths of arcs, which no other chain has.
-        if isinstance(chain, (ConstantCurvatureChain, ElasticTendonChain)):
+        if isinstance(chain, LengthDrivenChain):
             findings += geometry_findings(rows.log, chain, base_is_free)
         if not any(finding.kind in (*MISREAD, "encoder") for finding in findings):
             residual = [*residual_findings(rows.log, chain, rows.same_motion)]
