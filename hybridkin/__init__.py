@@ -24,7 +24,9 @@ if TYPE_CHECKING:
     from hybridkin.chains.rigid import RigidChain
     from hybridkin.chains.series import HysteresisSeries
     from hybridkin.hybrid.choose_rows import choose_rows
+    from hybridkin.hybrid.cross_fit import cross_fit
     from hybridkin.hybrid.estimator import HybridForwardModel
+    from hybridkin.hybrid.held_out import CrossFit
     from hybridkin.ik import tasks, trajectories
     from hybridkin.ik.results import IKSolution, IKStatus, Step, Track
     from hybridkin.ik.solver import InverseKinematics
@@ -38,6 +40,7 @@ __all__ = [
     "Commands",
     "ConstantCurvatureChain",
     "CreepOperator",
+    "CrossFit",
     "ELMRegressor",
     "ELMRegressorCV",
     "ElasticTendonChain",
@@ -59,6 +62,7 @@ __all__ = [
     "as_forward_model",
     "calibrate",
     "choose_rows",
+    "cross_fit",
     "datasets",
     "fit_play",
     "jacobian",
@@ -85,7 +89,9 @@ _NAMES_OF = {
     "chains.rigid": ("RigidChain",),
     "chains.series": ("HysteresisSeries",),
     "hybrid.choose_rows": ("choose_rows",),
+    "hybrid.cross_fit": ("cross_fit",),
     "hybrid.estimator": ("HybridForwardModel",),
+    "hybrid.held_out": ("CrossFit",),
     "ik.results": ("IKSolution", "IKStatus", "Step", "Track"),
     "ik.solver": ("InverseKinematics",),
     "ik.tracker": ("Tracker",),

@@ -490,14 +490,21 @@ class Blend(ErrorModel):
     def fit(self, rows: Rows, spec: Spec) -> FittedError:
         """Return all models fitted to the same rows."""
         fits = [model.fit(rows, spec) for model in self.models]
-        corrections: list[Weighted] = [[] for _ in fits[0].corrections]
-        for weight, fitted in zip(self.weights, fits, strict=True):
-            for blended, of_model in zip(corrections, fitted.corrections, strict=True):
-                blended += [
-                    (weight * part, correction) for part, correction in of_model
-                ]
-        results = tuple(fitted.result for fitted in fits)
-        return FittedError(FittedBlend(self.weights, results), corrections, self)
+        return replace(blended(fits, self.weights), settled=self)
+
+
+def blended(fits: Sequence[FittedError], weights: Sequence[float]) -> FittedError:
+    """Return the weighted mean of fitted error models; of a single one itself."""
+    if len(fits) == 1:
+        return fits[0]
+    corrections: list[Weighted] = [[] for _ in fits[0].corrections]
+    for weight, fitted in zip(weights, fits, strict=True):
+        for of_blend, of_model in zip(corrections, fitted.corrections, strict=True):
+            for part, correction in of_model:
+                of_blend.append((weight * part, correction))
+    results = tuple(fitted.result for fitted in fits)
+    result = FittedBlend(tuple(weights), results)
+    return FittedError(result, corrections, fits[0].settled)
 
 
 def network_model(

@@ -144,24 +144,6 @@ def choose_hysteresis(spec: Spec, rows: Rows) -> HysteresisOperator | None:
     )
 
 
-def moved_without(spec: Spec, log: Rows, held_out: NDArray) -> Rows:
-    """Return the measured rows with what the actuators do, by the hysteresis of the others.
-
-    Parameters
-    ----------
-    spec, log
-        As for `play_of`; rows of weight zero move the actuators.
-    held_out : ndarray of int
-        Places of measured rows that do not count.
-    """
-    measured = log.counted
-    weights = log.counts.copy()
-    weights[measured[held_out]] = 0.0
-    operator, _ = play_of(spec, replace(log, weights=weights).in_runs())
-    moved = log if operator is None else log.effective(operator)
-    return moved.take(measured)
-
-
 def continued(
     operator: HysteresisOperator, rows: Rows, past: Past | None
 ) -> tuple[NDArray, Past | None]:

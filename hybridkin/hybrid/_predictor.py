@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import warnings
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -17,6 +18,7 @@ from sklearn.utils.validation import check_is_fitted
 
 from hybridkin._core.arrays import labels
 from hybridkin._core.commands import Commands
+from hybridkin._core.digests import row_digests
 from hybridkin._core.distinct import targets_that_count
 from hybridkin._core.html import html_table
 from hybridkin._core.model import ForwardModel, as_forward_model
@@ -49,7 +51,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     error_model: object
     coupling: str
-    calibrate: Sequence[str] | str | None
+    calibrate: Iterable[str] | str | None
     guard: str | None
     output: str
     n_features_in_: int
@@ -318,20 +320,25 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         fit = self._fitted
         return fit.state_range if self.play_ is fit.play else None
 
-    def _take(self, fit: HybridFit) -> None:
+    def take_fit(self, fit: HybridFit) -> None:
         """Become the model of a fit; the robot has not changed since."""
         self._fitted = fit
         self.fitted_module_ = fit.module
         self.error_model_ = fit.error.result
         self.calibration_ = fit.calibration
         self.cv_results_ = fit.error.comparison
-        self.candidates_ = fit.error.candidates
+        self.candidates_ = fit.candidates
         self.play_ = fit.play
         self.radius_ = fit.radius
         self.change_ = Change.none(self.n_features_in_)
         self._drift = fit.no_drift
         self._past = None
         self._follow_robot()
+
+    def count_as_fitted(self, q: NDArray, x: NDArray) -> None:
+        """Count rows q (N, n) with tips x (N, m) as fitted: those of a log that was thinned."""
+        digests = np.unique(row_digests(q, x))
+        self._fitted = replace(self._fitted, fitted_rows=digests)
 
     def _follow_robot(self) -> None:
         """Set the module and its mechanical model after the change and the drift of the robot."""

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from math import nan
 from typing import NamedTuple, cast
 
@@ -27,7 +27,7 @@ from hybridkin.hybrid._module import Hybrid, TipCorrection
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._wrapped import pose_errors, posed
 from hybridkin.hybrid.cv_results import CvResults
-from hybridkin.hybrid.held_out import MEAN_LENGTH, Predictions
+from hybridkin.hybrid.held_out import MEAN_LENGTH
 from hybridkin.hybrid.structure_fit import StructureFit
 
 Seed = int | np.random.RandomState | None
@@ -96,10 +96,8 @@ class FittedError:
         The refined mechanical model that the corrections are added to. None: the calibrated one.
     structure : StructureFit or None
         The fit of the refined model to the same rows. None: not refined, or of a part of a log.
-    candidates : dict of str to Hybrid, or None
-        Of "auto": every candidate, fitted to all rows.
-    outside : Predictions or None
-        Of the candidates for a part of a log: their predictions for its outer rows.
+    candidates : dict of str to FittedHybrid
+        Of "auto": every candidate, fitted to all rows; else none.
     """
 
     result: object
@@ -111,8 +109,7 @@ class FittedError:
     comparison: CvResults | None = None
     refined: StructuralChain | None = None
     structure: StructureFit | None = None
-    candidates: dict[str, Hybrid] | None = None
-    outside: Predictions | None = None
+    candidates: Mapping[str, FittedHybrid] = field(default_factory=dict)
 
     @property
     def kind(self) -> str | None:
@@ -197,19 +194,16 @@ class Spec:
             held_out=False,
         )
 
-    def with_geometry_chosen(
-        self,
-        rows: Rows,
-        geometry: GeometryChoice | None = None,
-    ) -> Spec:
+    def with_geometry_chosen(self, rows: Rows) -> Spec:
         """Return the specification with the parameters to calibrate, chosen on the rows or given.
 
         For a list and an error model that chooses, a plain chain is compared with elastic tendons.
         """
-        automatic = self.calibrate == "auto"
-        if not self.calibrate or not (automatic or self.error_model.chooses):
-            return self
+        geometry = self.geometry
         if geometry is None:
+            automatic = self.calibrate == "auto"
+            if not self.calibrate or not (automatic or self.error_model.chooses):
+                return self
             geometry = choose_geometry(
                 cast(Chain, self.mechanical),
                 rows.q,
@@ -297,6 +291,25 @@ class Spec:
             (rows.marker(k), replace(self, mechanical=tip))
             for k, tip in enumerate(tips)
         ]
+
+
+class FittedHybrid(NamedTuple):
+    """Result of a fit; its warnings are in the messages of `spec` and were not issued."""
+
+    spec: Spec  # with the calibrated mechanical model
+    error: FittedError
+    module: Hybrid
+
+    def take_low_rank(self, q: Tensor) -> None:
+        """Give networks and their guards a leverage of low rank, for training rows q (N, n)."""
+        for part in [*self.module.modules()]:
+            if isinstance(part, TipCorrection):
+                part.take_low_rank(q)
+
+    def predict(self, X: NDArray) -> NDArray:
+        """Return the tips (N, m) at actuator vectors (N, n) [m]."""
+        with torch.no_grad():
+            return self.module(torch.from_numpy(X.astype(np.float64))).numpy()
 
 
 def residuals(

@@ -186,7 +186,7 @@ def hybrid_of(stored: Stored, training: object) -> HybridForwardModel:
             m = in_columns(module, model.output)(q).shape[1]
         drift = _restored_drift(stored, Drift.of_range(q, m))
         fit = _restored_fit(stored, training, module, drift.emptied(), error_model)
-        model._take(fit)
+        model.take_fit(fit)
         shift = stored.array("shift", (n,))
         model.change_ = Change(shift, stored.array("motion", (4, 4)))
         model._drift = drift

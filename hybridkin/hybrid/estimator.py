@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any, cast
 
@@ -19,6 +19,7 @@ from hybridkin._core.clock import check_seconds
 from hybridkin._core.commands import Commands
 from hybridkin._core.distinct import targets_that_count
 from hybridkin._core.model import PoseModel, as_forward_model
+from hybridkin.calibration.choice import GeometryChoice
 from hybridkin.calibration.measured import (
     LEAVE_OUT,
     WEIGH_ZERO,
@@ -41,7 +42,7 @@ from hybridkin.hybrid._predictor import HybridPredictor
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._settings import CONSTRAINTS, error_model_of
 from hybridkin.hybrid._spec import ErrorModel, Spec, residuals
-from hybridkin.hybrid.log_fit import HybridFit, fit_to_log
+from hybridkin.hybrid.log_fit import fit_to_log
 from hybridkin.hybrid.other_units import check_tips
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.hidden_layer import check_rows
@@ -200,7 +201,7 @@ class HybridForwardModel(HybridPredictor):
         error_model: object = None,
         *,
         coupling: str = "parallel",
-        calibrate: Sequence[str] | str | None = None,
+        calibrate: Iterable[str] | str | None = None,
         guard: str | None = "leverage",
         play: ArrayLike | HysteresisOperator | str | None = None,
         coverage: float | None = None,
@@ -276,10 +277,11 @@ class HybridForwardModel(HybridPredictor):
             their held-out errors; and none below 20 rows). The mean square must exceed that of the
             mechanical model by more than the standard error of the latter over rows, or groups.
         """
-        fitted = fit_to_log(*prepared(self, X, y, groups, sample_weight))
-        for message in fitted.messages:
+        fit = fit_to_log(*self.prepared(X, y, sample_weight, groups))
+        for message in fit.messages:
             warnings.warn(message, stacklevel=2)
-        return with_fit(self, fitted)
+        self.take_fit(fit)
+        return self
 
     def partial_fit(
         self,
@@ -428,6 +430,18 @@ class HybridForwardModel(HybridPredictor):
         self._follow_robot()
         return self
 
+    def prepared(
+        self,
+        X: object,
+        y: object,
+        sample_weight: ArrayLike | None = None,
+        groups: ArrayLike | None = None,
+    ) -> tuple[Spec, Rows]:
+        """Return the checked settings and the checked rows of a log, as for `fit`."""
+        error_model = self._checked_error_model()
+        log = self._checked_rows(X, y, sample_weight, groups)
+        return self._spec(error_model, log), log
+
     def html_rows(self) -> dict[str, object]:
         """Return names and values of what the fit found, which a notebook shows."""
         return fitted_rows(self)
@@ -528,6 +542,7 @@ class HybridForwardModel(HybridPredictor):
             # A function does not tell how many, but its rows do.
             mechanical.n_actuators = mechanical.n_actuators or rows.X.shape[1]
         names = ()
+        geometry = None
         if isinstance(mechanical, Chain):
             check_unscaled("X", rows.X, "actuator vectors [m or rad]")
             check_unscaled("y", rows.tips[rows.counts > 0.0], "tip positions [m]")
@@ -539,6 +554,9 @@ class HybridForwardModel(HybridPredictor):
                 names = ()
             elif names == "default":
                 names = mechanical.default_parameters
+            elif isinstance(names, GeometryChoice):
+                geometry = names
+                names = geometry.parameters
             elif not isinstance(names, str):
                 names = tuple(names)
         return Spec(
@@ -549,28 +567,10 @@ class HybridForwardModel(HybridPredictor):
             self.output,
             self.play,
             self.coverage,
+            geometry=geometry,
         )
 
 
 def _check_positive(name: str, value: object, high: float) -> None:
     if not 0.0 < number(value, name) <= high:
         raise ValueError(f"`{name}` must lie in (0, {high:g}], got {value!r}.")
-
-
-def prepared(
-    model: HybridForwardModel,
-    X: object,
-    y: object,
-    groups: ArrayLike | None = None,
-    sample_weight: ArrayLike | None = None,
-) -> tuple[Spec, Rows]:
-    """Return the checked settings of a model and the rows of a log, for `fit_to_log`."""
-    error_model = model._checked_error_model()
-    log = model._checked_rows(X, y, sample_weight, groups)
-    return model._spec(error_model, log), log
-
-
-def with_fit(model: HybridForwardModel, fit: HybridFit) -> HybridForwardModel:
-    """Return a model, after `prepared`, as its `fit` returns it."""
-    model._take(fit)
-    return model

@@ -3,28 +3,49 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
+from itertools import starmap
+from typing import NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 from typing_extensions import Self
 
-from hybridkin._core.digests import row_digests
 from hybridkin.calibration.calibrate import CalibrationResult
 from hybridkin.calibration.choice import GeometryChoice
+from hybridkin.calibration.measured import folds
 from hybridkin.chains.hysteresis import HysteresisOperator
-from hybridkin.hybrid._drift import Drift
+from hybridkin.hybrid._drift import Drift, too_far
 from hybridkin.hybrid._fit import few_rows, fit_hybrid, fit_messages
-from hybridkin.hybrid._hysteresis import moved_without, play_of
+from hybridkin.hybrid._hysteresis import play_of
 from hybridkin.hybrid._module import Hybrid
 from hybridkin.hybrid._pace import Pace, PaceRange, each_pace, pace_range
-from hybridkin.hybrid._radius import Radius, conformal_radius
+from hybridkin.hybrid._radius import Radius
 from hybridkin.hybrid._range import TrainingRange, state_range
 from hybridkin.hybrid._rows import Rows
-from hybridkin.hybrid._spec import UNREFINED, FitStart, FittedError, Refinement, Spec
+from hybridkin.hybrid._selection import (
+    Settled,
+    decided,
+    expected_with_new_choices,
+)
+from hybridkin.hybrid._spec import (
+    UNREFINED,
+    FitStart,
+    FittedError,
+    FittedHybrid,
+    Refinement,
+    Spec,
+)
 from hybridkin.hybrid._worse import worse_than_mechanical
 from hybridkin.hybrid.cv_results import CvResults
-from hybridkin.hybrid.held_out import MEAN_LENGTH
+from hybridkin.hybrid.held_out import (
+    MEAN_LENGTH,
+    CrossFit,
+    FoldChoice,
+    Outer,
+    Predictions,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,29 +95,167 @@ class HybridFit:
     messages: tuple[str, ...] = ()
 
     @property
+    def candidates(self) -> dict[str, Hybrid] | None:
+        """The candidates of "auto", fitted to all rows; None for other error models."""
+        fits = self.error.candidates
+        return {name: fit.module for name, fit in fits.items()} or None
+
+
+@dataclass(frozen=True, eq=False)
+class FitOnce:
+    """A fit to a log, without what a table of held-out predictions tells.
+
+    Attributes
+    ----------
+    spec : Spec
+        The settings, with the chosen geometry.
+    log, rows : Rows
+        The log, and its different rows with what the actuators do.
+    play : HysteresisOperator or None
+        The hysteresis.
+    fitted : FittedHybrid
+        The hybrid of these rows.
+    messages : list of str
+        Warnings about the hysteresis.
+    radius : Radius or None
+        The estimated error radius; None: not asked for, or not known yet.
+    """
+
+    spec: Spec
+    log: Rows
+    rows: Rows
+    play: HysteresisOperator | None
+    fitted: FittedHybrid
+    messages: list[str]
+    radius: Radius | None = None
+
+    @property
     def start(self) -> FitStart:
         """Where the choices of fits to parts of the log start."""
-        return FitStart(self.error.settled, self.geometry, self.refinement)
+        settled = self.fitted.error.settled
+        return FitStart(settled, self.spec.geometry, self.spec.refinement)
+
+    def effective(self, log: Rows) -> Tensor:
+        """Return what the actuators do at the rows of a log (N, n)."""
+        if self.play is None:
+            return log.q
+        return log.effective(self.play).q
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the candidates of "auto"; of other error models the one name "model"."""
+        return [*self.fitted.error.candidates] or ["model"]
+
+    def settled(self) -> Settled:
+        """Return the models with their choices, for fits to some of the rows that count."""
+        moved = self.log if self.play is None else self.log.effective(self.play)
+        return Settled.of(self.fitted, moved.take(self.log.counted))
+
+    def outer(self) -> Outer | None:
+        """Return what the candidates predict for the outer rows that count; None without any."""
+        if not self.fitted.error.candidates:
+            return None
+        outer = Settled.of(self.fitted, self.rows).outer()
+        assert self.rows.place is not None
+        place = self.rows.place[self.log.counted]
+        _, first = np.unique(place, return_index=True)
+        return outer._replace(rows=first[outer.rows])
+
+    def decided(self, table: CrossFit) -> Self:
+        """Return the fit with the blend of its candidates, and the radius, of a table."""
+        fitted = self.fitted
+        if fitted.error.candidates:
+            fitted = decided(fitted, self.rows, table)
+        radius = None
+        messages = self.messages
+        if self.spec.coverage is not None:
+            radius = table.radius(self.spec.coverage)
+            n_groups = len(np.unique(table.groups_inside))
+            messages = [*messages, *radius.doubts(n_groups)]
+        return replace(self, fitted=fitted, radius=radius, messages=messages)
 
     def expecting(self, distance: float) -> Self:
-        """Return the same with the mean error of a comparison, which "auto" expects [m]."""
-        comparison = self.error.comparison
-        if comparison is None:
-            return self
-        expected: CvResults = {**comparison, "expected_distance": distance}
-        noise = distance / MEAN_LENGTH
-        return replace(
-            self, error=replace(self.error, comparison=expected, noise=noise)
+        """Return the fit with another mean distance to expect on new motions [m]."""
+        error = self.fitted.error
+        assert error.comparison is not None
+        comparison: CvResults = {**error.comparison, "expected_distance": distance}
+        error = replace(error, comparison=comparison, noise=distance / MEAN_LENGTH)
+        return replace(self, fitted=self.fitted._replace(error=error))
+
+    def found(self) -> HybridFit:
+        """Return what a `HybridForwardModel` keeps of the fit."""
+        log = self.log
+        rows = self.rows
+        play = self.play
+        fitted = self.fitted
+        states = None
+        pace = None
+        if play is not None:
+            measured = log.take(log.counted)
+            size = np.ptp(log.X, axis=0)
+            states = state_range(_states(play, log), measured, size)
+            pace = _pace(play, log, measured)
+        fitted.take_low_rank(rows.q)
+        messages = [*self.messages, *fit_messages(fitted.spec, rows)]
+        return HybridFit(
+            module=fitted.module,
+            error=fitted.error,
+            kind=fitted.error.kind,
+            fitted_rows=log.distinct().digests(),
+            single_output=log.y.ndim == 1,
+            training_range=TrainingRange.of(rows.X),
+            no_drift=Drift.of_range(rows.q, rows.tips.shape[1]),
+            calibration=fitted.spec.calibration,
+            geometry=self.spec.geometry,
+            refinement=self.spec.refinement,
+            play=play,
+            state_range=states,
+            pace=pace,
+            radius=self.radius,
+            messages=tuple(dict.fromkeys(messages)),
         )
 
-    def of_all_rows(self, q: NDArray, x: NDArray) -> Self:
-        """Return the same for a log of more rows, all of which count as fitted."""
-        return replace(self, fitted_rows=np.unique(row_digests(q, x)))
+
+def fit_once(spec: Spec, log: Rows) -> FitOnce:
+    """Return the hybrid of a log, after the choices of its geometry and its hysteresis."""
+    commands = log.distinct()
+    chosen = spec.with_geometry_chosen(commands)
+    play, messages = play_of(chosen, log.in_runs())
+    rows = commands
+    if play is not None:
+        chosen = replace(chosen, commanded=commands.directions)
+        rows = log.effective(play).distinct()
+    return FitOnce(chosen, log, rows, play, fit_hybrid(chosen, rows), messages)
 
 
-def fit_to_log(
-    spec: Spec, log: Rows, geometry: GeometryChoice | None = None
-) -> HybridFit:
+class Anew(NamedTuple):
+    """A specification for fits to parts of a log, each of which makes its own choices."""
+
+    spec: Spec
+    log: Rows
+
+    def held_out(self, train: NDArray, test: NDArray) -> Predictions:
+        """Return what a fit to training rows predicts for test rows, of the rows that count."""
+        log = self.log
+        counted = log.counted
+        fit = fit_once(self.spec, log.counting(counted[train]))
+        modules = [fit.fitted.module]
+        if fit.fitted.error.candidates:
+            modules = [part.module for part in fit.fitted.error.candidates.values()]
+        q = fit.effective(log)[counted[test]]
+        tips = []
+        inside = []
+        with torch.no_grad():
+            for module in modules:
+                tips.append(module(q).numpy())
+                inside.append(module.in_domain(q).numpy())
+        if not np.isfinite(tips).all():
+            raise too_far()
+        choice = FoldChoice(fit.spec.geometry, fit.play, fit.fitted.error.result)
+        return Predictions(np.array(tips), np.array(inside), choice)
+
+
+def fit_to_log(spec: Spec, log: Rows) -> HybridFit:
     """Return what a fit finds; it changes no argument.
 
     Parameters
@@ -105,48 +264,34 @@ def fit_to_log(
         The settings.
     log : Rows
         The rows as they were measured.
-    geometry : GeometryChoice, optional
-        What to calibrate. Default: chosen on the rows.
     """
-    commands = log.distinct()
-    messages = few_rows(commands, spec)
-    chosen = spec.with_geometry_chosen(commands, geometry)
-    play, of_play = play_of(chosen, log.in_runs())
-    rows = commands
-    measured = commands
-    states = None
-    pace = None
-    moved = None
-    if play is not None:
-        spec = replace(spec, commanded=commands.directions)
-        chosen = replace(chosen, commanded=commands.directions)
-        measured = log.take(log.counted)
-        states = state_range(_states(play, log), measured, np.ptp(log.X, axis=0))
-        pace = _pace(play, log, measured)
-        moved = partial(moved_without, chosen, log)
-        rows = log.effective(play).distinct()
-    fitted = fit_hybrid(chosen, rows)
-    fitted.take_low_rank(rows.q)
-    radius, of_radius = conformal_radius(spec, measured, moved)
-    messages += [*of_play, *of_radius, *fit_messages(fitted.spec, rows)]
-    messages += worse_than_mechanical(fitted, _by_motion(log, rows, play))
-    return HybridFit(
-        module=fitted.module,
-        error=fitted.error,
-        kind=fitted.error.kind,
-        fitted_rows=commands.digests(),
-        single_output=log.y.ndim == 1,
-        training_range=TrainingRange.of(rows.X),
-        no_drift=Drift.of_range(rows.q, rows.tips.shape[1]),
-        calibration=fitted.spec.calibration,
-        geometry=chosen.geometry,
-        refinement=chosen.refinement,
-        play=play,
-        state_range=states,
-        pace=pace,
-        radius=radius,
-        messages=tuple(dict.fromkeys(messages)),
-    )
+    messages = few_rows(log.distinct(), spec)
+    fit = fit_once(spec, log)
+    if spec.coverage is not None:
+        fit = fit.decided(_table_anew(spec, fit))
+    elif fit.fitted.error.candidates:
+        table = Settled.of(fit.fitted, fit.rows).table()
+        expected = expected_with_new_choices(fit.fitted, fit.rows, table)
+        fit = fit.decided(table).expecting(expected)
+    by_motion = _by_motion(log, fit.rows, fit.play)
+    worse = worse_than_mechanical(fit.fitted, by_motion)
+    found = fit.found()
+    return replace(found, messages=(*messages, *found.messages, *worse))
+
+
+def _table_anew(spec: Spec, fit: FitOnce) -> CrossFit:
+    """Return the predictions of five folds of a log, which make the choices of a fit anew."""
+    if fit.play is None:
+        spec = replace(spec, play=None)
+        fit = replace(fit, log=fit.log.distinct())
+    log = fit.log
+    if fit.fitted.error.candidates:
+        spec = spec.starting_at(fit.start)
+    anew = Anew(replace(spec, held_out=False), log)
+    measured = log.take(log.counted)
+    splits = folds(measured.X, measured.groups)
+    held_out = starmap(anew.held_out, splits)
+    return CrossFit.of(fit.names, measured, splits, held_out, fit.outer())
 
 
 def _states(play: HysteresisOperator, log: Rows) -> NDArray:
