@@ -136,7 +136,11 @@ class KernelsHook(BuildHookInterface):  # pyright: ignore[reportGeneralTypeIssue
         """Compile; without a compiler the wheel is pure Python."""
         self.work = tempfile.mkdtemp()
         target = os.environ.get("HYBRIDKIN_PLATFORM") or host()
-        folder = NATIVE / "lib" if version == "editable" else Path(self.work)
+        folder = NATIVE / "lib"
+        if version != "editable":
+            folder = Path(self.work, "lib")
+            if (NATIVE / "lib").is_dir():
+                shutil.copytree(NATIVE / "lib", folder)  # what is up to date stays
         try:
             made = compile_into(folder, target, [])
         except OSError as error:

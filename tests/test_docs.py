@@ -214,46 +214,65 @@ def names_in(entries):
     return {name for names, _, _ in entries for name in names if name}
 
 
-@pytest.mark.parametrize("name", PUBLIC)
-def test_docstring_names_arguments_and_results(name):
-    thing = PUBLIC[name]
-    doc = inspect.getdoc(thing)
-    assert doc, "has no docstring"
-    assert doc.splitlines()[0].endswith((".", ":")), "the first line is a sentence"
-    is_method = not inspect.isclass(thing) and "." in name and name.split(".")[-2] not in MODULES
-    if re.search(r"; see `\w+`", doc.splitlines()[0]):  # where the details are
+# A module with its functions, or a class with its methods: one test.
+HOMES = {name.split(".")[0]: [] for name in PUBLIC}
+for _name in PUBLIC:
+    HOMES[_name.split(".")[0]].append(_name)
+
+
+@pytest.mark.parametrize("home", HOMES)
+def test_docstrings_name_arguments_and_results(home):
+    for name in HOMES[home]:
+        thing = PUBLIC[name]
+        doc = inspect.getdoc(thing)
+        assert doc, f"{name} has no docstring"
+        first_line = doc.splitlines()[0]
+        assert first_line.endswith((".", ":")), f"{name}: the first line is a sentence"
+        if re.search(r"; see `\w+`", first_line):  # where the details are
+            continue
+        is_class = inspect.isclass(thing)
+        is_method = not is_class and "." in name and name.split(".")[-2] not in MODULES
+        is_made_by_user = is_class and "Parameters\n---" in doc
+        documented = names_in(section(doc, "Parameters"))
+        is_function = inspect.isfunction(thing)
+        if is_made_by_user or (is_function and (documented or not is_method)):
+            taken = {*inspect.signature(thing).parameters} - {"self", "cls"}
+            assert documented == taken, name
+        if is_class and not is_made_by_user and not issubclass(thing, (Exception, Enum)):
+            assert "Attributes\n---" in doc, name
+        if is_function and not is_method and doc.startswith("Return"):
+            assert section(doc, "Returns"), name
+
+
+@pytest.mark.parametrize("home", HOMES)
+def test_arrays_have_a_shape_and_a_unit(home):
+    for name in HOMES[home]:
+        doc = inspect.getdoc(PUBLIC[name]) or ""
+        for kind in ("Parameters", "Attributes", "Returns"):
+            for names, what, text in section(doc, kind):
+                check_array(f"{name}, {names or kind}: {what}", {*names}, what, text)
+
+
+def check_array(entry, names, what, text):
+    """Fail if an entry of a docstring holds an array without a shape or a unit."""
+    is_array = re.search(r"\b(array|array-like|ndarray|Tensor)\b(?! of Axes)", what)
+    if not is_array or re.match(r"(dict|mapping)\b", what):
         return
-    is_made_by_user = inspect.isclass(thing) and "Parameters\n---" in doc
-    documented = names_in(section(doc, "Parameters"))
-    if is_made_by_user or (inspect.isfunction(thing) and (documented or not is_method)):
-        taken = {*inspect.signature(thing).parameters} - {"self", "cls"}
-        assert documented == taken
-    if inspect.isclass(thing) and not is_made_by_user and not issubclass(thing, (Exception, Enum)):
-        assert "Attributes\n---" in doc
-    if inspect.isfunction(thing) and not is_method and doc.startswith("Return"):
-        assert section(doc, "Returns")
+    assert "shape" in what + text, entry
+    is_number = not re.search(r"\b(bool|int|str)\b|Bool|of Axes", what + text)
+    if is_number and not names & (OF_THE_ACTUATORS | WITHOUT_UNIT):
+        stated = re.search(r"\[.+\]|unit of|As for|as for", text, re.DOTALL)
+        assert stated or not names, f"{entry}: {text}"
 
 
-@pytest.mark.parametrize("name", PUBLIC)
-def test_arrays_have_a_shape_and_a_unit(name):
-    doc = inspect.getdoc(PUBLIC[name]) or ""
-    for kind in ("Parameters", "Attributes", "Returns"):
-        for names, what, text in section(doc, kind):
-            is_array = re.search(r"\b(array|array-like|ndarray|Tensor)\b(?! of Axes)", what)
-            if not is_array or re.match(r"(dict|mapping)\b", what):
-                continue
-            assert "shape" in what + text, f"{names or kind}: {what}"
-            is_number = not re.search(r"\b(bool|int|str)\b|Bool|of Axes", what + text)
-            if is_number and not {*names} & (OF_THE_ACTUATORS | WITHOUT_UNIT):
-                stated = re.search(r"\[.+\]|unit of|As for|as for", text, re.DOTALL)
-                assert stated or not names, f"{names}: {text}"
-
-
-@pytest.mark.parametrize("name", [n for n in PUBLIC if inspect.isclass(PUBLIC[n])])
-def test_reference_lists_every_class(name):
+def test_reference_lists_every_class():
     """Functions and classes of the modules are listed from `__all__` by the pages' template."""
     text = (DOCS / "api.rst").read_text(encoding="utf-8")
-    assert re.search(rf"^   {name.split('.')[0]}$", text, re.MULTILINE)
+    for name, thing in PUBLIC.items():
+        if inspect.isclass(thing):
+            home = name.split(".")[0]
+            listed = re.search(rf"^   (app\.)?{home}(\.\w+)?$", text, re.MULTILINE)
+            assert listed, name
 
 
 @pytest.fixture(autouse=True)
