@@ -195,11 +195,13 @@ def models_of(
     if settings.auto:
         models[DATA_ELM] = HybridForwardModel(None, network)
         models[AUTO] = _auto(robot, mechanical, settings)
-        return models
-    if robot.chain is not None:
-        models["hybrid, linear"] = HybridForwardModel(model, "linear")
-    models["hybrid, quadratic"] = HybridForwardModel(model, "quadratic")
-    models[HYBRID_ELM] = HybridForwardModel(model, network)
+    else:
+        if robot.chain is not None:
+            models["hybrid, linear"] = HybridForwardModel(model, "linear")
+        models["hybrid, quadratic"] = HybridForwardModel(model, "quadratic")
+        models[HYBRID_ELM] = HybridForwardModel(model, network)
+    for of_comparison in models.values():
+        of_comparison.set_params(coverage=settings.coverage)
     return models
 
 
@@ -221,7 +223,6 @@ def _auto(
         "auto",
         calibrate=calibrate,
         play=settings.play,
-        coverage=settings.coverage,
         random_state=0,
     )
 

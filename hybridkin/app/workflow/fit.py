@@ -83,7 +83,7 @@ def fit_log(
         Fit even if the check of the log finds errors, and replace files of `out` that `fit` did
         not write.
     n_jobs, progress
-        As in `compare_by_group`.
+        As for `hybridkin.cross_fit`.
 
     Returns
     -------
@@ -121,9 +121,10 @@ def fit_log(
     model.count_as_fitted(complete.q, complete.x)
     progress("writing the report", 0, 1)
     held_out = {}
-    for name, errors in errors_of_rows(compared).items():
+    errors = errors_of_rows(compared)
+    for name, of_model in errors.items():
         held_out[name] = HeldOutErrors.of_motions(
-            errors, measured.motions, compared.fold
+            of_model, measured.motions, compared.fold
         )
     record = FitRecord(
         log=Path(log.source).name,
@@ -138,15 +139,13 @@ def fit_log(
         saved=saved,
         chosen=choice_in_words(model, rows.q_unit),
         held_out=held_out,
-        promise=Promise.of(
-            errors_of_rows(compared)[saved], compared.distances_from_others
-        ),
+        promise=Promise.of(errors[saved], compared.distances_from_others),
         counts=None
         if robot.log is None
         else Counts.of_log(robot.log.to_log(complete.q)),
         choices_by_fold=choices_by_fold(compared, rows.q_unit),
         log_check=complete.report,
-        worst=largest_errors(compared, measured.motions),
+        worst=largest_errors(errors, measured.motions),
         markers=errors_of_markers(
             distances(compared.tips[compared.names.index(saved)], compared.y)
         ),
@@ -161,7 +160,7 @@ def fit_log(
     )
     report = Report(f"{robot.name}: hybrid model of {record.log}", record)
     write_comparison(report)
-    add_error_figures(report, errors_of_rows(compared))
+    add_error_figures(report, errors)
     write_model(report)
     _add_model(report, model, robot)
     report.write(out)

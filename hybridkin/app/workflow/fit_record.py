@@ -228,11 +228,12 @@ def errors_of_rows(compared: CrossFit) -> dict[str, NDArray]:
     return dict(zip(compared.names, compared.distances, strict=True))
 
 
-def largest_errors(compared: CrossFit, motions: NDArray) -> list[MotionErrors]:
+def largest_errors(
+    errors: Mapping[str, NDArray], motions: NDArray
+) -> list[MotionErrors]:
     """Return the motions with the largest errors of the last of the `shown_models`."""
     names, motion = np.unique(motions, return_inverse=True)
     counts = np.bincount(motion)
-    errors = errors_of_rows(compared)
     shown = shown_models(errors)
     means = {name: np.bincount(motion, errors[name]) / counts for name in shown}
     entries = []
