@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from hybridkin.calibration.calibrate import CalibrationResult, calibrate
     from hybridkin.calibration.play_fit import PlayFit, fit_play
     from hybridkin.chains import robots
+    from hybridkin.chains.arc_chain import ArcChain
+    from hybridkin.chains.chain import Chain
     from hybridkin.chains.constant_curvature import ConstantCurvatureChain
     from hybridkin.chains.creep import CreepOperator
     from hybridkin.chains.elastic_tendons import ElasticTendonChain
@@ -36,7 +38,9 @@ if TYPE_CHECKING:
     from hybridkin.saving.saved_model import load_model, save_model
 
 __all__ = [
+    "ArcChain",
     "CalibrationResult",
+    "Chain",
     "Commands",
     "ConstantCurvatureChain",
     "CreepOperator",
@@ -80,6 +84,8 @@ _NAMES_OF = {
     "_core.model": ("ForwardModel", "as_forward_model", "jacobian"),
     "calibration.calibrate": ("CalibrationResult", "calibrate"),
     "calibration.play_fit": ("PlayFit", "fit_play"),
+    "chains.arc_chain": ("ArcChain",),
+    "chains.chain": ("Chain",),
     "chains.constant_curvature": ("ConstantCurvatureChain",),
     "chains.creep": ("CreepOperator",),
     "chains.elastic_tendons": ("ElasticTendonChain",),

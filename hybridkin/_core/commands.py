@@ -9,6 +9,9 @@ from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Self
 
 from hybridkin._core.arrays import check_shape, labels, real_array, table
+from hybridkin._core.clock import ClockDoubt, clock_doubt
+from hybridkin._core.directions import Directions, moved_directions
+from hybridkin._core.runs import RunOrder
 
 __all__ = ["Commands"]
 
@@ -73,6 +76,35 @@ class Commands:
     def run_of_rows(self) -> NDArray:
         """The run of every row, (N,)."""
         return np.zeros(len(self)) if self.runs is None else self.runs
+
+    @property
+    def order(self) -> RunOrder:
+        """The order in which runs come one after the other: its rows, and where runs begin."""
+        return RunOrder.of(self.run_of_rows)
+
+    @property
+    def clock_doubt(self) -> ClockDoubt:
+        """Why the times seem to have another unit than seconds; its `unit` is empty if not."""
+        if self.time is None:
+            return ClockDoubt()
+        return clock_doubt(self.time, self.run_of_rows)
+
+    @property
+    def directions(self) -> Directions:
+        """The directions of q that the rows move, and those in which nothing can be learned."""
+        return moved_directions(np.asarray(self.q))
+
+    def up_to(self, rows: NDArray) -> NDArray[np.intp]:
+        """Return all rows that move the actuators of some rows (K,): those before in their runs."""
+        return self.order.up_to(rows)
+
+    def spread_rows(self, most: int) -> NDArray[np.intp]:
+        """Return at most `most` rows, ascending: of some of the runs, some rows of each.
+
+        All runs are used if each can have ten rows, or all of fewer, else a part of them, spread
+        over all. Each has rows in proportion to its length.
+        """
+        return self.order.spread_rows(most)
 
     def __len__(self) -> int:
         """Return the number of rows."""

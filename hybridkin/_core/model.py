@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.autograd import grad
 
+from hybridkin._core.actuators import ActuatorLayout
 from hybridkin._core.arrays import as_array
 from hybridkin._core.blocks import check_tensor
 from hybridkin._core.derived import KEPT, entries_of
@@ -225,6 +226,15 @@ class ForwardModel(PortableModule):
     def each_tip(self) -> list[Any]:
         """Return one model for each point of the robot: a chain of K markers has K."""
         return [self]
+
+    @property
+    def actuator_layout(self) -> ActuatorLayout:
+        """Rest, kind and segment of every actuator."""
+        return ActuatorLayout.independent(self.n_actuators)
+
+    def softer(self) -> Sequence[ForwardModel]:
+        """Return the same robot with actuators that give way, where that may matter."""
+        return []
 
     def unit_messages(self, q: Tensor, name: str, factor: float = 1.0) -> list[str]:
         """Return warnings if q (N, n) holds values too large to be metres or radians.

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hybridkin._core.arrays import identity
@@ -53,13 +51,6 @@ def nearest_rotation(moments: Tensor) -> tuple[Tensor, Tensor]:
     nearest = (left * sign[..., None, :]) @ right
     trace = (stretch * sign).sum(-1)
     return nearest, trace
-
-
-def nearest_turn(moments: NDArray) -> tuple[NDArray, float]:
-    """Return `nearest_rotation` of one matrix (3, 3) of NumPy, in a fifth of the time."""
-    left, stretch, right = np.linalg.svd(moments)
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
-    return left * sign @ right, float(stretch @ sign)
 
 
 def rigid_motion(

@@ -7,6 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+_GOLDEN = 0.5 * (5.0**0.5 - 1.0)  # its multiples, modulo 1, are evenly spread
+_ROWS_OF_RUN = 10  # of some rows, if there are runs enough
 BEGINS = -1.0  # step in time of the first row of a run, for the kernels of hysteresis
 
 
@@ -62,3 +64,48 @@ class RunOrder(NamedTuple):
         in_order = time[self.order]
         earlier = np.diff(in_order, prepend=-np.inf) < 0.0
         return self.order[earlier & ~self.first]
+
+    def up_to(self, rows: NDArray) -> NDArray[np.intp]:
+        """Return the rows that move the actuators of some rows (K,): those before in their runs."""
+        counts = np.zeros(len(self.order), dtype=int)
+        counts[rows] = 1
+        in_order = counts[self.order]
+        run = np.cumsum(self.first) - 1
+        until = np.cumsum(in_order)  # rows that count, up to each row
+        before = (until - in_order)[self.starts]
+        of_run = np.bincount(run, in_order)
+        still_to_come = before[run] + of_run[run] - (until - in_order)
+        return np.sort(self.order[still_to_come > 0])
+
+    def spread_rows(self, most: int) -> NDArray[np.intp]:
+        """Return at most `most` rows, ascending: of some of the runs, some rows of each.
+
+        All runs are used if each can have ten rows, or all of fewer, else a part of them, spread
+        over all. Each has rows in proportion to its length.
+        """
+        n_rows = len(self.order)
+        if n_rows <= most:
+            return np.arange(n_rows)
+        starts = self.starts
+        lengths = np.diff(starts, append=n_rows)
+        by_time = np.argsort(self.order[starts], kind="stable")
+        needed = np.minimum(lengths, _ROWS_OF_RUN).mean()
+        chosen = by_time[spread(len(starts), max(1, int(most / needed)))]
+        part = (most - len(chosen)) / lengths[chosen].sum()
+        rows = []
+        for run in chosen.tolist():
+            length = int(lengths[run])
+            places = spread(length, max(1, min(length, int(part * length))), len(rows))
+            rows.append(self.order[starts[run] + places])
+        return np.sort(np.concatenate(rows))
+
+
+def spread(n: int, most: int, first: int = 0) -> NDArray[np.intp]:
+    """Return the places of at most `most` of n rows, one in each of equal parts.
+
+    Steps between them differ, so that they do not repeat with a periodic motion. Other numbers
+    `first` give other places.
+    """
+    parts = np.arange(min(most, n) + 1) * n // max(1, min(most, n))
+    within = (first + np.arange(1, len(parts))) * _GOLDEN % 1.0
+    return parts[:-1] + (within * np.diff(parts)).astype(np.intp)

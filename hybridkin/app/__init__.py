@@ -6,8 +6,6 @@ It uses the library by its public names only.
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from hybridkin._core.first_use import on_first_use
-
 if TYPE_CHECKING:
     from hybridkin.app import workflow
     from hybridkin.app.checks import LogFinding, LogReport, check_log
@@ -22,18 +20,22 @@ __all__ = [
     "workflow",
 ]
 
-_NAMES_OF = {
-    "checks": ("LogFinding", "LogReport", "check_log"),
-    "viewer": ("LiveView", "view"),
+_MODULE_OF = {
+    "LiveView": "viewer",
+    "LogFinding": "checks",
+    "LogReport": "checks",
+    "check_log": "checks",
+    "view": "viewer",
 }
-_open_name = on_first_use(__name__, _NAMES_OF)
 
 
 def __getattr__(name: str) -> Any:
     """Open public names on first use: the command line answers before torch is loaded."""
     if name == "workflow":
         return import_module("hybridkin.app.workflow")
-    return _open_name(name)
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"hybridkin.app.{_MODULE_OF[name]}"), name)
 
 
 def __dir__() -> list[str]:

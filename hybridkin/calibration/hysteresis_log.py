@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hybridkin._core.model import ForwardModel
 from hybridkin._core.runs import RunOrder
-from hybridkin.calibration.measured import folds, thinned
+from hybridkin.calibration.measured import folds
 from hybridkin.chains.reversals import behind, reversals
 
 _MOST_COUNTED = 10_000  # rows whose errors are computed
@@ -120,10 +120,11 @@ class HysteresisLog:
         log = self
         if len(self.rows) > _MOST_COUNTED:
             counts = np.zeros(len(self.q))
-            chosen = self.rows[thinned(self.groups[self.rows], _MOST_COUNTED)]
+            motions = RunOrder.of(self.groups[self.rows])
+            chosen = self.rows[motions.spread_rows(_MOST_COUNTED)]
             counts[chosen] = self.counts[chosen]
             log = replace(self, counts=counts)
-        needed = needed_rows(self.runs, log.rows)
+        needed = self.order.up_to(log.rows)
         if len(needed) < len(self.q):
             log = log._take(needed)
         size = _FINEST
@@ -175,25 +176,3 @@ def which_count(x: NDArray, counts: NDArray) -> NDArray:
         As in `HysteresisLog`.
     """
     return (counts > 0.0) & ~np.isnan(x).all(axis=1)
-
-
-def needed_rows(runs: NDArray, counted: NDArray) -> NDArray:
-    """Return the rows that move the actuators of rows that count: those before them in a run.
-
-    Parameters
-    ----------
-    runs : ndarray of shape (N,)
-        Run of every row.
-    counted : ndarray of int of shape (K,)
-        The rows that count.
-    """
-    order = RunOrder.of(runs)
-    counts = np.zeros(len(runs), dtype=int)
-    counts[counted] = 1
-    in_order = counts[order.order]
-    run = np.cumsum(order.first) - 1
-    until = np.cumsum(in_order)  # rows that count, up to each row
-    before = (until - in_order)[order.starts]
-    of_run = np.bincount(run, in_order)
-    still_to_come = before[run] + of_run[run] - (until - in_order)
-    return np.sort(order.order[still_to_come > 0])

@@ -10,14 +10,11 @@ from sklearn.model_selection import GroupKFold, KFold
 
 from hybridkin._core.arrays import countable
 from hybridkin._core.directions import moved_directions
-from hybridkin._core.runs import RunOrder
-from hybridkin._core.spread import spread
 from hybridkin._core.turns import TURNS
 
 # fractions of rows by distance: end of the inner, start of the outer
 _INNER = 0.4
 _BEYOND = 0.65
-_ROWS_OF_MOTION = 10  # of a thinned log, if it has motions enough
 
 
 LEAVE_OUT = (
@@ -123,36 +120,6 @@ def folds(
 def evenly_spaced(n: int, most: int) -> NDArray[np.intp]:
     """Return the places of at most `most` of n rows, evenly spaced."""
     return np.linspace(0, n - 1, min(most, n)).astype(np.intp)
-
-
-def thinned(motions: NDArray, most: int) -> NDArray[np.intp]:
-    """Return at most `most` rows of a log, ascending: of some of its motions, some rows of each.
-
-    All motions are used if each can have ten rows, or all of fewer, else a part of them, spread
-    over the log. Each has rows in proportion to its length.
-
-    Parameters
-    ----------
-    motions : ndarray of shape (N,)
-        Motion of every row.
-    most : int
-        Largest number of rows.
-    """
-    if len(motions) <= most:
-        return np.arange(len(motions))
-    order = RunOrder.of(motions)
-    starts = order.starts
-    lengths = np.diff(starts, append=len(motions))
-    by_time = np.argsort(order.order[starts], kind="stable")
-    needed = np.minimum(lengths, _ROWS_OF_MOTION).mean()
-    chosen = by_time[spread(len(starts), max(1, int(most / needed)))]
-    part = (most - len(chosen)) / lengths[chosen].sum()
-    rows = []
-    for motion in chosen.tolist():
-        length = int(lengths[motion])
-        places = spread(length, max(1, min(length, int(part * length))), len(rows))
-        rows.append(order.order[starts[motion] + places])
-    return np.sort(np.concatenate(rows))
 
 
 def inner_and_outer(X: NDArray) -> tuple[NDArray, NDArray]:

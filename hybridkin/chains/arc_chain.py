@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hybridkin._core.actuators import ActuatorLayout
 from hybridkin._core.arrays import as_array, identity, whole
 from hybridkin._core.blocks import in_blocks
 from hybridkin._core.plan import NoKernel, Plan
@@ -30,7 +31,6 @@ from hybridkin.chains._arcs import (
 )
 from hybridkin.chains._checks import arc_geometry
 from hybridkin.chains._paths import bend_matrix, path_starts, reading_matrix
-from hybridkin.chains.chain import ActuatorLayout
 from hybridkin.chains.markers import MarkedChain
 
 if TYPE_CHECKING:
@@ -100,6 +100,23 @@ class ArcChain(MarkedChain):
     """A chain of circular arcs; subclasses define how the actuators shape them.
 
     A subclass defines `_arcs_and_slope` and `_arcs_and_change`.
+
+    Attributes
+    ----------
+    actuators_per_segment : tuple of int
+        Number of actuators of each of the S segments.
+    extensible : tuple of bool
+        Which segments change their length; the others have `lengths`.
+    takes_lengths : bool
+        Whether q holds lengths or their changes; else it holds forces.
+    radii, offsets : Tensor of shape (S,)
+        Radius of the circle of actuators, and rigid length after the segment [m].
+    angles, gains : Tensor of shape (n,)
+        Angles of the actuators about the backbone [rad], and metres per unit of q [m].
+    rest_bends : Tensor of shape (S, 2)
+        Bending of the segments at rest [rad].
+    lengths : Tensor of shape (S - E,) or None
+        Lengths of the segments but for E extensible ones [m]; None if all are.
     """
 
     _structure = (
@@ -152,6 +169,10 @@ class ArcChain(MarkedChain):
     def has_one_arc_per_segment(self) -> bool:
         """Whether every segment is one arc."""
         return self.arcs_per_segment == 1
+
+    def unit_of(self, name: str) -> str:
+        """Return the unit of an entry of the geometry, or of a parameter of `calibrate`."""
+        return super().unit_of(ALIASES.get(name, name))
 
     @property
     def in_metres(self) -> bool:

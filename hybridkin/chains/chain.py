@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, ClassVar, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, ClassVar, TypeVar
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hybridkin._core.arrays import check_shape, countable
@@ -26,37 +24,6 @@ __all__ = ["Chain"]
 
 _Values = TypeVar("_Values", bound=Tensor | tuple[Tensor, ...])
 _FAR = 50.0  # robot sizes; some extensible robots are long and thin
-
-
-class ActuatorLayout(NamedTuple):
-    """What the actuators of a robot are.
-
-    Attributes
-    ----------
-    rest : ndarray of shape (n,)
-        The q at which they have no effect, for lengths of chambers zero [unit of q].
-    absolute : ndarray of shape (n,) of bool
-        Which have lengths in place of changes of length.
-    signed : ndarray of shape (n,) of bool
-        Which can be read with a wrong sign: all but lengths.
-    segments : list of list of int
-        The actuators of every segment, in order of their angles.
-    balance : ndarray of shape (n, k)
-        Directions along which tendons that do not pull against each other never move.
-    """
-
-    rest: NDArray
-    absolute: NDArray
-    signed: NDArray
-    segments: list[list[int]]
-    balance: NDArray
-
-    @classmethod
-    def independent(cls, n: int) -> ActuatorLayout:
-        """Return the layout of n actuators of which nothing is known."""
-        segments = [[i] for i in range(n)]
-        none = np.zeros(n, dtype=bool)
-        return cls(np.zeros(n), none, ~none, segments, np.zeros((n, 0)))
 
 
 class Chain(PoseModel):
@@ -105,15 +72,6 @@ class Chain(PoseModel):
     def units(self) -> str | list[str]:
         """Unit of q, or of each actuator."""
         return "as in training"
-
-    @property
-    def actuator_layout(self) -> ActuatorLayout:
-        """Rest, kind and segment of every actuator."""
-        return ActuatorLayout.independent(self.n_actuators)
-
-    def softer(self) -> list[Chain]:
-        """Return the same robot with actuators that give way, where that may matter."""
-        return []
 
     def geometry(self) -> dict[str, Tensor]:
         """Return the geometry by name, as in the constructor; entries that are None are omitted."""

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridkin._core.actuators import ActuatorLayout
 from hybridkin._core.arrays import Numbers, as_path, shaped
 from hybridkin._core.units import METRES, UNITS
 from hybridkin.chains._robot_files import chain_of, each, read_tables
@@ -18,6 +19,7 @@ from hybridkin.chains.constant_curvature import ConstantCurvatureChain
 
 __all__ = [
     "BHA_LENGTH_LIMITS",
+    "ActuatorLayout",
     "Limits",
     "LogFormat",
     "RobotDescription",

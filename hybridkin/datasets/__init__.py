@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING
 
 from hybridkin._core.first_use import on_first_use
+from hybridkin.datasets.encoders import EncoderFault
 from hybridkin.datasets.logs import Log, load_log, log_columns
 
 if TYPE_CHECKING:
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     )
 
 __all__ = [
+    "EncoderFault",
     "Log",
     "Merged",
     "TimedColumns",

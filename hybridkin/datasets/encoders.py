@@ -57,7 +57,7 @@ class EncoderFault:
     period : float
         The period, in the unit of the file.
     turns : ndarray of shape (N,)
-        Number of periods to subtract from every reading.
+        Number of periods to subtract from every reading [1].
     """
 
     column: int

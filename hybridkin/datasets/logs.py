@@ -27,7 +27,13 @@ from hybridkin._core.units import METRES, UNITS, duration_in_words
 from hybridkin.datasets._frames import frame_table
 from hybridkin.datasets._tables import UNNAMED, Table, without_missing
 from hybridkin.datasets._time import seconds_per_unit
-from hybridkin.datasets.encoders import given_periods, unwrapped
+from hybridkin.datasets.encoders import (
+    EncoderFault,
+    encoder_faults,
+    given_periods,
+    periods_of,
+    unwrapped,
+)
 from hybridkin.datasets.table_files import read_table
 
 
@@ -105,7 +111,7 @@ class Log:
         head = f"{type(self).__name__} of {self.source}: {len(self.q)} rows"
         if self.groups is not None:
             head += f", {len(np.unique(self.groups))} motions"
-        names = ", ".join(column_names(self, "q"))
+        names = ", ".join(self.column_names("q"))
         values = "no commands"
         if self.q.size:
             values = f"{self.q.min():.4g} to {self.q.max():.4g} {self.units['q']}"
@@ -194,12 +200,22 @@ class Log:
                 columns[name] = column[chosen]
         return replace(self, **columns)
 
+    def column_names(self, which: str) -> list[str]:
+        """Return the names of the columns of "q" or "x"; without names, their numbers."""
+        names = self.q_names if which == "q" else self.x_names
+        values = self.q if which == "q" else self.x
+        return list(names) or [f"{which}[{i}]" for i in range(values.shape[1])]
 
-def column_names(log: Log, which: str) -> list[str]:
-    """Return the names of the columns of "q" or "x"; without names, their numbers."""
-    names = log.q_names if which == "q" else log.x_names
-    values = log.q if which == "q" else log.x
-    return list(names) or [f"{which}[{i}]" for i in range(values.shape[1])]
+    def encoder_faults(self) -> list[EncoderFault]:
+        """Return the readings of q that are whole turns of an encoder off, as the tips confirm.
+
+        Usual periods of encoders are tried, in the unit of the file; see `unwrap` of `load_log`.
+        """
+        q_unit = self.file_units["q"]
+        readings = self.q / np.multiply(self.q_sign, UNITS.get(q_unit, 1.0))
+        runs = self.commands.run_of_rows
+        periods = [periods_of(q_unit)] * readings.shape[1]
+        return encoder_faults(readings, self.x, runs[1:] == runs[:-1], periods)
 
 
 def load_log(
@@ -330,8 +346,8 @@ def log_columns(
     *,
     header_line: int | None = None,
     decimal: str = ".",
-) -> list[str]:
-    """Return the names of the columns of a log file.
+) -> dict[str, str]:
+    """Return the names of the columns of a log file, and the units that the file states.
 
     Parameters
     ----------
@@ -340,10 +356,12 @@ def log_columns(
 
     Returns
     -------
-    list of str
-        In the order of the file.
+    dict of str to str
+        The unit by the name of the column, "" where the file does not say; in the order of the
+        file.
     """
-    return read_table(as_path(path), TextForm(delimiter, header_line, decimal)).header
+    table = read_table(as_path(path), TextForm(delimiter, header_line, decimal))
+    return {name: table.units.get(name, "") for name in table.header}
 
 
 class _Columns(NamedTuple):

@@ -30,6 +30,7 @@ from hybridkin.datasets.encoders import _features as rough_features
 from hybridkin.datasets.logs import Log
 from hybridkin.datasets.table_files import read_table
 
+_AS_WRITTEN = "as written"
 _GAP = 5.0  # usual periods of the motor rows: longer ones are gaps
 _CELLS = 2**14  # of the coarse search, at most
 _OVERLAP = 0.5  # of the shorter recording, at least
@@ -130,8 +131,9 @@ def read_columns(
         The columns.
     time : str
         Column of the time stamp [s].
-    unit : {"m", "cm", "mm", "um", "in", "rad", "deg", "1"}, default="m"
-        Unit of the columns; lengths become metres and angles radians.
+    unit : {"m", "cm", "mm", "um", "in", "rad", "deg", "1", "as written"}, default="m"
+        Unit of the columns; lengths become metres and angles radians. "as written": the numbers
+        of the file, whatever their unit is.
     sign : 1, -1 or sequence of them, default=1
         Factor on the columns, as `q_sign` of `load_log`.
     groups : str or None, default=None
@@ -159,15 +161,18 @@ def read_columns(
     ...     read_columns(path, ["X", "Y", "Z"], time="t", unit="mm").values[1]
     array([0.001, 0.002, 0.004])
     """
-    one_of(unit, "unit", UNITS)
-    factor = np.multiply(real_array(sign, "sign"), UNITS[unit])
+    one_of(unit, "unit", [*UNITS, _AS_WRITTEN])
+    factor = real_array(sign, "sign")
     table = read_table(as_path(path), TextForm(delimiter, header_line, decimal))
-    table.check_unit("unit", table.names("names", names), unit)
-    columns = columns_as_written(table, names, time, groups, missing)
-    return replace(columns, values=columns.values * factor, unit=unit)
+    columns = _columns_as_written(table, names, time, groups, missing)
+    if unit != _AS_WRITTEN:
+        table.check_unit("unit", table.names("names", names), unit)
+        columns = replace(columns, unit=unit)
+        factor = factor * UNITS[unit]
+    return replace(columns, values=columns.values * factor)
 
 
-def columns_as_written(
+def _columns_as_written(
     table: Table,
     names: Sequence[str],
     time: str,

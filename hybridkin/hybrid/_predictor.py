@@ -22,6 +22,7 @@ from hybridkin._core.digests import row_digests
 from hybridkin._core.distinct import targets_that_count
 from hybridkin._core.html import html_table
 from hybridkin._core.model import ForwardModel, as_forward_model
+from hybridkin._core.other_units import check_commands
 from hybridkin._core.plausible import PlausibleRows
 from hybridkin._core.units import motion_message
 from hybridkin.calibration.calibrate import CalibrationResult
@@ -39,7 +40,6 @@ from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._wrapped import in_columns, pose_difference
 from hybridkin.hybrid.cv_results import CvResults
 from hybridkin.hybrid.log_fit import HybridFit
-from hybridkin.hybrid.other_units import check_commands
 from hybridkin.learning.hidden_layer import check_inputs
 from hybridkin.native.library import evaluate
 
@@ -259,7 +259,8 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         turns = chain is not None and bool(
             torch.as_tensor(chain.turns, device="cpu").all()
         )
-        check_commands(rows, self.training_range_, turns)
+        low, high = self.training_range_
+        check_commands(rows.X, low, high, turns)
 
     def _warn_of_units(self, rows: Rows) -> None:
         """Warn if measured tips span far more than the robot, so they cannot be in metres."""

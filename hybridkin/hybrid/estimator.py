@@ -19,6 +19,7 @@ from hybridkin._core.clock import check_seconds
 from hybridkin._core.commands import Commands
 from hybridkin._core.distinct import targets_that_count
 from hybridkin._core.model import PoseModel, as_forward_model
+from hybridkin._core.other_units import check_tips
 from hybridkin.calibration.choice import GeometryChoice
 from hybridkin.calibration.measured import (
     LEAVE_OUT,
@@ -43,7 +44,6 @@ from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._settings import CONSTRAINTS, error_model_of
 from hybridkin.hybrid._spec import ErrorModel, Spec, residuals
 from hybridkin.hybrid.log_fit import fit_to_log
-from hybridkin.hybrid.other_units import check_tips
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.hidden_layer import check_rows
 

@@ -22,9 +22,14 @@ class HalfSpaces(NamedTuple):
     normals: Tensor
     offsets: Tensor
 
+    @property
+    def n(self) -> int:
+        """Number of half-spaces."""
+        return len(self.offsets)
+
     def __repr__(self) -> str:
         """Return the number of half-spaces, for printing."""
-        return f"{len(self.offsets)} half-spaces"
+        return f"{self.n} half-spaces" if self.n else "None"
 
     def margin(self, x: Tensor) -> Tensor:
         """Return the distances (N, k) of points (N, m) to the planes, negative outside."""
@@ -54,6 +59,12 @@ class HalfSpaces(NamedTuple):
             nu = nu + change
             way = way - apply_rows(J, change)
         return way
+
+
+def everywhere() -> HalfSpaces:
+    """Return no half-space: the tip may be anywhere."""
+    nowhere = torch.empty(0, 3, dtype=torch.float64, device="cpu")
+    return HalfSpaces(nowhere, nowhere[:, 0])
 
 
 def half_spaces(pair: Sequence[Numbers | Transform], task: Task) -> HalfSpaces:

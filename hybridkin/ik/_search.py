@@ -116,7 +116,7 @@ class Search:
         self._try_again(best, rows, nudged[:, None])
         if restarts > 0:
             self._restart(best, q, restarts)
-        if settings.tip_limits is not None:
+        if settings.tip_limits.n > 0:
             self._return_inside(best)
         if settings.has_posture:
             self._to_posture(best)

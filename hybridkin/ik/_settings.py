@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import NamedTuple, TypeAlias
 
@@ -37,6 +37,8 @@ from hybridkin._core.named_rows import without_warnings
 from hybridkin._core.plan import NoKernel, Plan
 from hybridkin.ik._feedback import expected_innovation
 from hybridkin.ik._half_spaces import HalfSpaces
+from hybridkin.ik._posture import FixedPosture, Function, NoPosture, PostureFunction
+from hybridkin.ik._rates import Rate
 from hybridkin.ik.tasks import (
     AxisTask,
     PointsTask,
@@ -48,7 +50,6 @@ from hybridkin.ik.tasks import (
 from hybridkin.native.hysteresis import stage_numbers
 
 Array: TypeAlias = Numbers | Transform  # what a caller may pass
-Posture: TypeAlias = Callable[[Tensor], Tensor]
 
 # Largest plausible speed: this many times the largest plausible q per second.
 _FAST = 5.0
@@ -115,18 +116,6 @@ def stopping(way: Tensor, change: Tensor) -> Tensor:
     return torch.where((way > 0.0) & torch.isfinite(way), stops, way)
 
 
-def _in_one_period(name: str, rate: float, seconds: float) -> float:
-    """Return a rate [1/s] times the period, at most 1."""
-    need = f"`{name}` times the period must be at most 1"
-    way = f"use a {name} up to {1.0 / seconds:.4g} 1/s or a shorter period"
-    fraction = rate * seconds
-    require(
-        fraction <= 1.0 + 1e-9,
-        f"{need}, got {rate:.6g} 1/s x {seconds:.6g} s; {way}.",
-    )
-    return min(fraction, 1.0)
-
-
 def _in_words(limits: Tensor) -> str:
     """Return a number, or the smallest and the largest one; None if all are infinite."""
     if torch.isinf(limits).all():
@@ -139,8 +128,8 @@ def _in_words(limits: Tensor) -> str:
 class StepSettings(Portable):
     """All inputs of a step except q and the target; see `InverseKinematics`.
 
-    Limits, weights and a fixed posture are float64 tensors of shape () or (n,). `posture` is
-    `q_pref`, or by default the middle of the limits. `of_model` names the limits taken from the
+    Limits and weights are float64 tensors of shape () or (n,). `posture` is `q_pref`, by default
+    the middle of the limits if they are finite. `of_model` names the limits taken from the
     model. `periods`, shape () or (n,), are the periods of q: a turn for an angle with a range of a
     whole turn, else inf. `pulls` is that of the robot, see `ForwardModel`. `n_actuators` is None if
     neither settings nor model define it.
@@ -151,16 +140,16 @@ class StepSettings(Portable):
     q_max: Tensor
     dq_max: Tensor
     ddq_max: Tensor
-    q_pref: Tensor | Posture | None
-    beta: float | None
-    gain: float | None
+    q_pref: Tensor | Function | None
+    beta: Rate
+    gain: Rate
     damping: str | float
     limits: str
     dt: float
-    weights: Tensor | None
+    weights: Tensor
     of_model: tuple[str, ...]
-    tip_limits: HalfSpaces | None
-    posture: Tensor | Posture | None = field(init=False)
+    tip_limits: HalfSpaces
+    posture: NoPosture = field(init=False)
     periods: Tensor = field(init=False)
     pulls: Tensor = field(init=False)
     n_actuators: int | None = field(init=False)
@@ -189,37 +178,35 @@ class StepSettings(Portable):
             0.0 < self.dt < LARGEST,
             f"`dt` must be a positive period [s], got {self.dt!r}.",
         )
-        require(
-            self.gain is None or self.gain > 0.0,
-            f"`gain` must be positive [1/s], got {self.gain!r}.",
-        )
-        require(
-            self.beta is None or self.beta >= 0.0,
-            f"`beta` must not be negative [1/s], got {self.beta!r}.",
-        )
-        self.rates()
+        self.rates(self.dt)
         require(
             self.damping == "adaptive"
             or (not isinstance(self.damping, str) and 0.0 <= self.damping < math.inf),
             f'`damping` must be "adaptive" or lambda / sigma_max >= 0, got {self.damping!r}.',
         )
-        posture = self.q_pref
-        if posture is None:
-            posture = self.middle
-        if isinstance(posture, Tensor):
-            posture = self.on_plane(posture)
         # An angle that can turn once round is periodic.
         turns = torch.as_tensor(model.turns, device="cpu") & (self.limits != "off")
         full = self.q_max - self.q_min >= _FULL * _TURN
         periods = torch.where(turns & full, self.q_max.new_tensor(_TURN), math.inf)
         vars(self).update(
-            posture=posture,
+            posture=self._posture(),
             periods=periods,
             pulls=bound(model.robot.pulls, "pulls"),
             n_actuators=next(iter(sizes), None),
             farthest=model.robot.farthest,
             longest_usual=model.robot.longest_usual,
         )
+
+    def _posture(self) -> NoPosture:
+        """Return the preferred configurations, on the plane of q."""
+        wanted = self.q_pref
+        if callable(wanted):
+            return PostureFunction(wanted, self.on_plane)
+        if wanted is None:
+            wanted = self.middle
+        if torch.isfinite(wanted).all():
+            return FixedPosture(self.on_plane(wanted))
+        return NoPosture()
 
     def present(self) -> StepSettings:
         """Return the settings for the model that the estimator of the task has now."""
@@ -246,6 +233,8 @@ class StepSettings(Portable):
             words[name] = repr(value)
             if isinstance(value, Tensor):
                 words[name] = _in_words(value)
+            if name == "weights" and not self.weighted:
+                words[name] = "None"
             if name in self.of_model and words[name] != "None":
                 words[name] += " of the model"
         return words
@@ -285,10 +274,9 @@ class StepSettings(Portable):
         return self.task.misses(target, largest)
 
     @property
-    def middle(self) -> Tensor | None:
-        """The middle of the limits, or None if they are not finite."""
-        middle = 0.5 * (self.q_min + self.q_max)
-        return middle if torch.isfinite(middle).all() else None
+    def middle(self) -> Tensor:
+        """The middle of the limits; not finite where they are not."""
+        return 0.5 * (self.q_min + self.q_max)
 
     @property
     def accelerates(self) -> bool:
@@ -309,7 +297,7 @@ class StepSettings(Portable):
     @property
     def has_posture(self) -> bool:
         """Whether there is a preferred configuration."""
-        return self.posture is not None and self.beta != 0.0
+        return self.posture.exists and self.beta.per_second != 0.0
 
     def write_plan(self, plan: Plan) -> int:
         """Write the node of a step into a plan, after its model, and return its place.
@@ -326,8 +314,7 @@ class StepSettings(Portable):
                 raise TypeError(f"a {type(part).__name__} has no kernel")
             if part.of_poses and len(self.task.stacked) > 1:
                 raise TypeError("a Stack with poses or axes has no kernel")
-        if callable(self.posture):
-            raise TypeError("a posture that is a function has no kernel")
+        posture = self.posture.numbers
         if n is None:
             raise TypeError(
                 "the number of actuators is unknown; give one limit for each"
@@ -336,11 +323,8 @@ class StepSettings(Portable):
         scale = np.repeat(self.task.units, self.task.parts)
         plan.limit("rows of a task", len(scale))
 
-        # Numbers of all actuators, in the kernel's order; no posture is zero, no weights are one.
-        posture = 0.0 if self.posture is None else self.posture
-        weights = np.ones(n)
-        if self.weights is not None:
-            weights = np.broadcast_to(as_array(self.weights), n)
+        # Numbers of all actuators, in the kernel's order.
+        weights = np.broadcast_to(as_array(self.weights), n)
         vectors = [self.q_min, self.q_max, self.dq_max, self.ddq_max, posture]
         numbers = [np.broadcast_to(as_array(vector), n) for vector in vectors]
         numbers += [weights**-0.5, self.kernel_rates(), scale]
@@ -360,9 +344,8 @@ class StepSettings(Portable):
             raise NoKernel(
                 f"the log leaves {n_normals} directions of q out, more than {IK_NORMALS}"
             )
-        n_spaces = 0
-        if self.tip_limits is not None:
-            n_spaces = len(self.tip_limits.offsets)
+        n_spaces = self.tip_limits.n
+        if n_spaces > 0:
             plan.limit("actuators", n_spaces)  # they share arrays of the kernels
             numbers += [as_array(part).T for part in self.tip_limits]
         stages = [0, 0]
@@ -373,7 +356,7 @@ class StepSettings(Portable):
 
         flags = IK_LIMITED * (self.limits == "saturate")
         flags |= IK_POSTURE * self.has_posture
-        flags |= IK_WEIGHTS * bool((weights != 1.0).any())
+        flags |= IK_WEIGHTS * self.weighted
         flags |= IK_ACCELERATES * self.accelerates
         flags |= IK_PULLS * bool(self.pulls.any())
         flags |= IK_POSE * self.task.has_rotation
@@ -383,16 +366,16 @@ class StepSettings(Portable):
 
     def kernel_rates(self) -> list[float]:
         """Return gain (negative: 1 / period), beta, period and damping (negative: adaptive)."""
-        gain = -1.0 if self.gain is None else self.gain
+        gain = self.gain.per_second if self.gain.given else -1.0
         # Steps of more than a second end at the posture.
-        beta = 1.0 if self.beta is None else self.beta
+        beta = self.beta.per_second
         damping = -1.0 if isinstance(self.damping, str) else self.damping
         return [gain, beta, self.dt, damping]
 
     @property
     def fraction(self) -> float:
         """Fraction of an innovation that a reading adds to the offset; all of it for a `gain`."""
-        return IK_FRACTION if self.gain is None else 1.0
+        return 1.0 if self.gain.given else IK_FRACTION
 
     # The plane of q to keep to, where the log lies in one.
 
@@ -426,47 +409,34 @@ class StepSettings(Portable):
 
     def preferred(self, q: Tensor) -> Tensor:
         """Return the preferred configurations, of shape (n,) or that of q."""
-        wanted = self.posture
-        if callable(wanted):
-            wanted = wanted(q)
-        if not isinstance(wanted, Tensor):
-            got = type(wanted).__name__
-            raise TypeError(
-                f"`q_pref` must map torch tensors to torch tensors, got {got}."
-            )
-        return self.on_plane(wanted.to(q))
+        return self.posture.at(q)
 
     def start(self, like: Tensor) -> Tensor:
         """Return the preferred configuration (n,); if it is a function, evaluate it mid-range."""
-        start = self.posture
-        if not isinstance(start, Tensor):
-            start = self.middle
-        if start is None or self.n_actuators is None:
+        n = self.n_actuators
+        middle = self.middle.to(like)
+        if n is not None:
+            middle = middle.expand(n)
+        start = self.posture.start(middle).to(like)
+        if n is None or not torch.isfinite(start).all():
             raise ValueError(
                 "a start is needed: give `q0` or `q_pref` of shape (n,), or finite `q_min` and "
                 "`q_max`, one value per actuator where the number of actuators is not known from "
                 "the model."
             )
-        start = start.to(like).expand(self.n_actuators)
-        if callable(self.q_pref):
-            return self.preferred(start)
-        return start
+        return start.expand(n)
 
-    def rates(self, period: float | None = None) -> tuple[float, float, float]:
-        """Return gain dt and beta dt, both at most 1, and dt, for a period [s], default `dt`."""
-        dt = self.dt if period is None else period
-        gain = 1.0
-        beta = min(dt, 1.0)
-        if self.gain is not None:
-            gain = _in_one_period("gain", self.gain, dt)
-        if self.beta is not None:
-            beta = _in_one_period("beta", self.beta, dt)
-        return gain, beta, dt
+    def rates(self, period: float) -> tuple[float, float]:
+        """Return gain dt and beta dt, both at most 1, for a period [s]."""
+        return self.gain.fraction(period), self.beta.fraction(period)
+
+    @property
+    def weighted(self) -> bool:
+        """Whether some weight is not one."""
+        return bool((self.weights != 1.0).any())
 
     def unit(self, q: Tensor) -> Tensor:
         """Return the units of q, shape () or (n,), in which all weights are 1."""
-        if self.weights is None:
-            return q.new_ones(())
         return self.weights.to(q).rsqrt()
 
     # Limits of q and of its steps.
@@ -495,7 +465,7 @@ class StepSettings(Portable):
     def allowed(self, x: Tensor) -> Tensor:
         """Return the points nearest to x within the tip limits."""
         limits = self.tip_limits
-        if limits is None:
+        if limits.n == 0:
             return x
         return x + limits.way_in(limits.margin(x))
 

@@ -76,12 +76,12 @@ def control_step(
     q: Tensor,
     J: Tensor,
     e: Tensor,
-    feed_forward: Tensor | None = None,
-    period: float | None = None,
-    last: Tensor | None = None,
-    tip: Tensor | None = None,
+    tip: Tensor,
+    seconds: float,
+    feed_forward: Tensor | float = 0.0,
+    last: Tensor | float = 0.0,
     bounds: Bounds | None = None,
-    least: Tensor | None = None,
+    least: Tensor | float = 0.0,
 ) -> StepRows:
     """Return the step of eq. (1) for one period, with v = dx dt + gain dt e.
 
@@ -98,32 +98,28 @@ def control_step(
         Jacobians of the task.
     e : Tensor of shape (N, m)
         Errors of the task, to be corrected by the gain [m].
-    feed_forward : Tensor of shape (N, m), optional
-        Motion of the targets in this period [m]. Default: none.
-    period : float, optional
-        Time to the next step [s]. Default: `settings.dt`.
-    last : Tensor of shape (N, n), optional
-        Previous step, scaled to this period. Default: at rest.
-    tip : Tensor of shape (N, m), optional
-        Position of the tip, for tip limits.
+    tip : Tensor of shape (N, ...)
+        Positions of the tip where there are tip limits; else not used.
+    seconds : float
+        Time to the next step [s].
+    feed_forward : Tensor of shape (N, m) or float
+        Motion of the targets in this period [m].
+    last : Tensor of shape (N, n) or float
+        Previous step, scaled to this period.
     bounds : Bounds, optional
         Bounds of the step. Default: the limits.
-    least : Tensor of shape (N,), optional
-        Least lambda^2, in the unit in which weights are 1. Default: none.
+    least : Tensor of shape (N,) or float
+        Least lambda^2, in the unit in which weights are 1.
 
     Returns
     -------
     StepRows
         The steps; sigma_min is NaN for rows that are not finite.
     """
-    gain, beta, seconds = settings.rates(period)
-    if feed_forward is None:
-        feed_forward = torch.zeros_like(e)
-    if last is None:
-        last = torch.zeros_like(q)
-    if least is None:
-        least = torch.zeros_like(q[:, 0])
-    law = Law(settings, least)
+    gain, beta = settings.rates(seconds)
+    feed_forward = feed_forward + torch.zeros_like(e)
+    last = last + torch.zeros_like(q)
+    law = Law(settings, least + torch.zeros_like(q[:, 0]))
 
     # Rows that are not finite, or overflow, get zeros, and no step at the end.
     error_size = e.norm(dim=-1, keepdim=True)
@@ -156,7 +152,7 @@ def control_step(
     if bounds is None:
         bounds = settings.step_bounds(q, seconds, last)
     spaces = settings.tip_limits
-    if spaces is None or tip is None:
+    if spaces.n == 0:
         step = law.step(J, v, posture, bounds)
         if not settings.pulls.any():
             step = _escaping(law, at, J, v, e, step, bounds)
@@ -231,7 +227,7 @@ def limited_step(
     # of the plane.
     if settings.limits != "off":
         clipped = box.clip(dq)
-        out_of_plane = settings.plane is not None and settings.weights is not None
+        out_of_plane = settings.plane is not None and settings.weighted
         over = ((clipped != dq).any(-1) | out_of_plane).nonzero()[:, 0]
         if over.numel() > 0:
             rows, motion = _with_plane(settings, J, v, posture)

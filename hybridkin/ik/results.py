@@ -243,6 +243,14 @@ class Track(Generic[ArrayT]):
         """Largest change of one actuator from one point to the next, in the unit of q."""
         return float(np.abs(np.diff(as_array(self.q), axis=0)).max(initial=0.0))
 
+    @property
+    def score(self) -> tuple[int, int]:
+        """Numbers of points reached in the domain, and reached at all: a larger one is better."""
+        status = as_array(self.status)
+        inside = int((status == IKStatus.CONVERGED).sum())
+        outside = int((status == IKStatus.OUT_OF_DOMAIN).sum())
+        return inside, inside + outside
+
     def __repr__(self) -> str:
         """Return a one-line summary."""
         step = f"largest step {self.largest_step:.3g}"
@@ -267,16 +275,6 @@ class Track(Generic[ArrayT]):
         if self.rejected is not None:
             rows["rejected readings"] = f"{int(as_array(self.rejected).sum())}"
         return html_table("Track", rows)
-
-
-def score(track: Track) -> tuple[int, int]:
-    """Return the number of points reached in the domain, and the number reached at all."""
-    status = as_array(track.status)
-    inside, outside = (
-        int((status == wanted).sum())
-        for wanted in (IKStatus.CONVERGED, IKStatus.OUT_OF_DOMAIN)
-    )
-    return inside, inside + outside
 
 
 def _tally(status: np.ndarray | Tensor) -> str:

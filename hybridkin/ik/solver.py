@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from inspect import signature
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -27,13 +29,14 @@ from hybridkin._core.html import html_table
 from hybridkin.ik._compiled import Core, core_of
 from hybridkin.ik._feedback import MOST_PERIODS, Feedback
 from hybridkin.ik._gram import row_gram
-from hybridkin.ik._half_spaces import half_spaces
+from hybridkin.ik._half_spaces import everywhere, half_spaces
 from hybridkin.ik._implicit import differentiable as with_derivatives
+from hybridkin.ik._posture import Function
+from hybridkin.ik._rates import beta_of, gain_of
 from hybridkin.ik._search import Search
 from hybridkin.ik._settings import (
     RATES,
     Array,
-    Posture,
     StepSettings,
     bound,
     limits_of,
@@ -42,7 +45,7 @@ from hybridkin.ik._settings import (
 from hybridkin.ik._starts import nearest_starts
 from hybridkin.ik._step import control_step
 from hybridkin.ik._tracks import Loop, Path, followed
-from hybridkin.ik.results import IKSolution, IKStatus, Step, Track, score, statuses
+from hybridkin.ik.results import IKSolution, IKStatus, Step, Track, statuses
 from hybridkin.ik.tasks import as_task
 from hybridkin.ik.tracker import Plant, Tracker
 from hybridkin.ik.trajectories import Trajectory
@@ -153,7 +156,7 @@ class InverseKinematics:
         q_max: Array | None = None,
         dq_max: Array | None = None,
         ddq_max: Array | None = None,
-        q_pref: Array | Posture | None = None,
+        q_pref: Array | Function | None = None,
         beta: float | None = None,
         gain: float | None = None,
         damping: str | float = "adaptive",
@@ -176,30 +179,26 @@ class InverseKinematics:
                 bounds[name] = bound(value, name, positive=name in RATES)
         if q_pref is not None and not callable(q_pref):
             q_pref = bound(q_pref, "q_pref", finite=True)
-        if weights is not None:
-            weights = bound(weights, "weights", finite=True, positive=True)
-        if beta is not None:
-            beta = number(beta, "beta")
-        if gain is not None:
-            gain = number(gain, "gain")
         if not isinstance(damping, str):
             damping = number(damping, "damping")
+        if weights is None:
+            weights = 1.0
         one_of(limits, "limits", ("saturate", "off"))
-        half = None
+        spaces = everywhere()
         if tip_limits is not None and limits != "off":
-            half = half_spaces(tip_limits, task)
+            spaces = half_spaces(tip_limits, task)
         self._settings = StepSettings(
             task,
             **bounds,
             q_pref=q_pref,
-            beta=beta,
-            gain=gain,
+            beta=beta_of(beta),
+            gain=gain_of(gain),
             damping=damping,
             limits=limits,
             dt=number(dt, "dt"),
-            weights=weights,
+            weights=bound(weights, "weights", finite=True, positive=True),
             of_model=of_model,
-            tip_limits=half,
+            tip_limits=spaces,
         )
         for message in self.settings.unit_messages():
             warnings.warn(message, stacklevel=2)
@@ -341,7 +340,16 @@ class InverseKinematics:
         if measured is not None:
             tip = task.completed(measured, x)
         e = task.difference(tip, target)
-        step = control_step(settings, rows, J, e, feed_forward, last=last, tip=tip)
+        step = control_step(
+            settings,
+            rows,
+            J,
+            e,
+            tip,
+            settings.dt,
+            torch.zeros_like(e) if feed_forward is None else feed_forward,
+            torch.zeros_like(rows) if last is None else last,
+        )
         results = (
             step.dq,
             x,
@@ -643,14 +651,50 @@ class InverseKinematics:
         tracks: list[Track] = []
         for start in self._starts(target[:1], starts, timed.as_numpy):
             tracks.append(followed(settings, start, timed, on_model))
-            if score(tracks[-1]) == (len(target), len(target)):
+            if tracks[-1].score == (len(target), len(target)):
                 break
-        best = max(tracks, key=score)  # of equal tracks the first
+        best = max(tracks, key=attrgetter("score"))  # of equal tracks the first
         if alone:
             return best
         return followed(
             settings, torch.as_tensor(best.q[0], device=target.device), timed, loop
         )
+
+    def judged(self, track: Track, *, tol: float | Sequence[float] = _TOL) -> Track:
+        """Return a track with the errors and statuses of its tips, after a change of its commands.
+
+        Parameters
+        ----------
+        track : Track
+            A track of this solver with other `q`, and the `effective` and `x` of these.
+        tol : float or sequence of floats, default=1e-4
+            Largest error of a reached point, as for `track`.
+
+        Returns
+        -------
+        Track
+            With new `error` and `status`; points that were AT_LIMITS or SINGULAR and are missed
+            stay so.
+        """
+        task = self.settings.task
+        motion = as_tensor(track.effective, "effective")
+        x = as_tensor(track.x, "x")
+        target = as_tensor(track.target, "target")
+        before = as_tensor(track.status, "status")
+        e = task.difference(x, target)
+        status = statuses(
+            task,
+            motion,
+            e,
+            self.settings.tolerance(tol),
+            known=before != IKStatus.INVALID_INPUT,
+            held=before == IKStatus.AT_LIMITS,
+            singular=before == IKStatus.SINGULAR,
+        )
+        error, status = give_back(
+            [e.norm(dim=-1), status], (len(e),), is_numpy(track.q)
+        )
+        return replace(track, error=error, status=status)
 
     def _starts(
         self, target: Tensor, q0: Tensor | None, as_numpy: bool

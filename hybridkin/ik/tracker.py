@@ -351,7 +351,7 @@ class Tracker(Portable):
         settings = self._settings
         like = self._like
         target = settings.points(x_target, "x_target", like, lead="")
-        feed_forward = None
+        feed_forward = like.new_zeros(1, sum(settings.task.parts))
         if dx is not None:
             shape = (sum(settings.task.parts),)
             velocity = settings.points(dx, "dx", like, lead="", shape=shape)
@@ -479,7 +479,7 @@ class _InTorch:
         self,
         period: float | None,
         target: Tensor | None,
-        feed_forward: Tensor | None,
+        feed_forward: Tensor,
         tip: Tensor | None,
         age: float,
     ) -> Tick:
@@ -502,8 +502,8 @@ class _InTorch:
             before = used + task.difference(self._last.x, target) - model_error
         seconds = period or settings.dt
         last = self._last.step.dq * (seconds / self._period)
-        at = None
-        if settings.tip_limits is not None:
+        at = x
+        if settings.tip_limits.n > 0:
             at = x + readings.offset
         rest = self._rest.seen(settings, before, used, J)
         control = partial(
@@ -512,10 +512,10 @@ class _InTorch:
             self._q,
             J,
             used,
-            feed_forward,
-            seconds,
-            last,
             at,
+            seconds,
+            feed_forward,
+            last,
             least=rest.least(used),
         )
         effective = self._q

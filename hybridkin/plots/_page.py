@@ -9,10 +9,10 @@ import numpy as np
 from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 
-from hybridkin._core.page_server import page_server, stop
 from hybridkin._core.texts import visible
 from hybridkin.plots._canvas import COLORS
 from hybridkin.plots._scene import Line, Scene
+from hybridkin.plots.page_server import page_server, stop
 
 # From the middle to the eye, in longest sides of the scene; as the axes of matplotlib at the start.
 _EYE = 1.2 * np.array([0.433, -0.75, 0.5])

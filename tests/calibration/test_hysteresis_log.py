@@ -14,13 +14,11 @@ from hybridkin import (
     PlayOperator,
     as_forward_model,
 )
-from hybridkin._core.runs import RunOrder
-from hybridkin._core.spread import spread
+from hybridkin._core.runs import RunOrder, spread
 from hybridkin.calibration import hysteresis_log
 from hybridkin.calibration.hysteresis_fit import HysteresisProblem, _held_back
-from hybridkin.calibration.hysteresis_log import HysteresisLog, needed_rows
+from hybridkin.calibration.hysteresis_log import HysteresisLog
 from hybridkin.calibration.hysteresis_search import find_hysteresis
-from hybridkin.calibration.measured import thinned
 from hybridkin.chains.reversals import behind, reversals
 
 M = np.array([[1.0, 0.3, 0.0], [0.0, 0.8, -0.4], [0.2, 0.0, 1.1]])
@@ -135,7 +133,7 @@ def test_rows_up_to_the_last_one_that_counts_are_needed(seed):
     for run in np.unique(runs[counted]):
         last = counted[runs[counted] == run].max()
         expected += np.flatnonzero((runs == run) & (np.arange(60) <= last)).tolist()
-    assert_array_equal(needed_rows(runs, counted), sorted(expected))
+    assert_array_equal(RunOrder.of(runs).up_to(counted), sorted(expected))
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -143,7 +141,7 @@ def test_a_thinned_log_has_rows_of_motions_in_proportion(seed):
     rng = np.random.default_rng(seed)
     for n_motions in (3, 40, 400):
         motions = np.repeat(rng.permutation(n_motions), rng.integers(20, 60, n_motions))
-        rows = thinned(motions, 400)
+        rows = RunOrder.of(motions).spread_rows(400)
         assert 300 < len(rows) <= 400 or len(rows) == len(motions) < 400
         assert (np.diff(rows) > 0).all()
         counts = np.bincount(motions[rows], minlength=n_motions)
@@ -151,8 +149,8 @@ def test_a_thinned_log_has_rows_of_motions_in_proportion(seed):
         if n_motions == 40:
             part = counts / np.bincount(motions)
             assert part.max() < 2.0 * part.min()
-    assert_array_equal(thinned(motions[:100], 100), np.arange(100))
-    assert len(thinned(np.arange(1000), 100)) <= 100  # every row is a motion
+    assert_array_equal(RunOrder.of(motions[:100]).spread_rows(100), np.arange(100))
+    assert len(RunOrder.of(np.arange(1000)).spread_rows(100)) <= 100  # every row is a motion
 
 
 def test_spread_rows_do_not_repeat_with_a_period():

@@ -90,7 +90,7 @@ def test_an_export_of_motive(tmp_path, rows):
     assert_allclose(log.q, 1e-3 * Q)
     assert_allclose(log.time, 0.01 * np.arange(N))
     assert log.line[0] == 8 + len(rows)
-    names = log_columns(path)
+    names = [*log_columns(path)]
     assert names[:3] == ["Frame", "Time (Seconds)", "tip X"]
     assert names[8:16] == [
         *(f"arm rot {axis}" for axis in "XYZW"),
@@ -140,7 +140,7 @@ def test_bodies_of_vicon(tmp_path):
     ]
     frames = np.arange(N)
     path = write(tmp_path, lines_of(head, [frames, 0 * frames, np.ones((N, 4)), Q]))
-    names = log_columns(path)
+    names = [*log_columns(path)]
     assert names[2:9] == [*(f"arm:arm rot {a}" for a in "XYZW"), *(f"arm:arm {a}" for a in "XYZ")]
     log = load_log(path, q=names[2:5], x=names[6:9], x_unit="mm")
     assert_allclose(log.x, 1e-3 * Q)
@@ -180,7 +180,7 @@ def test_bodies_of_qualisys(tmp_path, alone):
     values = np.arange(34.0 * N).reshape(N, 34)
     text = lines_of([*head, "\t".join(header)], [values], "\t")
     path = write(tmp_path, text, "log.tsv")
-    names = log_columns(path)
+    names = [*log_columns(path)]
     expected = [f"{body} {name}" for body in ("arm", "base") for name in columns]
     assert names == ["Frame", "Time", *expected]
     log = load_log(path, q=["arm Roll"], x=BASE, q_unit="deg", x_unit="mm", time="Time")
@@ -216,7 +216,7 @@ def test_the_line_that_looks_like_the_header_is_named(tmp_path, separator):
     log = load_log(path, **names, header_line=4)
     assert_allclose(log.x, 1e-3 * TIPS[:, :3])
     assert_array_equal(log.line, np.arange(5, 5 + N))
-    assert log_columns(path, header_line=4)[:2] == ["t", "a"]
+    assert [*log_columns(path, header_line=4)][:2] == ["t", "a"]
 
 
 def test_a_header_line_that_is_not_there(tmp_path):

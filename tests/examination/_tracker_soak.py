@@ -99,7 +99,7 @@ class Checked:
         self.change = settings.ddq_max.expand(n).numpy() * DT**2
         self.found = {"not_finite": 0, "position": 0, "speed": 0.0, "acceleration": 0.0, "tip": 0.0}
         self.found["moved"] = 0  # ticks
-        if settings.tip_limits is not None:
+        if settings.tip_limits.n:
             self.found["within"] = 0  # ticks whose tip must stay within its half-spaces
         self.digest, self.digests = hashlib.sha256(), []
 
@@ -121,7 +121,7 @@ class Checked:
             ("acceleration", changes, self.change),
         ):
             found[name] = max(found[name], float(((abs(value) - most) / ulp).max()))
-        if settings.tip_limits is not None:
+        if settings.tip_limits.n:
             margin = settings.tip_limits.margin(self.chain(torch.from_numpy(commands))).amin(-1)
             inside = np.logical_or.accumulate(np.append(self.was_inside, margin.numpy() >= 0.0))
             found["within"] += int(inside[:-1].sum())
@@ -153,7 +153,7 @@ def missed(ik, chain, checked, rng):
         while not inside:
             q = torch.from_numpy(rng.uniform(checked.low, checked.high))
             x = chain(q)
-            inside = limits is None or bool((limits.margin(x[None]) > 0.0).all())
+            inside = limits.n == 0 or bool((limits.margin(x[None]) > 0.0).all())
         tracker.reset(0.5 * checked.low + 0.5 * checked.high)
         for _ in range(ARRIVAL):
             end = tracker.step(x.numpy())

@@ -16,8 +16,8 @@ from hybridkin import (
     RigidChain,
     calibrate,
 )
+from hybridkin._core.other_units import check_tips
 from hybridkin._core.units import other_unit, rough_unit
-from hybridkin.hybrid.other_units import check_tips
 
 FACTORS = {"millimetres": 1000.0, "centimetres": 100.0, "inches": 1.0 / 0.0254}
 DIVISOR = {"millimetres": "1000", "centimetres": "100", "inches": "39.37"}

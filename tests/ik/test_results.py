@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from hybridkin.ik.results import IKStatus, Track, score
+from hybridkin.ik.results import IKStatus, Track
 
 
 def a_track(q, error):
@@ -23,7 +23,7 @@ def test_a_track_in_the_domain_is_better_than_a_longer_one_outside():
     def of(*names):
         track = a_track(np.zeros((4, 2)), np.zeros(4))
         track.status[:] = [IKStatus[name] for name in names]
-        return score(track)
+        return track.score
 
     inside = of("CONVERGED", "CONVERGED", "MAX_ITER", "AT_LIMITS")
     outside = of("CONVERGED", "OUT_OF_DOMAIN", "OUT_OF_DOMAIN", "OUT_OF_DOMAIN")

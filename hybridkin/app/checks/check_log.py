@@ -9,8 +9,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridkin._core.arrays import countable
-from hybridkin._core.named_rows import named_places
 from hybridkin.app.checks.columns import COLUMN_CHECKS, LogRows
 from hybridkin.app.checks.encoders import encoder_findings
 from hybridkin.app.checks.geometry import geometry_findings
@@ -22,10 +20,13 @@ from hybridkin.app.checks.report import (
     LogReport,
 )
 from hybridkin.app.checks.residual import residual_findings
-from hybridkin.datasets.logs import Log
+from hybridkin.datasets import Log
+from hybridkin.formats import named_places
 
 if TYPE_CHECKING:
-    from hybridkin.chains.arc_chain import ArcChain
+    from hybridkin import ArcChain
+
+_LARGEST = 1e75  # fourth powers of larger numbers overflow
 
 
 def check_log(
@@ -94,9 +95,9 @@ def check_log(
         if chain is not None:
             chain = chain.tip_model
     columns = np.column_stack([log.q, log.x])
-    valid = countable(columns).all(axis=1)
+    valid = _countable(columns)
     # A row of several markers may lack the tip.
-    complete = countable(log.q).all(axis=1) if has_markers else valid
+    complete = _countable(log.q) if has_markers else valid
     findings = [*_invalid_rows(log, complete, drop_invalid), *missing]
     for finding in missing:
         valid[finding.rows] = False  # the other checks look at the measured rows
@@ -130,6 +131,11 @@ def check_log(
         source=log.source,
         q_unit=log.units["q"],
     )
+
+
+def _countable(columns: NDArray) -> NDArray[np.bool_]:
+    """Return which rows (N, k) hold numbers alone whose squares can be summed (N,)."""
+    return np.all(np.abs(columns) < _LARGEST, axis=1)
 
 
 def _invalid_rows(log: Log, valid: NDArray, drop_invalid: bool) -> Iterator[LogFinding]:

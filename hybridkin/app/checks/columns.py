@@ -9,15 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hybridkin._core.clock import clock_doubt
-from hybridkin._core.directions import in_terms, moved_directions
-from hybridkin._core.distinct import distinct_rows
-from hybridkin._core.named_rows import named_places
-from hybridkin._core.runs import RunOrder
-from hybridkin._core.units import FRAMES, duration_in_words
 from hybridkin.app.checks.report import LogFinding
 from hybridkin.chains.reversals import Coarseness
-from hybridkin.datasets.logs import Log, column_names
+from hybridkin.datasets import Log
+from hybridkin.formats import FRAMES, duration_in_words, in_terms, named_places
 
 _FROZEN_ROWS = 3  # fewer rows may be chance
 _FROZEN_WAY = 0.1  # part of an actuator's range over which the tip must have moved
@@ -68,7 +63,7 @@ class LogRows:
     def columns(self, which: str) -> list[tuple[str, NDArray]]:
         """Return the columns of "q" or "x" with their names."""
         values = self.log.q if which == "q" else self.log.x
-        return list(zip(column_names(self.log, which), values.T, strict=True))
+        return list(zip(self.log.column_names(which), values.T, strict=True))
 
     @property
     def same_motion(self) -> NDArray:
@@ -190,11 +185,11 @@ def unmoved_directions(rows: LogRows) -> Iterator[LogFinding]:
     q = rows.log.q
     if len(q) <= q.shape[1] or not np.ptp(q, axis=0).all():
         return
-    directions = moved_directions(q)
+    directions = rows.log.commands.directions
     if directions.still.size:
         signs = np.broadcast_to(rows.log.q_sign, q.shape[1])
         of_columns = directions.normals() * signs[:, None]
-        still = in_terms(of_columns, column_names(rows.log, "q"))
+        still = in_terms(of_columns, rows.log.column_names("q"))
         message = f"the log has no motion along {still}, or only by rounding or less than 1 %."
         advice = (
             "nothing is learned there. Commands keep to the log where the mechanical model knows "
@@ -217,9 +212,8 @@ def same_columns(rows: LogRows) -> Iterator[LogFinding]:
 
 def duplicates(rows: LogRows) -> Iterator[LogFinding]:
     """Yield rows that are exact copies of earlier ones."""
-    first, _, place = distinct_rows(rows.log.q, rows.log.x)
-    original = first[place]
-    copies = np.setdiff1d(np.arange(len(place)), first)
+    original = _first_equal(np.hstack([rows.log.q, rows.log.x]))
+    copies = np.flatnonzero(original < np.arange(len(original)))
     if not len(copies):
         return
     message = f"{len(copies)} rows are exact copies of earlier ones"
@@ -236,12 +230,20 @@ def duplicates(rows: LogRows) -> Iterator[LogFinding]:
     )
 
 
+def _first_equal(values: NDArray) -> NDArray:
+    """Return for each row (N, k) the first row that is equal to it (N,)."""
+    values = np.ascontiguousarray(values, dtype=np.float64) + 0.0  # -0.0 equals 0.0
+    whole_row = np.dtype((np.void, values.itemsize * values.shape[1]))
+    keys = values.view(whole_row)[:, 0]
+    _, first, place = np.unique(keys, return_index=True, return_inverse=True)
+    return first[place]
+
+
 def same_commands(rows: LogRows) -> Iterator[LogFinding]:
     """Yield the spread of the tips at equal commands: noise, or backlash."""
-    different = distinct_rows(rows.log.q, rows.log.x)[0]
-    q = rows.log.q[different]
+    different = np.unique(_first_equal(np.hstack([rows.log.q, rows.log.x])))
     x = rows.log.x[different]
-    command = distinct_rows(q, q[:, :0])[2]
+    _, command = np.unique(_first_equal(rows.log.q[different]), return_inverse=True)
     counts = np.bincount(command)
     repeated = counts[command] > 1
     if repeated.sum() < _FEW_COMMANDS:
@@ -297,7 +299,8 @@ def times(rows: LogRows) -> Iterator[LogFinding]:
     time = rows.log.time
     if time is None:
         return
-    doubt = clock_doubt(time, rows.runs)
+    commands = rows.log.commands
+    doubt = commands.clock_doubt
     if doubt.unit:
         message = f"{doubt.reason}, which are hardly seconds."
         if doubt.certain:
@@ -307,7 +310,7 @@ def times(rows: LogRows) -> Iterator[LogFinding]:
             severity = "note"
         advice = f"{doubt.way_out}."
         yield rows.finding("time", message, advice, severity=severity)
-    order = RunOrder.of(rows.runs)
+    order = commands.order
     steps = order.steps(time)
     late = np.sort(order.order[(steps <= 0.0) & ~order.first])
     if len(late):

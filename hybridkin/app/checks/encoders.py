@@ -7,17 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridkin._core.units import UNITS
 from hybridkin.app.checks.columns import LogRows
 from hybridkin.app.checks.report import LogFinding
-from hybridkin.datasets.encoders import (
-    TURNS,
-    WRAP,
-    EncoderFault,
-    encoder_faults,
-    periods_of,
-)
-from hybridkin.datasets.logs import column_names
+from hybridkin.datasets import EncoderFault
 
 _ADVICE = (
     "read the log with --unwrap {period:.10g} (unwrap={period:.10g}, or unwrap = {period:.10g} in "
@@ -27,17 +19,12 @@ _ADVICE = (
 
 def encoder_findings(rows: LogRows) -> Iterator[LogFinding]:
     """Yield the columns of q in which readings are whole periods off."""
-    log = rows.log
-    q_unit = log.file_units["q"]
-    names = column_names(log, "q")
-    readings = log.q / np.multiply(log.q_sign, UNITS.get(q_unit, 1.0))
-    periods = [periods_of(q_unit)] * len(names)
-    same_run = rows.runs[1:] == rows.runs[:-1]
+    names = rows.log.column_names("q")
     wraps: dict[float, list[EncoderFault]] = {}
-    for fault in encoder_faults(readings, log.x, same_run, periods):
-        if fault.kind == WRAP:
+    for fault in rows.log.encoder_faults():
+        if fault.kind == "wrap":
             wraps.setdefault(fault.period, []).append(fault)
-        elif fault.kind == TURNS:
+        elif fault.kind == "turns":
             yield _lost_turns(rows, names[fault.column], fault)
         else:
             yield _glitches(rows, names[fault.column], fault)

@@ -13,8 +13,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from hybridkin._core.directions import in_terms
-from hybridkin._core.units import METRES
 from hybridkin.app.checks.causes.alignment import Alignment, FreeBase, FreeOrigin
 from hybridkin.app.checks.causes.commands import (
     FirstRow,
@@ -42,11 +40,11 @@ from hybridkin.app.checks.order import (
     segment_columns,
 )
 from hybridkin.app.checks.report import LogFinding
-from hybridkin.datasets.logs import Log, column_names
+from hybridkin.datasets import Log
+from hybridkin.formats import METRES, in_terms
 
 if TYPE_CHECKING:
-    from hybridkin.chains.arc_chain import ArcChain
-    from hybridkin.chains.chain import ActuatorLayout
+    from hybridkin import ArcChain, robots
 
 _FACTORS = (1e-3, 1e-2, 1e-1, 10.0, 100.0, 1000.0)
 _ROWS = 500  # enough to distinguish a robot from its mirror image
@@ -142,13 +140,17 @@ class _Comparison:
     """
 
     def __init__(
-        self, log: Log, chain: ArcChain, layout: ActuatorLayout, base_is_free: bool
+        self,
+        log: Log,
+        chain: ArcChain,
+        layout: robots.ActuatorLayout,
+        base_is_free: bool,
     ) -> None:
         self.log = log
         self.chain = chain
         self.layout = layout
         self.base_is_free = base_is_free
-        self.q_names = column_names(log, "q")
+        self.q_names = log.column_names("q")
         self.radii = chain.radii.detach().cpu().double().numpy()
         self.all_extensible = chain.lengths is None
         self.length = 0.0
@@ -448,7 +450,7 @@ def _exchanged_columns(comparison: _Comparison) -> Iterator[LogFinding]:
         exchanges.append((comparison.error(q, x), i, j))
     error, i, j = min(exchanges)
     if error < min(comparison.good_error, _FAR_BETTER * least):
-        axis = column_names(comparison.log, "x")[j]
+        axis = comparison.log.column_names("x")[j]
         reading = f"columns {comparison.q_names[i]!r} and {axis!r} exchanged"
         message = comparison.better(error, reading)
         yield LogFinding("exchanged", "warning", message, "exchange these two columns.")
@@ -482,7 +484,7 @@ def _unbalanced(comparison: _Comparison) -> Iterator[LogFinding]:
     yield LogFinding(kind, "warning", message, advice)
 
 
-def _few_changes(layout: ActuatorLayout) -> Iterator[list[NDArray]]:
+def _few_changes(layout: robots.ActuatorLayout) -> Iterator[list[NDArray]]:
     """Yield the ways with one change that balance can show, then those with more signs."""
     n = len(layout.rest)
     declared = np.eye(n, dtype=int)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridkin._core.units import METRES, UNITS
+from hybridkin.formats import METRES, UNITS
 
 if TYPE_CHECKING:
     from hybridkin.app.checks.columns import LogRows

@@ -13,12 +13,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
-from hybridkin._core.rotations import nearest_rotation, rigid_motion
+from hybridkin.app.checks.rotations import nearest_turn
 
 if TYPE_CHECKING:
-    from hybridkin.chains.arc_chain import ArcChain
+    from hybridkin import ArcChain
 
 _ROWS = 60  # rows of the search; enough to distinguish two orders
 _MANY = 5  # for more actuators in a segment, or more segments, only pairs of columns are swapped
@@ -100,20 +99,20 @@ def misses(chain: ArcChain, qs: NDArray, x: NDArray, base_is_free: bool) -> NDAr
     """
     tips, measured = _centred(chain, qs, x)
     if base_is_free:
-        turn, trace = nearest_rotation(measured.mT @ tips)
-        size = tips.square().sum((-2, -1)).clamp(min=torch.finfo(tips.dtype).tiny)
-        tips = (trace / size)[:, None, None] * tips @ turn.mT
-    squared_error = (tips - measured).square().sum(-1).mean(-1)
-    squared_size = measured.square().sum(-1).mean()
-    return (squared_error / squared_size).sqrt().numpy()
+        turn, trace = nearest_turn(measured.T @ tips)
+        size = np.square(tips).sum(axis=(-2, -1)).clip(min=np.finfo(float).tiny)
+        tips = (trace / size)[:, None, None] * tips @ turn.swapaxes(-2, -1)
+    squared_error = np.square(tips - measured).sum(axis=-1).mean(axis=-1)
+    squared_size = np.square(measured).sum(axis=-1).mean()
+    return np.sqrt(squared_error / squared_size)
 
 
 def base_turn(chain: ArcChain, q: NDArray, x: NDArray) -> tuple[float, float]:
     """Return the rotation of the base about its axis that fits the tips, and its tilt [deg]."""
     tips, measured = _centred(chain, q[None], x)
-    base = chain.base[:3, :3].double()
-    motion = rigid_motion(tips[0], measured)[:3, :3]
-    turn = (base.mT @ motion @ base).numpy()
+    base = chain.base[:3, :3].numpy(force=True).astype(float)
+    motion, _ = nearest_turn(measured.T @ tips[0])
+    turn = base.T @ motion @ base
     sine = turn[1, 0] - turn[0, 1]
     cosine = turn[0, 0] + turn[1, 1]
     twist = np.arctan2(sine, cosine)
@@ -121,14 +120,12 @@ def base_turn(chain: ArcChain, q: NDArray, x: NDArray) -> tuple[float, float]:
     return float(np.degrees(twist)), float(np.degrees(tilt))
 
 
-def _centred(chain: ArcChain, qs: NDArray, x: NDArray) -> tuple[Tensor, Tensor]:
+def _centred(chain: ArcChain, qs: NDArray, x: NDArray) -> tuple[NDArray, NDArray]:
     """Return the tips (K, N, 3) of the chain and the measured ones, each minus their mean."""
     rows = torch.from_numpy(np.ascontiguousarray(qs, dtype=np.float64))
     with torch.no_grad():
-        tips = chain(rows).double()
-    measured = torch.from_numpy(np.asarray(x, dtype=np.float64))
-    centred_tips = tips - tips.mean(dim=1, keepdim=True)
-    return centred_tips, measured - measured.mean(dim=0)
+        tips = chain(rows).double().numpy()
+    return tips - tips.mean(axis=1, keepdims=True), x - x.mean(axis=0)
 
 
 def better_way(

@@ -8,9 +8,7 @@ from dataclasses import asdict, dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridkin._core.stored import plain
-from hybridkin._core.texts import visible
-from hybridkin._core.units import duration_in_words
+from hybridkin.formats import duration_in_words, plain, visible
 
 SEVERITIES = ("error", "warning", "note")
 MISREAD = ("units", "order", "sign", "numbering", "axes", "size")

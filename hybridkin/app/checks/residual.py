@@ -9,12 +9,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from hybridkin._core.spread import spread
+from hybridkin import Commands
 from hybridkin.app.checks.report import LogFinding
-from hybridkin.datasets.logs import Log
+from hybridkin.datasets import Log
 
 if TYPE_CHECKING:
-    from hybridkin.chains.arc_chain import ArcChain
+    from hybridkin import ArcChain
 
 _LAGS = 10  # largest lag of the tip in rows, in both directions
 # Limits of the rms residual of a model with a drift, and with a lag, relative to that without. For
@@ -90,7 +90,7 @@ def _left(features: NDArray, x: NDArray) -> float:
 
     Of a long log some rows are enough, spread over it.
     """
-    rows = spread(len(x), _MOST)
+    rows = Commands(features).spread_rows(_MOST)
     features = features[rows]
     x = x[rows]
     weights, *_ = np.linalg.lstsq(features, x, rcond=None)

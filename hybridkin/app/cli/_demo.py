@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import hybridkin
-from hybridkin._core.files import write_file
+from hybridkin.formats import write_file
 
 if TYPE_CHECKING:
     from hybridkin.app.workflow import FitRecord, Report, TrackRecord

@@ -13,9 +13,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from hybridkin._core.text_rows import TextForm
-from hybridkin._core.texts import toml_value, visible
-from hybridkin._core.units import METRES, UNITS
 from hybridkin.app.cli._terminal import write
 from hybridkin.app.cli._values import (
     count,
@@ -27,6 +24,7 @@ from hybridkin.app.cli._values import (
     positive,
     signs,
 )
+from hybridkin.formats import METRES, UNITS, toml_value, visible
 
 if TYPE_CHECKING:
     from hybridkin.app.workflow import MeasuredLog
@@ -203,16 +201,20 @@ def _proposed(answers: _Answers, given: _Answers) -> _Answers:
     n = answers["segments"] * answers["actuators"]
     if answers["log"] is None:
         return {"q": [f"q{i + 1}" for i in range(n)], "x": ["x", "y", "z"]}
-    from hybridkin.datasets.table_files import read_table  # loads torch
+    from hybridkin.datasets import log_columns  # loads torch
 
-    form = TextForm(given["delimiter"], given["header_line"], given["decimal"] or ".")
-    table = read_table(answers["log"], form)
-    header = table.header
+    units = log_columns(
+        answers["log"],
+        given["delimiter"],
+        header_line=given["header_line"],
+        decimal=given["decimal"] or ".",
+    )
+    header = [*units]
     proposed: _Answers = {}
     tips = [*filter(_is_tip, zip(header, header[1:], header[2:], strict=False))]
     if tips:
         proposed["x"] = max(tips, key=_likeness_to_tip)
-        proposed["x_unit"] = table.units.get(proposed["x"][0], "mm")
+        proposed["x_unit"] = units[proposed["x"][0]] or "mm"
     families: dict[str, list[str]] = {}  # names that differ in numbers only
     for name in header:
         if name not in proposed.get("x", ()) and re.search(r"\d", name):

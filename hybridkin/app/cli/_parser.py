@@ -15,8 +15,6 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import hybridkin
-from hybridkin._core.text_rows import DECIMALS
-from hybridkin._core.units import FRAMES, METRES, SECONDS, UNITS
 from hybridkin.app.cli._init import QUESTIONS
 from hybridkin.app.cli._terminal import write
 from hybridkin.app.cli._values import (
@@ -31,12 +29,15 @@ from hybridkin.app.cli._values import (
     signs,
     start,
 )
+from hybridkin.formats import FRAMES, METRES, SECONDS, UNITS
 
 EXIT_CODES = """\
 exit codes: 0 success; 1 the result is not as requested (a fifth of the points of a path not
 reached, errors above --fail-above or a promise, or `describe` and `init` found errors in a log);
 2 invalid input, a log with errors before a fit, or a path out of reach; 130 interrupted;
 143 terminated."""
+
+_DECIMALS = (".", ",")
 
 
 def parser() -> argparse.ArgumentParser:
@@ -198,7 +199,7 @@ def _merge(command: argparse.ArgumentParser) -> None:
     add("--hold", action="store_true", help=text)
     text = "separator of text files (comma, semicolon or tab, by the header)"
     add("--delimiter", metavar="CHAR", help=text)
-    add("--decimal", choices=DECIMALS, help="decimal sign of text files (.)")
+    add("--decimal", choices=_DECIMALS, help="decimal sign of text files (.)")
     text = "numbers of the camera that stand for missing values, such as 9999.999"
     add("--missing", type=numbers, metavar="A,...", help=text)
     add("--force", action="store_true", help="replace the log if it exists")
@@ -674,7 +675,7 @@ def _add_text_form(command: argparse._ActionsContainer) -> None:
         "known, else line 1)"
     )
     add("--header-line", type=count, metavar="N", help=text)
-    add("--decimal", choices=DECIMALS, help="decimal sign of a text file (.)")
+    add("--decimal", choices=_DECIMALS, help="decimal sign of a text file (.)")
     text = "numbers that stand for missing values, such as 9999.999; 0: a marker at 0, 0, 0"
     add("--missing", type=numbers, metavar="A,...", help=text)
 

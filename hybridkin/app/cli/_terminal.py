@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.text import Text
 
-from hybridkin._core.texts import visible, visible_lines
+from hybridkin.formats import visible, visible_lines
 
 _PATIENCE = 15.0  # seconds between two lines of progress in files and pipes
 _LONG = 30.0  # seconds of a stage from which on the remaining time is of interest

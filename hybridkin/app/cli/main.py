@@ -20,18 +20,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 import hybridkin  # its folders are opened when used: help comes at once
-from hybridkin._core.files import check_outputs, write_file
-from hybridkin._core.texts import visible
-from hybridkin._core.turns import one_thread
-from hybridkin._core.units import FRAMES, METRES
 from hybridkin.app.cli import _demo as demo
 from hybridkin.app.cli._init import answered, description, with_zeros
 from hybridkin.app.cli._parser import failed, parser
 from hybridkin.app.cli._terminal import Stages, write
+from hybridkin.formats import FRAMES, METRES, check_outputs, visible, write_file
 
 if TYPE_CHECKING:
+    from hybridkin import Chain, robots, trajectories
     from hybridkin.app import LogReport
     from hybridkin.app.workflow import (
         Counts,
@@ -40,10 +39,7 @@ if TYPE_CHECKING:
         PathLimits,
         Report,
     )
-    from hybridkin.chains.chain import Chain
-    from hybridkin.chains.robots import Limits, LogFormat
     from hybridkin.datasets import Log
-    from hybridkin.ik.trajectories import Trajectory
 
 _DT = 0.02
 _LIGHT = ("describe", "init")  # commands that compute little
@@ -73,7 +69,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             contextlib.closing(stages),
             warnings.catch_warnings(),
             _interruptible(),
-            one_thread(),
+            threadpool_limits(limits=1),
         ):
             warnings.filterwarnings("default", category=UserWarning)
             warnings.showwarning = stages.warn
@@ -338,7 +334,7 @@ def _verify(arguments: argparse.Namespace, stages: Stages) -> _Result:
 
 
 def _measured_track(
-    arguments: argparse.Namespace, log_format: LogFormat, stages: Stages
+    arguments: argparse.Namespace, log_format: robots.LogFormat, stages: Stages
 ) -> Log:
     """Return the measured tips of a track, with the commands where the file has them."""
     columns = hybridkin.datasets.log_columns(arguments.log, arguments.delimiter)
@@ -420,7 +416,7 @@ def _init(arguments: argparse.Namespace, stages: Stages) -> _Result:
         )
     text = description(answers, out.stem)
     robot = _robot_of(text)
-    log_format: LogFormat = robot.log
+    log_format: robots.LogFormat = robot.log
     check = None
     about_zeros = ""
     log = answers["log"]
@@ -535,7 +531,7 @@ def _limits(
     return hybridkin.app.workflow.path_limits(loaded, **vars(scaled), **options)
 
 
-def _scaled_limits(arguments: argparse.Namespace, loaded: LoadedModel) -> Limits:
+def _scaled_limits(arguments: argparse.Namespace, loaded: LoadedModel) -> robots.Limits:
     """Return the limits of the arguments, in the log's unit and sign, which may swap the ends."""
     limits = hybridkin.robots.Limits(
         arguments.q_min, arguments.q_max, arguments.dq_max, arguments.ddq_max
@@ -548,7 +544,9 @@ def _note(found: LogReport, stages: Stages) -> None:
     stages.note(f"{found}\n", important=bool(found.errors or found.warnings))
 
 
-def _path_of(arguments: argparse.Namespace, loaded: LoadedModel) -> Trajectory | None:
+def _path_of(
+    arguments: argparse.Namespace, loaded: LoadedModel
+) -> trajectories.Trajectory | None:
     """Return the path of the tip that the arguments name; None without."""
     if arguments.path is None:
         return None
@@ -571,7 +569,7 @@ def _log_of(
 
 def _read(
     arguments: argparse.Namespace,
-    log_format: LogFormat,
+    log_format: robots.LogFormat,
     stages: Stages,
     chain: Chain | None = None,
     base_is_free: bool = False,
@@ -596,8 +594,8 @@ _TIME = ("time_unit", "rate")
 
 
 def _log_format(
-    arguments: argparse.Namespace, described: LogFormat | None, source: Path
-) -> LogFormat:
+    arguments: argparse.Namespace, described: robots.LogFormat | None, source: Path
+) -> robots.LogFormat:
     """Return how the log is written: as described, with what the options say instead."""
     entries = {}
     if arguments.time_unit not in (None, FRAMES):

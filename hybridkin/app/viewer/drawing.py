@@ -8,14 +8,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from hybridkin._core.commands import Commands
-from hybridkin._core.model import ForwardModel
+from hybridkin import ArcChain, Chain, Commands, ElasticTendonChain, ForwardModel
 from hybridkin.app.viewer.steered import SteeredRobot
-from hybridkin.chains.arc_chain import ArcChain
-from hybridkin.chains.chain import Chain
-from hybridkin.chains.elastic_tendons import ElasticTendonChain
 from hybridkin.datasets import Log
-from hybridkin.plots.models import body_of
+from hybridkin.plots import BackboneDisplay
 
 Color: TypeAlias = tuple[int, int, int]
 
@@ -37,13 +33,13 @@ class Body:
     def __init__(self, scene: Any, model: Any, robot: SteeredRobot) -> None:
         self._model = model
         self._chain = robot.loaded.chain
-        body = body_of(model, robot.q, _POINTS)
+        body = _body_of(model, robot)
         self._thick = 0.015 * robot.size
         if isinstance(self._chain, ArcChain):
             self._thick = min(self._thick, 0.4 * float(self._chain.radii.min()))
         self._backbone = scene.add_spline_catmull_rom(
             "/robot/backbone",
-            body["points"][0],
+            body.points[0],
             thickness=self._thick,
             color=(60, 60, 60),
         )
@@ -52,7 +48,7 @@ class Body:
             scene.add_spline_catmull_rom(
                 f"/robot/actuator {k + 1}", path[0], thickness=0.4 * self._thick
             )
-            for k, path in enumerate(body["actuators"])
+            for k, path in enumerate(body.actuators)
         ]
         self._markers = None
         if self._chain is not None and self._chain.n_outputs > 3:
@@ -64,28 +60,28 @@ class Body:
                 point_shape="circle",
             )
         self._disks = None
-        if "disks" in body:
+        if body.disks is not None:
             self._disks = scene.add_line_segments(
                 "/robot/disks",
-                _rims(body["disks"]),
+                _rims(body.disks),
                 GREY,
                 thickness=0.3 * self._thick,
             )
 
     def move(self, robot: SteeredRobot) -> None:
         """Draw the robot where it is."""
-        body = body_of(self._model, robot.q, _POINTS)
-        if not np.isfinite(body["points"]).all():
+        body = _body_of(self._model, robot)
+        if not np.isfinite(body.points).all():
             return
-        self._backbone.points = body["points"][0]
+        self._backbone.points = body.points[0]
         self._tip.position = robot.x
-        if self._disks is not None and "disks" in body:
-            self._disks.points = _rims(body["disks"])
+        if self._disks is not None and body.disks is not None:
+            self._disks.points = _rims(body.disks)
         if self._markers is not None:
             self._markers.points = self._marked(robot)
         colors, slack = self._tensions(robot)
         for k, handle in enumerate(self._actuators):
-            handle.points = body["actuators"][k][0]
+            handle.points = body.actuators[k][0]
             color = tuple(colors[k].tolist())
             thickness = (0.12 if slack[k] else 0.4) * self._thick
             if tuple(handle.color) != color:
@@ -109,6 +105,11 @@ class Body:
         return between(RED, BLUE, fraction), np.zeros(len(fraction), dtype=bool)
 
 
+def _body_of(model: Any, robot: SteeredRobot) -> BackboneDisplay:
+    """Return the body of a model at the configuration of a robot."""
+    return BackboneDisplay.from_estimator(model, robot.q, n_points=_POINTS)
+
+
 class Ghost:
     """The backbone of another model at the same command."""
 
@@ -118,7 +119,7 @@ class Ghost:
         self._chain = chain
         self.line = scene.add_spline_catmull_rom(
             f"/{name}",
-            body_of(chain, robot.q, _POINTS)["points"][0],
+            _body_of(chain, robot).points[0],
             thickness=0.008 * robot.size,
             color=GHOSTS[name],
             visible=False,
@@ -127,7 +128,7 @@ class Ghost:
     def move(self, robot: SteeredRobot) -> None:
         """Draw it, if it is shown."""
         if self.line.visible:
-            points = body_of(self._chain, robot.q, _POINTS)["points"][0]
+            points = _body_of(self._chain, robot).points[0]
             if np.isfinite(points).all():
                 self.line.points = points
 

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Self
 
-from hybridkin._core.page_server import page_server, stop
-from hybridkin._core.texts import csv_table, markdown, visible
+from hybridkin import Chain, HybridForwardModel, trajectories
 from hybridkin.app.viewer.drawing import BLUE, GREEN, ORANGE, RED, Body, Ghost, LogCloud
 from hybridkin.app.viewer.motions import (
     Loop,
@@ -27,10 +26,9 @@ from hybridkin.app.viewer.motions import (
 from hybridkin.app.viewer.steered import RATE, SteeredRobot
 from hybridkin.app.workflow.domain import path_limits
 from hybridkin.app.workflow.model import LoadedModel
-from hybridkin.chains.chain import Chain
 from hybridkin.datasets import Log
-from hybridkin.hybrid.estimator import HybridForwardModel
-from hybridkin.ik.trajectories import Trajectory
+from hybridkin.formats import csv_table, markdown, visible
+from hybridkin.plots.page_server import page_server, stop
 
 __all__ = ["LiveView", "view"]
 
@@ -42,7 +40,7 @@ def view(
     model: LoadedModel | HybridForwardModel | Chain,
     log: Log | None = None,
     *,
-    path: Trajectory | None = None,
+    path: trajectories.Trajectory | None = None,
     q_min: ArrayLike | None = None,
     q_max: ArrayLike | None = None,
     dq_max: ArrayLike | None = None,
@@ -134,7 +132,7 @@ class LiveView:
         self,
         robot: SteeredRobot,
         log: Log | None,
-        path: Trajectory | None,
+        path: trajectories.Trajectory | None,
         host: str,
         port: int,
     ) -> None:
@@ -242,7 +240,7 @@ class LiveView:
         self.robot.go_to(q)
         self._wake.set()
 
-    def _add_panel(self, log: Log | None, path: Trajectory | None) -> None:
+    def _add_panel(self, log: Log | None, path: trajectories.Trajectory | None) -> None:
         """Add words, sliders and buttons."""
         gui = self._server.gui
         robot = self.robot

@@ -8,10 +8,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridkin import trajectories
 from hybridkin.app.viewer.steered import RATE, SteeredRobot
 from hybridkin.datasets import Log
-from hybridkin.ik import trajectories
-from hybridkin.ik.trajectories import Trajectory
 
 _SWING = 0.3  # of a wiggle, relative to the range of the actuator
 _LAP = 8.0  # time of one lap on a path [s]
@@ -66,7 +65,7 @@ class Wiggle:
 class Loop:
     """A path of the target, again and again."""
 
-    def __init__(self, robot: SteeredRobot, path: Trajectory) -> None:
+    def __init__(self, robot: SteeredRobot, path: trajectories.Trajectory) -> None:
         self._robot = robot
         n_ticks = max(2, round(RATE * path.duration))
         times = np.linspace(path.t[0], path.t[-1], n_ticks)
@@ -80,7 +79,7 @@ class Loop:
         return True
 
 
-def circle(robot: SteeredRobot) -> Trajectory:
+def circle(robot: SteeredRobot) -> trajectories.Trajectory:
     """Return a horizontal circle through the present tip."""
     radius = _WIDTH * robot.size
     center = robot.x - [radius, 0.0, 0.0]
@@ -89,7 +88,7 @@ def circle(robot: SteeredRobot) -> Trajectory:
     )
 
 
-def figure_eight(robot: SteeredRobot) -> Trajectory:
+def figure_eight(robot: SteeredRobot) -> trajectories.Trajectory:
     """Return a horizontal figure eight about the present tip."""
     width = 2.0 * _WIDTH * robot.size
     return trajectories.figure_eight(

@@ -10,11 +10,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hybridkin import IKStatus, InverseKinematics
 from hybridkin.app.workflow.domain import Domain, PathLimits
 from hybridkin.app.workflow.model import LoadedModel
 from hybridkin.datasets import Log
-from hybridkin.ik.results import IKStatus
-from hybridkin.ik.solver import InverseKinematics
 
 RATE = 50.0  # ticks per second
 _GAIN = 8.0  # [1/s]

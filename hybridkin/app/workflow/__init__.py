@@ -1,8 +1,8 @@
 """From a log to a model, a report and a track: the functions behind the command line."""
 
-from typing import TYPE_CHECKING
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
-from hybridkin._core.first_use import on_first_use
 from hybridkin.app.workflow.description import Description, describe
 from hybridkin.app.workflow.log import LogError, MeasuredLog, read_log
 from hybridkin.app.workflow.model import LOG_SUFFIXES, LoadedModel, is_log, open_model
@@ -59,39 +59,33 @@ __all__ = [
 ]
 
 # A description of a robot needs no fit and no inverse kinematics.
-_NAMES_OF = {
-    "compare": ("FitSettings",),
-    "counts": ("Counts",),
-    "delay": (
-        "Delay",
-        "estimated_delay",
-    ),
-    "domain": (
-        "PathLimits",
-        "path_limits",
-    ),
-    "evaluate": (
-        "Evaluation",
-        "evaluate_log",
-    ),
-    "export": ("export_model",),
-    "film": ("animate_track",),
-    "fit": ("fit_log",),
-    "fit_record": ("FitRecord",),
-    "merge": ("merge_files",),
-    "path": (
-        "scaled_path",
-        "shape_path",
-    ),
-    "planning": ("next_rows",),
-    "track": (
-        "TrackRecord",
-        "track_path",
-    ),
-    "verify": (
-        "Verification",
-        "read_tips",
-        "verify_track",
-    ),
+_MODULE_OF = {
+    "Counts": "counts",
+    "Delay": "delay",
+    "Evaluation": "evaluate",
+    "FitRecord": "fit_record",
+    "FitSettings": "compare",
+    "PathLimits": "domain",
+    "TrackRecord": "track",
+    "Verification": "verify",
+    "animate_track": "film",
+    "estimated_delay": "delay",
+    "evaluate_log": "evaluate",
+    "export_model": "export",
+    "fit_log": "fit",
+    "merge_files": "merge",
+    "next_rows": "planning",
+    "path_limits": "domain",
+    "read_tips": "verify",
+    "scaled_path": "path",
+    "shape_path": "path",
+    "track_path": "track",
+    "verify_track": "verify",
 }
-__getattr__ = on_first_use(__name__, _NAMES_OF)
+
+
+def __getattr__(name: str) -> Any:
+    """Open names on first use."""
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)

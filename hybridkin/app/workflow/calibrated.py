@@ -9,12 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hybridkin._core.arrays import as_array
-from hybridkin._core.units import LogUnit
+from hybridkin import ArcChain, CalibrationResult, Chain
 from hybridkin.app.workflow.report import Report, millimetres
-from hybridkin.calibration.calibrate import CalibrationResult
-from hybridkin.chains.arc_chain import ALIASES, ArcChain
-from hybridkin.chains.chain import Chain
+from hybridkin.formats import LogUnit
 
 IDENTIFIED = 10.0
 """A parameter is identified by the data if they narrow its prior at least this many times, and if
@@ -130,9 +127,7 @@ def _before_and_after(
 
 def _start_value(start: Chain, name: str) -> NDArray:
     """Return the start value of a parameter of `calibrate`."""
-    geometry = {
-        key: as_array(value.detach()) for key, value in start.geometry().items()
-    }
+    geometry = {key: value.numpy(force=True) for key, value in start.geometry().items()}
     if name == "turns" and isinstance(start, ArcChain):
         counts = np.array(start.actuators_per_segment)
         first = np.cumsum(counts) - counts
@@ -150,7 +145,7 @@ def _unit(start: Chain, name: str, k: int, q_unit: LogUnit) -> _Unit:
         return _DEGREES
     if name == "actuator_zeros" and isinstance(start, ArcChain) and start.in_metres:
         return _MILLIMETRES
-    unit = start.unit_of(ALIASES.get(name, name))
+    unit = start.unit_of(name)
     if unit.endswith(_PER_UNIT):
         of_what = unit.removesuffix(_PER_UNIT)
         scale, symbol = _SHOWN.get(of_what, (1.0, of_what))

@@ -7,12 +7,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from hybridkin._core.units import LogUnit
+from hybridkin import CrossFit, ELMRegressorCV, HybridForwardModel
 from hybridkin.app.workflow.report import millimetres
 from hybridkin.chains.hysteresis import HysteresisOperator
-from hybridkin.hybrid.estimator import HybridForwardModel
-from hybridkin.hybrid.held_out import CrossFit
-from hybridkin.learning.elm_cv import ELMRegressorCV
+from hybridkin.formats import LogUnit
 
 
 def choice_in_words(model: HybridForwardModel, unit: LogUnit) -> str:

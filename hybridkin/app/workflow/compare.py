@@ -13,18 +13,21 @@ from sklearn.linear_model import LinearRegression
 from sklearn.pipeline import Pipeline, make_pipeline
 from sklearn.preprocessing import MinMaxScaler, PolynomialFeatures
 
-from hybridkin._core.arrays import whole
-from hybridkin._core.model import ForwardModel
+from hybridkin import (
+    CalibrationResult,
+    Chain,
+    CrossFit,
+    ForwardModel,
+    HybridForwardModel,
+    cross_fit,
+    robots,
+)
 from hybridkin.app.workflow.calibrated import CalibratedParameter, calibrated_parameters
 from hybridkin.app.workflow.log import MeasuredLog
 from hybridkin.app.workflow.report import Progress, quiet
-from hybridkin.calibration.calibrate import CalibrationResult, fit_geometry
+from hybridkin.arguments import whole
+from hybridkin.calibration.calibrate import fit_geometry
 from hybridkin.calibration.choice import GeometryChoice, choose_geometry
-from hybridkin.chains.chain import Chain
-from hybridkin.chains.robots import RobotDescription
-from hybridkin.hybrid.cross_fit import cross_fit
-from hybridkin.hybrid.estimator import HybridForwardModel
-from hybridkin.hybrid.held_out import CrossFit
 from hybridkin.learning.elm_cv import growing_network
 from hybridkin.learning.regressor_modules import error_module
 
@@ -124,7 +127,7 @@ class Mechanical:
     @classmethod
     def of(
         cls,
-        robot: RobotDescription,
+        robot: robots.RobotDescription,
         rows: MeasuredLog,
         loss: str,
         of_all: Mechanical | None = None,
@@ -180,7 +183,7 @@ def quadratic() -> Pipeline:
 
 
 def models_of(
-    robot: RobotDescription, mechanical: Mechanical, settings: FitSettings
+    robot: robots.RobotDescription, mechanical: Mechanical, settings: FitSettings
 ) -> dict[str, HybridForwardModel]:
     """Return the unfitted models of the comparison by name."""
     model = mechanical.model
@@ -206,7 +209,7 @@ def models_of(
 
 
 def _auto(
-    robot: RobotDescription, mechanical: Mechanical, settings: FitSettings
+    robot: robots.RobotDescription, mechanical: Mechanical, settings: FitSettings
 ) -> HybridForwardModel:
     """Return the hybrid with error_model="auto".
 
@@ -246,7 +249,7 @@ def with_play_detected(
 
 def compare(
     rows: MeasuredLog,
-    robot: RobotDescription,
+    robot: robots.RobotDescription,
     settings: FitSettings,
     mechanical: Mechanical,
     *,
@@ -263,7 +266,7 @@ def compare(
     ----------
     rows : MeasuredLog
         The rows to compare on.
-    robot : RobotDescription
+    robot : robots.RobotDescription
         Nominal kinematics, and the parameters to calibrate.
     settings : FitSettings
         Loss, folds and models, see `with_play_detected`.
@@ -305,7 +308,7 @@ def compare(
 
 
 def _models_for(
-    robot: RobotDescription,
+    robot: robots.RobotDescription,
     settings: FitSettings,
     of_all: Mechanical,
     rows: MeasuredLog,
@@ -321,7 +324,7 @@ def _in_table(candidate: str) -> str:
 
 
 def _nominal(
-    robot: RobotDescription, chain: Chain, rows: MeasuredLog, loss: str
+    robot: robots.RobotDescription, chain: Chain, rows: MeasuredLog, loss: str
 ) -> Chain:
     """Return the described chain, with a fitted base if the base is calibrated."""
     if not robot.base_is_free:

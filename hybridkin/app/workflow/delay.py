@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import minimize_scalar
 
-from hybridkin._core.arrays import real_array
+from hybridkin.arguments import real_array
 
 _MOST = 0.25  # of the duration: else the ends of the motion decide
 _PERIODS = 63  # at most, as in a control loop

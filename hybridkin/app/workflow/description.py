@@ -9,12 +9,11 @@ from typing import Any
 
 from torch import Tensor
 
-from hybridkin._core.texts import visible
+from hybridkin import robots
 from hybridkin.app.workflow.errors import HeldOutErrors
 from hybridkin.app.workflow.model import LoadedModel
 from hybridkin.app.workflow.report import Report, listed
-from hybridkin.chains.robots import Limits, LogFormat
-from hybridkin.hybrid.cv_results import CvResults
+from hybridkin.formats import visible
 
 _NAMES = 24  # width of the names of rows
 _NOTES = ("log", "rows", "n_whole", "n_motions", "saved", "chosen")
@@ -54,11 +53,11 @@ class Description:
     kind: str
     n_actuators: int
     geometry: Mapping[str, Tensor]
-    auto: CvResults | None
+    auto: Mapping[str, Any] | None
     play: list[float] | None
-    domain: Limits | None
-    log_format: LogFormat
-    limits: Limits | None
+    domain: robots.Limits | None
+    log_format: robots.LogFormat
+    limits: robots.Limits | None
     training: Mapping[str, Any]
     created: str | None
     versions: Mapping[str, str] | None
@@ -147,7 +146,10 @@ def _in_lines(rows: Mapping[str, object]) -> str:
 
 
 def _write_limits(
-    report: Report[Description], title: str, limits: Limits, log: LogFormat
+    report: Report[Description],
+    title: str,
+    limits: robots.Limits,
+    log: robots.LogFormat,
 ) -> None:
     """Add limits in the unit and sign of the logs."""
     unit = "" if log.q_unit == "1" else f" {log.q_unit}"

@@ -9,12 +9,9 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from hybridkin._core.arrays import as_array, real_array
+from hybridkin import ArcChain, ConstantCurvatureChain, InverseKinematics, robots
 from hybridkin.app.workflow.model import LoadedModel
-from hybridkin.chains import robots
-from hybridkin.chains.arc_chain import ArcChain
-from hybridkin.chains.constant_curvature import ConstantCurvatureChain
-from hybridkin.ik.solver import InverseKinematics
+from hybridkin.arguments import real_array
 
 _WALKERS = 256
 _STEPS = 60
@@ -168,7 +165,7 @@ class Domain:
         hybrid = self.loaded.hybrid
         if hybrid is not None and hybrid.fitted_module_.tested is not None:
             tested = hybrid.fitted_module_.tested
-            rows = as_array(tested.rows) - hybrid.change_.shift
+            rows = tested.rows.numpy(force=True) - hybrid.change_.shift
             far = np.linalg.norm(rows - middle, axis=1)
             median = self._bent(np.median(rows, axis=0))
             candidates = [median, *candidates, rows[far.argmin()]]
@@ -194,7 +191,7 @@ class Domain:
         chain = self.tendons
         if chain is None:
             return np.zeros(self.loaded.n_actuators)
-        return as_array(chain.rest.detach())
+        return chain.rest.numpy(force=True)
 
     @cached_property
     def sample(self) -> tuple[NDArray, NDArray]:
@@ -268,10 +265,10 @@ class Domain:
         if chain is None:
             return q
         rest = self.rest
-        gains = as_array(chain.gains.detach())  # balanced in metres
+        gains = chain.gains.numpy(force=True)  # balanced in metres
         low, high = np.sort([gains * (low - rest), gains * (high - rest)], axis=0)
         pulled = gains * (q - rest)
-        angles = as_array(chain.angles.detach())
+        angles = chain.angles.numpy(force=True)
         first = 0
         for count in chain.actuators_per_segment:
             ring = slice(first, first + count)
@@ -295,7 +292,7 @@ class Domain:
             return np.eye(self.loaded.n_actuators)
         zero = torch.from_numpy(np.zeros(chain.n_actuators))
         slopes = torch.func.jacrev(lambda row: chain.arcs(row)[1].ravel())(zero)
-        gains = as_array(chain.gains.detach())
-        slopes = as_array(slopes) / gains
+        gains = chain.gains.numpy(force=True)
+        slopes = slopes.numpy(force=True) / gains
         of_metres = np.linalg.pinv(slopes, rcond=_PLANAR) @ slopes
         return gains[:, None] * of_metres / gains

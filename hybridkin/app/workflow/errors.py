@@ -13,6 +13,12 @@ from numpy.typing import NDArray
 from typing_extensions import Self
 
 
+def marker_distances(predicted: NDArray, measured: NDArray) -> NDArray:
+    """Return the distances (N, K) of predicted and measured markers (N, 3 K) [m]."""
+    difference = (predicted - measured).reshape(len(measured), -1, 3)
+    return np.linalg.norm(difference, axis=2)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Errors:
     """Statistics of tip errors [m], NaN if not known.

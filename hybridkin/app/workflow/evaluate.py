@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 import hybridkin
-from hybridkin._core.commands import Commands
+from hybridkin import Commands, HybridForwardModel
 from hybridkin.app import LogReport
-from hybridkin.app.workflow.errors import Errors
+from hybridkin.app.workflow.errors import Errors, marker_distances
 from hybridkin.app.workflow.fit_record import (
     add_histogram,
     errors_of_markers,
@@ -21,9 +21,7 @@ from hybridkin.app.workflow.fit_record import (
 from hybridkin.app.workflow.log import MeasuredLog, checked, write_check
 from hybridkin.app.workflow.model import LoadedModel
 from hybridkin.app.workflow.report import Report, check_out
-from hybridkin.calibration.measured import distances
 from hybridkin.datasets import Log
-from hybridkin.hybrid.estimator import HybridForwardModel
 
 _FIGURES = ("error_histogram.png", "workspace.png")
 
@@ -143,7 +141,7 @@ def evaluate_log(
     if loaded.play is not None:
         measured.check_order("A model with backlash (play)")
     predicted = loaded.predict(measured.commands)
-    markers = distances(predicted, log.x)
+    markers = marker_distances(predicted, log.x)
     errors = _row_errors(loaded, measured.commands, markers)
     fitted = loaded.was_fitted(log.q, log.x, measured.motions)
     fitted_errors = None
@@ -233,7 +231,7 @@ def _add_figures(
     predicted: NDArray,
 ) -> None:
     plots = hybridkin.plots
-    errors = np.nanmean(distances(predicted, log.x), axis=1)
+    errors = np.nanmean(marker_distances(predicted, log.x), axis=1)
     add_histogram(report, {loaded.kind: errors}, "Tip errors of all rows.")
     figure, ax = plots.new_figure(6.4, 5.2, subplot_kw={"projection": "3d"})
     row = int(np.argsort(errors)[int(0.95 * len(errors))])

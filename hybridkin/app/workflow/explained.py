@@ -6,12 +6,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from hybridkin import HybridForwardModel
 from hybridkin.app.workflow.compare import AUTO, CALIBRATED
 from hybridkin.app.workflow.errors import HeldOutErrors
 from hybridkin.app.workflow.log import MeasuredLog
 from hybridkin.app.workflow.report import millimetres
 from hybridkin.datasets import repeatability
-from hybridkin.hybrid.estimator import HybridForwardModel
 
 
 def explained_in_words(

@@ -6,13 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from hybridkin._core.arrays import one_of
 from hybridkin.app.workflow.domain import Domain, PathLimits, path_limits
 from hybridkin.app.workflow.model import LoadedModel
 from hybridkin.app.workflow.report import Report
-from hybridkin.native.export import export_c
-from hybridkin.native.fmu import export_fmu
-from hybridkin.native.mex import export_mex
+from hybridkin.arguments import one_of
+from hybridkin.native import export_c, export_fmu, export_mex
 
 _TITLES = {
     "c": "C code",

@@ -6,12 +6,11 @@ from functools import partial
 from pathlib import Path
 
 import hybridkin
-from hybridkin._core.commands import Commands
-from hybridkin._core.files import check_outputs
+from hybridkin import ArcChain, Commands
 from hybridkin.app.workflow.model import LoadedModel
 from hybridkin.app.workflow.report import Progress, Report, quiet
 from hybridkin.app.workflow.track import LEAD_IN, TARGET, read_track
-from hybridkin.chains.arc_chain import ArcChain
+from hybridkin.formats import check_outputs
 
 
 def animate_track(

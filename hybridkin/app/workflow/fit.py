@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from hybridkin import CrossFit, HybridForwardModel, robots, save_model
 from hybridkin.app.workflow.calibrated import Calibration, deviations
 from hybridkin.app.workflow.choices import (
     auto_in_words,
@@ -27,7 +28,7 @@ from hybridkin.app.workflow.compare import (
     with_play_detected,
 )
 from hybridkin.app.workflow.counts import Counts
-from hybridkin.app.workflow.errors import HeldOutErrors, Promise
+from hybridkin.app.workflow.errors import HeldOutErrors, Promise, marker_distances
 from hybridkin.app.workflow.explained import explained_in_words
 from hybridkin.app.workflow.fit_record import (
     FitRecord,
@@ -42,19 +43,14 @@ from hybridkin.app.workflow.fit_record import (
 from hybridkin.app.workflow.log import MeasuredLog, checked
 from hybridkin.app.workflow.model import LoadedModel
 from hybridkin.app.workflow.report import Progress, Report, check_out, quiet
-from hybridkin.calibration.measured import distances
-from hybridkin.chains.robots import RobotDescription
 from hybridkin.datasets import Log
-from hybridkin.hybrid.estimator import HybridForwardModel
-from hybridkin.hybrid.held_out import CrossFit
-from hybridkin.saving.saved_model import save_model
 
 _FILES = ("model.safetensors", "robot.toml", "held_out.png", "error_histogram.png")
 
 
 def fit_log(
     log: Log,
-    robot: RobotDescription,
+    robot: robots.RobotDescription,
     out: str | Path,
     settings: FitSettings = DEFAULTS,
     *,
@@ -73,7 +69,7 @@ def fit_log(
     ----------
     log : Log
         As from `read_log` or `datasets.load_log`.
-    robot : RobotDescription
+    robot : robots.RobotDescription
         As from `robots.read_description`.
     out : str or Path
         Folder to write into.
@@ -147,7 +143,7 @@ def fit_log(
         log_check=complete.report,
         worst=largest_errors(errors, measured.motions),
         markers=errors_of_markers(
-            distances(compared.tips[compared.names.index(saved)], compared.y)
+            marker_distances(compared.tips[compared.names.index(saved)], compared.y)
         ),
         auto=model.cv_results_,
         words=[
@@ -167,7 +163,9 @@ def fit_log(
     return report
 
 
-def _check(log: MeasuredLog, robot: RobotDescription, settings: FitSettings) -> None:
+def _check(
+    log: MeasuredLog, robot: robots.RobotDescription, settings: FitSettings
+) -> None:
     """Raise if the log or the settings do not allow a comparison by motions."""
     n_motions = len(np.unique(log.motions))
     if n_motions < 3:
@@ -227,7 +225,7 @@ def _in_words(loaded: LoadedModel, model: HybridForwardModel) -> list[str]:
 
 
 def _add_model(
-    report: Report[FitRecord], model: HybridForwardModel, robot: RobotDescription
+    report: Report[FitRecord], model: HybridForwardModel, robot: robots.RobotDescription
 ) -> None:
     """Add the model and the description of its robot to the files of a report."""
     training = training_notes(report.record)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 import hybridkin
+from hybridkin import CrossFit
 from hybridkin.app import LogReport
 from hybridkin.app.workflow.calibrated import Calibration
 from hybridkin.app.workflow.compare import (
@@ -21,8 +23,6 @@ from hybridkin.app.workflow.counts import Counts
 from hybridkin.app.workflow.errors import Errors, HeldOutErrors, Promise
 from hybridkin.app.workflow.log import write_check
 from hybridkin.app.workflow.report import Report
-from hybridkin.hybrid.cv_results import CvResults
-from hybridkin.hybrid.held_out import CrossFit
 
 _SHOWN = (CALIBRATED, DATA_LINEAR, HYBRID_ELM, "hybrid, parallel ELM", AUTO)
 _MOST = 5  # motions of largest errors
@@ -126,7 +126,7 @@ class FitRecord(Training):
     thinned: str
     worst: Sequence[MotionErrors]
     markers: Sequence[Errors]
-    auto: CvResults | None
+    auto: Mapping[str, Any] | None
     words: Sequence[str]
     tried: Mapping[str, Mapping[str, float]]
     calibrated: str

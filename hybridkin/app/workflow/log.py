@@ -11,15 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Self
 
-from hybridkin._core.commands import Commands
-from hybridkin._core.runs import RunOrder
-from hybridkin._core.units import LogUnit
+from hybridkin import ArcChain, Chain, Commands, robots
 from hybridkin.app import LogReport, check_log
 from hybridkin.app.workflow.report import Report
-from hybridkin.chains import robots
-from hybridkin.chains.arc_chain import ArcChain
-from hybridkin.chains.chain import Chain
 from hybridkin.datasets import Log, load_log
+from hybridkin.formats import LogUnit
 
 _BLOCKS = 10
 
@@ -95,7 +91,7 @@ class MeasuredLog(Log):
         """Number of rows that are earlier than the row above of the same run."""
         if self.time is None:
             return 0
-        return len(RunOrder.of(self.commands.run_of_rows).late(self.time))
+        return len(self.commands.order.late(self.time))
 
     def check_order(self, why: str) -> None:
         """Raise if rows of a run are not in order of time; `why` begins the message."""
@@ -140,11 +136,7 @@ class MeasuredLog(Log):
         """
         counts = np.zeros(len(self.q))
         counts[rows] = 1.0
-        # Reading a description loads no calibration.
-        from hybridkin.calibration.hysteresis_log import needed_rows
-
-        needed = needed_rows(self.commands.run_of_rows, rows)
-        return replace(self, counts=counts).rows(needed)
+        return replace(self, counts=counts).rows(self.commands.up_to(rows))
 
     def thinned(self, max_rows: int | None) -> Self:
         """Return the log with at most `max_rows` rows that count; None: all of them.
@@ -155,9 +147,7 @@ class MeasuredLog(Log):
         """
         if max_rows is None or len(self.q) <= max_rows:
             return self
-        from hybridkin.calibration.measured import thinned
-
-        rows = thinned(self.motions, max_rows)
+        rows = Commands(self.q, self.motions).spread_rows(max_rows)
         return self.counting(rows) if self.named else self.rows(rows)
 
     def thinned_in_words(self, complete: MeasuredLog) -> str:

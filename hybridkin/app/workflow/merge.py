@@ -10,14 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hybridkin._core.arrays import as_path
-from hybridkin._core.files import check_outputs, write_file
-from hybridkin._core.text_rows import TextForm
-from hybridkin._core.texts import csv_table
 from hybridkin.app.workflow.report import Report
-from hybridkin.datasets import merge_logs
-from hybridkin.datasets.merged import columns_as_written
-from hybridkin.datasets.table_files import read_table
+from hybridkin.arguments import as_path
+from hybridkin.datasets import merge_logs, read_columns
+from hybridkin.formats import check_outputs, csv_table, write_file
 
 
 def merge_files(
@@ -79,11 +75,9 @@ def merge_files(
     """
     path = as_path(out, "out")
     check_outputs([path], "merge", lambda _: False, force=force)
-    form = TextForm(delimiter, None, decimal)
-    commands = columns_as_written(read_table(as_path(motors), form), q, time, groups)
-    tips = columns_as_written(
-        read_table(as_path(camera), form), x, camera_time or time, missing=missing
-    )
+    form = {"delimiter": delimiter, "decimal": decimal, "unit": "as written"}
+    commands = read_columns(motors, q, time=time, groups=groups, **form)
+    tips = read_columns(camera, x, time=camera_time or time, missing=missing, **form)
     merged = merge_logs(commands, tips, lag=lag, tolerance=tolerance, hold=hold)
     log = merged.log
     motions = np.asarray(log.runs if groups is None else log.groups)

@@ -11,23 +11,17 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 import hybridkin
-from hybridkin._core.arrays import as_array, as_path, shaped
-from hybridkin._core.commands import Commands
+from hybridkin import ArcChain, Chain, Commands, ForwardModel, as_forward_model, robots
 from hybridkin._core.digests import row_digests
-from hybridkin._core.directions import in_terms
-from hybridkin._core.model import ForwardModel, as_forward_model
-from hybridkin._core.units import UNITS, LogUnit
 from hybridkin.app.workflow.errors import ExpectedErrors, HeldOutErrors, Promise
-from hybridkin.chains import robots
-from hybridkin.chains.arc_chain import ArcChain
-from hybridkin.chains.chain import Chain
-from hybridkin.native.library import evaluate
+from hybridkin.arguments import as_path, shaped
+from hybridkin.formats import UNITS, LogUnit, in_terms
+from hybridkin.native import evaluate
 from hybridkin.saving.header import model_header
 
 if TYPE_CHECKING:
+    from hybridkin import ELMRegressor, HybridForwardModel
     from hybridkin.chains.hysteresis import HysteresisOperator
-    from hybridkin.hybrid.estimator import HybridForwardModel
-    from hybridkin.learning.elm import ELMRegressor
 
 LOG_SUFFIXES = (".csv", ".tsv", ".txt", ".npz", ".parquet", ".pq")
 """Endings of files that are treated as logs."""
@@ -256,7 +250,9 @@ class LoadedModel:
         if self.module.plane is None:
             return ""
         log = self.log_format()
-        normals = as_array(self.module.plane[1]) * np.reshape(log.q_factor, (-1, 1))
+        normals = self.module.plane[1].numpy(force=True) * np.reshape(
+            log.q_factor, (-1, 1)
+        )
         motions = in_terms(normals / np.abs(normals).max(axis=0), log.q)
         return (
             f"The log has no motion along {motions}, and the mechanical model knows no effect of "

@@ -8,12 +8,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hybridkin._core.arrays import as_array, number, one_of, real_array
+from hybridkin import trajectories
 from hybridkin.app.workflow.domain import Domain, PathLimits
 from hybridkin.app.workflow.model import LoadedModel
 from hybridkin.app.workflow.reach import center_of, placed
-from hybridkin.ik import trajectories
-from hybridkin.ik.trajectories import Trajectory
+from hybridkin.arguments import number, one_of, real_array
 
 _TOL = 1e-4  # of a point that lies in the domain [m]
 _EXAMPLE = ("40", "20", "0")  # sizes
@@ -25,7 +24,7 @@ _SHAPES = {
 }
 
 
-def scaled_path(path: Trajectory, scale: float) -> Trajectory:
+def scaled_path(path: trajectories.Trajectory, scale: float) -> trajectories.Trajectory:
     """Return a path scaled about its centre, at the same times.
 
     Parameters
@@ -43,7 +42,7 @@ def scaled_path(path: Trajectory, scale: float) -> Trajectory:
     if not math.isfinite(number(scale, "scale")):
         raise ValueError(f"`scale` must be finite, got {scale!r}.")
     center = center_of(path)
-    return Trajectory(path.t, center + scale * (path.x - center))
+    return trajectories.Trajectory(path.t, center + scale * (path.x - center))
 
 
 def shape_path(
@@ -58,7 +57,7 @@ def shape_path(
     rise: float = 0.0,
     duration: float = 10.0,
     dt: float = 0.02,
-) -> Trajectory:
+) -> trajectories.Trajectory:
     """Return the path of a named shape, in the workspace of a model.
 
     Parameters
@@ -129,5 +128,7 @@ def shape_path(
 def _normal_of(tips: NDArray, loaded: LoadedModel) -> NDArray:
     """Return the normal (3,) of the plane nearest to tips (N, 3), along the base's z-axis."""
     normal = np.linalg.svd(tips - tips.mean(axis=0), full_matrices=False)[2][2]
-    ahead = normal if loaded.chain is None else as_array(loaded.chain.base)[:3, 2]
+    ahead = (
+        normal if loaded.chain is None else loaded.chain.base.numpy(force=True)[:3, 2]
+    )
     return normal if normal @ ahead > 0.0 else -normal

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hybridkin._core.arrays import whole
-from hybridkin._core.units import METRES
+from hybridkin import choose_rows, trajectories
 from hybridkin.app.workflow.domain import Domain, PathLimits, path_limits
 from hybridkin.app.workflow.log import MeasuredLog
 from hybridkin.app.workflow.model import LoadedModel
@@ -19,9 +18,8 @@ from hybridkin.app.workflow.report import (
     quiet,
 )
 from hybridkin.app.workflow.track import Attempts, best_track
-from hybridkin.calibration.measured import distance
-from hybridkin.hybrid.choose_rows import choose_rows
-from hybridkin.ik.trajectories import Trajectory
+from hybridkin.arguments import whole
+from hybridkin.formats import METRES
 
 _POOL = 2000  # number of configurations to choose from
 _SHOWN = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)  # rows of the table
@@ -35,7 +33,7 @@ def next_rows(
     n: int = 50,
     limits: PathLimits | None = None,
     measured: MeasuredLog | None = None,
-    path: Trajectory | None = None,
+    path: trajectories.Trajectory | None = None,
     force: bool = False,
     progress: Progress = quiet,
 ) -> Report[dict[str, object]]:
@@ -89,7 +87,7 @@ def next_rows(
     if path is not None:
         target = best_track(domain, path, _TOL, Attempts(progress)).effective
         candidates = np.concatenate([target, candidates])
-        far = distance(loaded.tips(target), path.x).max()
+        far = np.linalg.norm(loaded.tips(target) - path.x, axis=1).max()
         where = f"along the path, which the model reaches to within {millimetres(far)}"
     measured_q = None
     if measured is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridkin._core.units import rough_unit
+from hybridkin import IKStatus, trajectories
 from hybridkin.app.workflow.domain import Domain
 from hybridkin.app.workflow.report import (
     Progress,
@@ -13,8 +13,7 @@ from hybridkin.app.workflow.report import (
     percent,
     point_in_millimetres,
 )
-from hybridkin.ik.results import IKStatus
-from hybridkin.ik.trajectories import Trajectory
+from hybridkin.formats import rough_unit
 
 _POINTS = 13  # of the path, evenly in time; its ends in each direction are added
 _PLACES = 48  # places that are tried for a path
@@ -26,12 +25,14 @@ _MOST_MISSED = (
 _OTHER_UNIT = 20.0  # a path this many times larger than the workspace: another unit
 
 
-def center_of(path: Trajectory) -> NDArray:
+def center_of(path: trajectories.Trajectory) -> NDArray:
     """Return the centre (3,) of the box around the points of a path [m]."""
     return 0.5 * (path.x.min(axis=0) + path.x.max(axis=0))
 
 
-def placed(domain: Domain, path: Trajectory, tol: float) -> tuple[Trajectory, float]:
+def placed(
+    domain: Domain, path: trajectories.Trajectory, tol: float
+) -> tuple[trajectories.Trajectory, float]:
     """Return a path moved to where it lies in the domain, and the share of its points that does.
 
     Of equally good places it is the one with the least error to expect, or, for a model without
@@ -53,10 +54,10 @@ def placed(domain: Domain, path: Trajectory, tol: float) -> tuple[Trajectory, fl
     promised = domain.loaded.promised_errors(q.reshape(-1, q.shape[-1]))
     if promised is not None:
         best = int(good[promised.mean.reshape(len(good), -1).mean(axis=1).argmin()])
-    return Trajectory(path.t, path.x + shifts[best]), float(inside[best])
+    return trajectories.Trajectory(path.t, path.x + shifts[best]), float(inside[best])
 
 
-def better_place(domain: Domain, path: Trajectory, tol: float) -> str:
+def better_place(domain: Domain, path: trajectories.Trajectory, tol: float) -> str:
     """Return in words how a path that leaves the domain could lie in it."""
     moved, share_inside = placed(domain, path, tol)
     center = point_in_millimetres(center_of(moved))
@@ -68,7 +69,7 @@ def better_place(domain: Domain, path: Trajectory, tol: float) -> str:
 
 def check_reach(
     domain: Domain,
-    path: Trajectory,
+    path: trajectories.Trajectory,
     tol: float,
     out_of_reach: bool,
     progress: Progress,
@@ -124,7 +125,7 @@ def check_reach(
     )
 
 
-def _some_rows(path: Trajectory) -> NDArray:
+def _some_rows(path: trajectories.Trajectory) -> NDArray:
     """Return rows of a path: some evenly in time, and its ends in each direction."""
     evenly = np.linspace(0, len(path) - 1, _POINTS).astype(int)
     return np.unique([*evenly, *path.x.argmin(axis=0), *path.x.argmax(axis=0)])

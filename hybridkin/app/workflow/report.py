@@ -16,21 +16,25 @@ from typing import TYPE_CHECKING, Any, Generic, NamedTuple, Protocol, TypeVar
 
 from numpy.typing import NDArray
 
-from hybridkin._core.arrays import as_path
-from hybridkin._core.files import Writer, check_outputs, write_files
-from hybridkin._core.stored import plain
-from hybridkin._core.texts import (
+from hybridkin.app import LogReport
+from hybridkin.arguments import as_path
+from hybridkin.formats import (
+    check_outputs,
     csv_table,
     markdown,
     markdown_block,
     markdown_cell,
+    plain,
     visible,
     visible_lines,
+    write_files,
 )
-from hybridkin.app import LogReport
 
 if TYPE_CHECKING:
     from hybridkin.app.workflow.errors import Errors
+
+Writer = Callable[[Path], object]
+"""Writes a file to the path that it is given."""
 
 Progress = Callable[[str, int, int], None]
 """Called with (what, done, total)."""

@@ -6,16 +6,15 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike, NDArray
 
 import hybridkin
-from hybridkin._core.text_rows import TextFile
-from hybridkin._core.units import METRES, duration_in_words
+from hybridkin import ArcChain, IKStatus, Track, robots, trajectories
 from hybridkin.app.workflow.counts import Counts
 from hybridkin.app.workflow.domain import Domain, PathLimits, path_limits
 from hybridkin.app.workflow.errors import Errors
@@ -29,12 +28,8 @@ from hybridkin.app.workflow.report import (
     percent,
     quiet,
 )
-from hybridkin.chains.arc_chain import ArcChain
-from hybridkin.chains.robots import LogFormat
 from hybridkin.datasets import Log, load_log, log_columns
-from hybridkin.ik import trajectories
-from hybridkin.ik.results import IKStatus, Track, score, statuses
-from hybridkin.ik.trajectories import Trajectory
+from hybridkin.formats import METRES, duration_in_words
 
 TARGET = ("target_x", "target_y", "target_z")
 TIME = "t"
@@ -191,7 +186,7 @@ def _outcome(record: TrackRecord, better: str) -> str:
 
 def track_path(
     loaded: LoadedModel,
-    path: Trajectory,
+    path: trajectories.Trajectory,
     out: str | Path,
     *,
     limits: PathLimits | None = None,
@@ -286,7 +281,7 @@ def track_path(
     whole = _with_lead_in(track, lead_in[:-1], loaded)
     statuses = [IKStatus(int(code)).name for code in track.status]
     inside = loaded.domain_distance(track.effective) <= 1.0
-    _, reached = score(track)
+    _, reached = track.score
     missed = np.isin(track.status, _REACHED, invert=True)
     better = ""
     if loaded.hybrid is not None and inside.mean() < 1.0 - _MOST_OUTSIDE:
@@ -393,7 +388,7 @@ def _lead_in(track: Track, start: NDArray | None, domain: Domain) -> NDArray:
     return end - left[:, None] * way
 
 
-def _period(points: Track | Trajectory) -> float:
+def _period(points: Track | trajectories.Trajectory) -> float:
     """Return the time between two points [s]."""
     return float(points.t[1] - points.t[0]) if len(points.t) > 1 else _DT
 
@@ -438,7 +433,7 @@ class Attempts:
 
 def best_track(
     domain: Domain,
-    path: Trajectory,
+    path: trajectories.Trajectory,
     tol: float,
     attempts: Attempts,
     lead_in: NDArray | None = None,
@@ -468,13 +463,13 @@ def best_track(
         track = ik.track(fine, q0=commands, tol=tol, progress=attempts, state=state)
         # Only the points are kept, not the steps between them.
         tracks.append(_alone(_thinned(track, every), domain, tol, state))
-        if score(tracks[-1]) == (len(path), len(path)):
+        if tracks[-1].score == (len(path), len(path)):
             break
         commands = track.q[0]
-    return max(tracks, key=score)  # of equal tracks the first
+    return max(tracks, key=attrgetter("score"))  # of equal tracks the first
 
 
-def _in_steps(path: Trajectory, n: int) -> Trajectory:
+def _in_steps(path: trajectories.Trajectory, n: int) -> trajectories.Trajectory:
     """Return the path with every segment between two points cut into n."""
     places = np.arange((len(path) - 1) * n + 1) / n
     return trajectories.interpolated(
@@ -503,7 +498,7 @@ def _alone(track: Track, domain: Domain, tol: float, state: Any) -> Track:
     if exact is not None:
         commands.append(exact)
     tracks = [_with_commands(track, q, domain, tol, state) for q in commands]
-    return max(tracks, key=score)
+    return max(tracks, key=attrgetter("score"))
 
 
 def _within_speeds(q: NDArray, track: Track, domain: Domain) -> NDArray | None:
@@ -539,24 +534,8 @@ def _with_commands(
     if loaded.play is not None:
         effective, _ = loaded.play.apply(q, state, _steps(track))
     x = loaded.tips(effective)
-    e, motion = map(torch.from_numpy, (track.target - x, effective))
-    status = statuses(
-        domain.solver().settings.task,
-        motion,
-        e,
-        tol,
-        known=torch.from_numpy(track.status != IKStatus.INVALID_INPUT),
-        held=torch.from_numpy(track.status == IKStatus.AT_LIMITS),
-        singular=torch.from_numpy(track.status == IKStatus.SINGULAR),
-    )
-    return replace(
-        track,
-        q=q,
-        effective=effective,
-        x=x,
-        error=e.norm(dim=-1).numpy(),
-        status=status.numpy(),
-    )
+    sent = replace(track, q=q, effective=effective, x=x)
+    return domain.solver().judged(sent, tol=tol)
 
 
 def _rounded(q: NDArray, counts: Counts, domain: Domain) -> NDArray:
@@ -574,7 +553,7 @@ def _state_after(lead_in: NDArray, track: Track, domain: Domain) -> Any:
     return play.apply(lead_in, None, _period(track))[1]
 
 
-def read_track(path: str | Path, log_format: LogFormat) -> Log:
+def read_track(path: str | Path, log_format: robots.LogFormat) -> Log:
     """Return commands and times of a file, or of the track in a folder.
 
     The tips of a track are its targets, and its groups are the statuses.
@@ -587,7 +566,8 @@ def read_track(path: str | Path, log_format: LogFormat) -> Log:
             f"`track` must be a file of commands, there is none at {file}."
         )
     columns = replace(log_format, groups=None)
-    first_line = "".join(TextFile.of(file).head()[:1])
+    with open(file, encoding="utf-8", errors="replace") as text:
+        first_line = text.readline().rstrip("\n")
     if {*TARGET} <= {*first_line.split(",")}:
         columns = log_format.of_tracks(TARGET)
     header = log_columns(file, header_line=columns.header_line, decimal=columns.decimal)
@@ -604,7 +584,7 @@ def _add_track(
     track: Track,
     commands: Mapping[str, NDArray],
     statuses: Sequence[str],
-    log: LogFormat,
+    log: robots.LogFormat,
     digits: int,
 ) -> None:
     """Add commands with so many digits, and with backlash what actuators do, point by point."""

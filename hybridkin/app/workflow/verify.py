@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridkin._core.arrays import as_array, number
-from hybridkin._core.commands import Commands
+from hybridkin import Commands, robots
 from hybridkin.app.checks.causes.alignment import Alignment
 from hybridkin.app.checks.causes.comparison import CauseComparison, compare_causes
 from hybridkin.app.checks.causes.evidence import Actuators, Evidence
@@ -22,10 +21,8 @@ from hybridkin.app.workflow.errors import Errors, ExpectedErrors
 from hybridkin.app.workflow.model import LoadedModel
 from hybridkin.app.workflow.report import Report, check_out, millimetres, percent
 from hybridkin.app.workflow.track import LEAD_IN, read_track
-from hybridkin.chains.chain import ActuatorLayout
-from hybridkin.chains.robots import LogFormat
+from hybridkin.arguments import check_tips, number
 from hybridkin.datasets import Log, load_log, log_columns
-from hybridkin.hybrid.other_units import check_tips
 
 _KEPT = 1.5  # largest mean error of a kept promise, relative to the promised one
 _OFF = 0.01  # least distance from the plane of the log, as a share of the range of the commands
@@ -370,12 +367,11 @@ def _evidence(
     order = np.argsort(rows, kind="stable")
     rows = rows[order]
     q = motion[rows]
-    bodies = [loaded.module]
-    layout = ActuatorLayout.independent(loaded.n_actuators)
+    robot = loaded.module
     if loaded.chain is not None:
-        robots = [loaded.chain, *loaded.chain.softer()]
-        bodies = [robot.tip_model for robot in robots]
-        layout = loaded.chain.actuator_layout
+        robot = loaded.chain
+    bodies = [body.tip_model for body in (robot, *robot.softer())]
+    layout = robot.actuator_layout
     off_plane = _off_plane(loaded, q)
     low = motion.min(axis=0)
     high = motion.max(axis=0)
@@ -400,7 +396,7 @@ def _evidence(
     )
 
 
-def _actuators(log: LogFormat, layout: ActuatorLayout) -> Actuators:
+def _actuators(log: robots.LogFormat, layout: robots.ActuatorLayout) -> Actuators:
     """Return the actuators with the words of a log."""
     n = len(layout.rest)
     unit = "" if log.q_unit == "1" else log.q_unit
@@ -423,13 +419,13 @@ def _off_plane(loaded: LoadedModel, q: NDArray) -> NDArray:
     """Return the part (N, n) of commands off the plane of the log, 0 if they keep to it."""
     if loaded.module.plane is None:
         return np.zeros_like(q)
-    point, normals = map(as_array, loaded.module.plane)
+    point, normals = (part.numpy(force=True) for part in loaded.module.plane)
     off = (q - point) @ normals @ normals.T
     return np.where(np.abs(off).max() > _OFF * np.ptp(q, axis=0).max(), off, 0.0)
 
 
 def read_tips(
-    path: str | Path, log_format: LogFormat, delimiter: str | None = None
+    path: str | Path, log_format: robots.LogFormat, delimiter: str | None = None
 ) -> Log:
     """Return the tips of a file of a camera, which holds none of the commands.
 

@@ -81,7 +81,7 @@ def test_a_model_with_a_guard_prefers_the_median_of_its_log_in_the_compiled_core
     np.testing.assert_allclose(domain.preferred, median, rtol=0, atol=1e-9)
     assert loaded.domain_distance(median[None])[0] <= 1.0
     ik = domain.solver()
-    np.testing.assert_allclose(ik.settings.posture, domain.preferred, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(ik.settings.posture.numbers, domain.preferred, rtol=0, atol=1e-8)
     assert ik.tracker(domain.preferred).backend == hybridkin.native.backend(loaded.module)
 
 

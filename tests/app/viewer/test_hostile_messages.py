@@ -163,7 +163,7 @@ def test_a_page_of_another_origin_is_closed_out_and_steers_nothing(shown):
     ],
 )
 def test_a_domain_that_leads_here_is_refused(host, may):
-    from hybridkin._core.page_server import _Gate
+    from hybridkin.plots.page_server import _Gate
 
     headers = websockets.Headers([("Host", host), ("Origin", f"http://{host}")])
     assert _Gate("127.0.0.1").may_connect(headers) == may

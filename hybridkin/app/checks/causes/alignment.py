@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridkin._core.rotations import nearest_turn
+from hybridkin.app.checks.rotations import nearest_turn
 
 
 class Alignment:

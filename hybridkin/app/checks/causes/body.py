@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Self
 
-from hybridkin._core.directions import Directions, moved_directions
+from hybridkin import Commands
 from hybridkin.app.checks.causes.cause import Cause, LinearCause
 from hybridkin.app.checks.causes.evidence import Evidence
 
@@ -172,7 +172,9 @@ class Misread(Cause):
 class ModelError(Cause):
     """The model itself is wrong: an error that is a smooth function of the motion."""
 
-    directions: Directions
+    mean: NDArray  # (n,)
+    scale: NDArray  # (n,)
+    moved: NDArray  # (n, k), the directions of q / scale that the motion moves
     quadratic: bool
 
     name = "the model"
@@ -183,11 +185,18 @@ class ModelError(Cause):
     @classmethod
     def members(cls, evidence: Evidence) -> Sequence[Self]:
         """Return the one cause of this kind, with products of the motion if there are many rows."""
-        directions = moved_directions(evidence.motion.q)
+        directions = Commands(evidence.motion.q).directions
         n_moved = directions.moved.shape[1]
         n_features = 1 + n_moved + n_moved * (n_moved + 1) // 2
         n_rows = len(evidence.motion.q)
-        return [cls(directions, n_rows >= _ROWS_PER_FEATURE * n_features)]
+        return [
+            cls(
+                directions.mean,
+                directions.scale,
+                directions.moved,
+                n_rows >= _ROWS_PER_FEATURE * n_features,
+            )
+        ]
 
     def starts(self, evidence: Evidence) -> Sequence[NDArray]:
         """Return no error."""
@@ -195,8 +204,7 @@ class ModelError(Cause):
 
     def _features(self, evidence: Evidence) -> NDArray:
         """Return 1, the moved directions of q and, if it is quadratic, their products."""
-        directions = self.directions
-        z = (evidence.q - directions.mean) / directions.scale @ directions.moved
+        z = (evidence.q - self.mean) / self.scale @ self.moved
         columns = [np.ones((len(z), 1)), z]
         if self.quadratic:
             first, second = np.triu_indices(z.shape[1])

@@ -12,11 +12,10 @@ import torch
 from numpy.typing import NDArray
 from typing_extensions import Self
 
-from hybridkin._core.model import ForwardModel
+from hybridkin import ForwardModel, robots
 from hybridkin.app.checks.causes.alignment import Alignment
 from hybridkin.app.checks.causes.motion import Motion
-from hybridkin.chains.chain import ActuatorLayout
-from hybridkin.native.library import evaluate
+from hybridkin.native import evaluate
 
 _ENDS = 0.05  # of the rows: nothing changes this near to an end
 _STEPS = 3  # largest steps of the residual that are tried
@@ -41,7 +40,7 @@ class Actuators(NamedTuple):
     names: Sequence[str]
     unit: str
     per_unit: NDArray
-    layout: ActuatorLayout
+    layout: robots.ActuatorLayout
 
     @property
     def rest(self) -> NDArray:

@@ -7,11 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from typing_extensions import Self
 
-from hybridkin._core.rotations import rigid_motion, rotation_vector
 from hybridkin.app.checks.causes.cause import (
     Cause,
     LinearCause,
@@ -19,6 +17,7 @@ from hybridkin.app.checks.causes.cause import (
     robust_weights,
 )
 from hybridkin.app.checks.causes.evidence import Evidence
+from hybridkin.app.checks.rotations import angle_of, rigid_motion
 
 _ROUNDS = 4  # of the weights of a rigid motion
 _UNITS = {
@@ -127,7 +126,7 @@ class MovedBase(Cause):
         weights = np.ones(len(x))
         motion = np.eye(4)
         for _ in range(_ROUNDS):
-            motion = rigid_motion(*map(torch.from_numpy, (tips, x, weights))).numpy()
+            motion = rigid_motion(tips, x, weights)
             far = distances(tips @ motion[:3, :3].T + motion[:3, 3], x)
             weights = robust_weights(far)
         return motion[:3].ravel()
@@ -142,11 +141,11 @@ class MovedBase(Cause):
     def amount(self, evidence: Evidence, parameters: NDArray) -> str:
         """Return the angle, and how far the middle of the tips moves, in words."""
         motion = parameters.reshape(3, 4)
-        turn = rotation_vector(torch.from_numpy(motion[None, :, :3].copy())).numpy()[0]
+        turn = angle_of(motion[:, :3])
         middle = evidence.tips.mean(axis=0)
         shift = motion[:, :3] @ middle + motion[:, 3] - middle
         return (
-            f"turned by {np.degrees(np.linalg.norm(turn)):.3g} degrees, the tips moved by "
+            f"turned by {np.degrees(turn):.3g} degrees, the tips moved by "
             f"{1e3 * np.linalg.norm(shift):.3g} mm"
         )
 

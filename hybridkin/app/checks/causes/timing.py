@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Self
 
+from hybridkin import CreepOperator, PlayOperator
 from hybridkin.app.checks.causes.cause import Cause
 from hybridkin.app.checks.causes.commands import ActuatorCause
 from hybridkin.app.checks.causes.evidence import Evidence
 from hybridkin.app.checks.causes.motion import Motion
-from hybridkin.chains.creep import CreepOperator
-from hybridkin.chains.play import PlayOperator
 
 _PERIODS = 63  # at most, as in a control loop
 _MOST = 0.25  # of the duration: else the ends of the motion decide

@@ -6,35 +6,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridkin._core.units import other_unit
-from hybridkin.hybrid._range import TrainingRange
-from hybridkin.hybrid._rows import Rows
 
 _LARGER = 20.0  # times the fit; smaller ratios can be other motions
 _SMALLER = 0.01
 _POSTURES = 0.05  # span of predicted tips over their largest distance that tells a unit
 
 
-def check_commands(rows: Rows, seen: TrainingRange, turns: bool) -> None:
+def check_commands(q: NDArray, low: NDArray, high: NDArray, turns: bool) -> None:
     """Raise if actuator vectors are those of the fit in another unit.
 
     Parameters
     ----------
-    rows : Rows
+    q : ndarray of shape (N, n)
         New rows.
-    seen : TrainingRange
+    low, high : ndarray of shape (n,)
         The range of q in the fit.
     turns : bool
         Whether all actuators are angles.
     """
-    usual = np.maximum(np.abs(seen.low), np.abs(seen.high))
+    usual = np.maximum(np.abs(low), np.abs(high))
     # Small numbers are another unit only for lengths that are never near zero.
-    lengths = (
-        np.minimum(seen.low * np.sign(seen.high), seen.high * np.sign(seen.low)) > 0.0
-    )
+    lengths = np.minimum(low * np.sign(high), high * np.sign(low)) > 0.0
     moved = usual > 0.0
-    if not len(rows) or not moved.any():
+    if not len(q) or not moved.any():
         return
-    largest = (np.abs(rows.X)[:, moved] / usual[moved]).max(axis=1)
+    largest = (np.abs(q)[:, moved] / usual[moved]).max(axis=1)
     ratio = float(np.median(largest))
     small = ratio < _SMALLER and lengths.all()
     if not small and ratio < _LARGER:

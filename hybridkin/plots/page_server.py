@@ -17,6 +17,8 @@ from contextlib import redirect_stdout
 from typing import Any
 from urllib.parse import urlsplit
 
+__all__ = ["page_server", "stop"]
+
 _FARTHEST = 1e9  # of a coordinate; no page sends more
 _REFUSED = 1008  # code of a closed connection: policy violation
 _Message = Mapping[str, Any]

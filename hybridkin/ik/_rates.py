@@ -1,0 +1,54 @@
+"""Rates of the law of a step: of the feedback of the error, and of the posture."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from hybridkin._core.arrays import number
+
+
+class Rate(NamedTuple):
+    """A rate of decay [1/s]: the fraction that one period removes is at most 1."""
+
+    name: str
+    per_second: float
+    given: bool = True  # a rate that nobody gave follows the period
+
+    @classmethod
+    def of(cls, value: object, name: str, usual: float) -> Rate:
+        """Return the rate that an argument gives; None gives the usual one."""
+        if value is None:
+            return cls(name, usual, given=False)
+        return cls(name, number(value, name))
+
+    def fraction(self, seconds: float) -> float:
+        """Return the fraction that a period removes."""
+        fraction = self.per_second * seconds
+        if self.given and not fraction <= 1.0 + 1e-9:
+            raise ValueError(
+                f"`{self.name}` times the period must be at most 1, got "
+                f"{self.per_second:.6g} 1/s x {seconds:.6g} s; use a {self.name} up to "
+                f"{1.0 / seconds:.4g} 1/s or a shorter period."
+            )
+        return min(fraction, 1.0)
+
+    def __repr__(self) -> str:
+        """Return the argument that gives this rate."""
+        return repr(self.per_second) if self.given else "None"
+
+
+def gain_of(value: object) -> Rate:
+    """Return the feedback gain; without one the whole error is removed in one period."""
+    gain = Rate.of(value, "gain", math.inf)
+    if not gain.per_second > 0.0:
+        raise ValueError(f"`gain` must be positive [1/s], got {gain.per_second!r}.")
+    return gain
+
+
+def beta_of(value: object) -> Rate:
+    """Return the rate of the posture; without one it is 1 per second."""
+    beta = Rate.of(value, "beta", 1.0)
+    if not beta.per_second >= 0.0:
+        raise ValueError(f"`beta` must not be negative [1/s], got {beta.per_second!r}.")
+    return beta
