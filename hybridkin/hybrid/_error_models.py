@@ -96,6 +96,10 @@ class PerMarker(ErrorModel):
     def __init__(self, models: Sequence[ErrorModel]) -> None:
         self.models = tuple(models)
 
+    def without_errors(self) -> ErrorModel:
+        """Return these models for fits of which only the predictions count."""
+        return PerMarker([model.without_errors() for model in self.models])
+
     def fit(self, rows: Rows, spec: Spec) -> FittedError:
         """Return every error model fitted to its marker."""
         fits = []
@@ -213,7 +217,7 @@ class FeatureModel(TipModel):
                 self.coupling,
                 self.alphas,
                 self.noise_ratio,
-                spec.held_out,
+                self.tells_errors,
                 self.near,
                 self.start,
             )
@@ -227,6 +231,7 @@ class FeatureModel(TipModel):
         else:
             correction = TipCorrection(module)
         settled = copy.copy(self)
+        settled.tells_errors = True
         settled.alphas = fit.alphas
         settled.noise_ratio = fit.noise_ratio
         settled.near = False
@@ -345,7 +350,7 @@ class RegressorModel(TipModel, Generic[_Regressor]):
         regressor = self._fitted(rows)
         module = error_module(cast(Regressor, regressor), rows.q)
         noise = nan
-        if spec.held_out:
+        if self.tells_errors:
             noise = self._noise(regressor, module, rows)
         correction = TipCorrection(_on_moved_directions(module, directions))
         return FittedError(
@@ -486,6 +491,10 @@ class Blend(ErrorModel):
     def __init__(self, weights: Sequence[float], models: Sequence[ErrorModel]) -> None:
         self.weights = tuple(weights)
         self.models = tuple(models)
+
+    def without_errors(self) -> ErrorModel:
+        """Return these models for fits of which only the predictions count."""
+        return Blend(self.weights, [model.without_errors() for model in self.models])
 
     def fit(self, rows: Rows, spec: Spec) -> FittedError:
         """Return all models fitted to the same rows."""

@@ -81,7 +81,7 @@ def _module(rows: Rows, spec: Spec, weighted: Weighted) -> HybridModule | WithPo
     tested = plane = None
     if spec.error_model.learns or not directions.moved.size:
         # Backlash moves actuators off the plane of their commands, but only by its width.
-        plane = Plane.of_log(spec.mechanical, rows.q, spec.commanded or directions)
+        plane = Plane.of_log(spec.mechanical, rows.q, rows.commanded or directions)
         groups = None
         if guarded:
             groups = rows.groups

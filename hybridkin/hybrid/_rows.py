@@ -32,6 +32,7 @@ class Rows:
     place: NDArray | None = None
     # Shaped like y: measured minus mechanical model [m], in a fit
     residual: NDArray | None = None
+    commanded: Directions | None = None  # of the commands, with hysteresis before X
 
     def __len__(self) -> int:
         return len(self.X)

@@ -133,13 +133,29 @@ class Candidates(ErrorModel):
     ----------
     models : dict of str to ErrorModel
         The candidates by name.
+    refined : Refinement
+        How the mechanical model is refined below all of them.
     """
 
     chooses = True
     needs_mechanical = False
 
-    def __init__(self, models: dict[str, ErrorModel]) -> None:
+    def __init__(self, models: dict[str, ErrorModel], refined: Refinement) -> None:
         self.models = models
+        self.refined = refined
+
+    def refinement(
+        self, spec: Spec, geometry: GeometryChoice, rows: Rows
+    ) -> Refinement:
+        """Return the refinement that was chosen with the candidates."""
+        return self.refined
+
+    def without_errors(self) -> ErrorModel:
+        """Return the candidates for fits of which only the predictions count."""
+        models = {name: model.without_errors() for name, model in self.models.items()}
+        candidates = Candidates(models, self.refined)
+        candidates.tells_errors = False
+        return candidates
 
     def fit(self, rows: Rows, spec: Spec) -> FittedError:
         """Return the fits of all candidates."""
@@ -168,7 +184,7 @@ def _side_by_side(
         near[name] = model.starting_at(error.settled)
     return replace(
         fits[next(iter(fits))].error,
-        settled=Candidates(near),
+        settled=Candidates(near, spec.refinement),
         refined=_errors_of_structure(spec),
         candidates=fits,
     )
@@ -194,11 +210,10 @@ class Settled(NamedTuple):
     @classmethod
     def of(cls, fitted: FittedHybrid, rows: Rows) -> Settled:
         """Return the candidates of a fit to rows, or the one model that it has."""
-        models = {"model": fitted.error.settled}
-        if fitted.error.candidates:
-            models = {}
-            for name, fit in fitted.error.candidates.items():
-                models[name] = fit.error.settled
+        fits = fitted.error.candidates or {"model": fitted}
+        models = {}
+        for name, fit in fits.items():
+            models[name] = fit.error.settled.without_errors()
         return cls(fitted.spec, rows, models)
 
     def part(self, train: NDArray) -> tuple[Spec, Rows]:
@@ -281,7 +296,7 @@ def expected_with_new_choices(
     settled = Settled.of(fitted, rows)
     near = fitted.error.settled
     assert isinstance(near, Candidates)
-    model = blend_of(near.models.values(), weights)
+    model = blend_of(near.models.values(), weights).without_errors()
     tips = np.tensordot(weights, table.tips, 1)
     before = 0.0
     after = 0.0

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from math import nan
 from typing import NamedTuple, cast
@@ -15,8 +16,8 @@ from torch import Tensor
 from typing_extensions import Self
 
 from hybridkin._core.arrays import countable
-from hybridkin._core.directions import Directions
 from hybridkin._core.model import ForwardModel
+from hybridkin.calibration._search import Start
 from hybridkin.calibration.calibrate import CalibrationResult, fit_geometry, refitted
 from hybridkin.calibration.choice import GeometryChoice, choose_geometry
 from hybridkin.chains.chain import Chain
@@ -30,6 +31,7 @@ from hybridkin.hybrid.cv_results import CvResults
 from hybridkin.hybrid.held_out import MEAN_LENGTH
 from hybridkin.hybrid.structure_fit import StructureFit
 
+Starts = tuple[Start | None, ...]
 Seed = int | np.random.RandomState | None
 Play = ArrayLike | HysteresisOperator | str | None
 Weighted = list[tuple[float, TipCorrection]]  # weights and corrections, without guards
@@ -43,6 +45,7 @@ class ErrorModel(ABC):
     couplings: tuple[str, ...] = ("parallel", "serial")
     for_poses = False  # whether it learns the six numbers of a pose
     needs_mechanical = True
+    tells_errors = True  # whether a fit computes errors of held-out rows
 
     @classmethod
     def of(cls, coupling: str, random_state: Seed) -> Self:
@@ -52,6 +55,12 @@ class ErrorModel(ABC):
     def starting_at(self, settled: ErrorModel) -> ErrorModel:
         """Return this model for other rows; its choice may start at the settled settings."""
         return self
+
+    def without_errors(self) -> ErrorModel:
+        """Return this model for fits of which only the predictions count."""
+        model = copy.copy(self)
+        model.tells_errors = False
+        return model
 
     def refinement(
         self, spec: Spec, geometry: GeometryChoice, rows: Rows
@@ -68,7 +77,7 @@ class ErrorModel(ABC):
         rows : Rows
             Different rows, with the residuals of the mechanical model.
         spec : Spec
-            The calibrated mechanical model, and whether errors of held-out rows are needed.
+            The calibrated mechanical model.
         """
 
 
@@ -146,14 +155,6 @@ class Refinement:
 UNREFINED = Refinement()
 
 
-class FitStart(NamedTuple):
-    """Where the choices of a fit to a part of a log start: those of the fit to the whole log."""
-
-    error_model: ErrorModel
-    geometry: GeometryChoice | None
-    refinement: Refinement = UNREFINED
-
-
 @dataclass(frozen=True)
 class Spec:
     """Specification of a fit: the resolved settings of a HybridForwardModel."""
@@ -165,34 +166,29 @@ class Spec:
     output: str = "position"
     play: Play = None
     coverage: float | None = None
-    near: GeometryChoice | None = (
-        None  # that of the whole log, where that choice starts
-    )
+    starts: Starts = ()  # of the choice of what to calibrate
     geometry: GeometryChoice | None = None  # how `calibrate` was chosen
-    refinement: Refinement = (
-        UNREFINED  # of the calibrated model, before its residual is learned
-    )
+    # Of the calibrated model, before its residual is learned.
+    refinement: Refinement = UNREFINED
     calibration: CalibrationResult | None = None  # how `mechanical` was calibrated
     messages: tuple[str, ...] = ()  # warnings of that choice and calibration
-    held_out: bool = True  # whether errors of held-out rows are computed
-    compared: bool = False  # whether a comparison will give the error to expect
-    # Of the commands, with backlash between them and the rows.
-    commanded: Directions | None = None
-    progress: Callable[[int, int], None] | None = None  # gets (done, total)
 
-    def starting_at(self, start: FitStart) -> Spec:
+    def without_errors(self) -> Spec:
+        """Return the specification of fits of which only the predictions count."""
+        return replace(self, error_model=self.error_model.without_errors())
+
+    def starting_at(self, settled: ErrorModel, starts: Starts) -> Spec:
         """Return the specification of a fit to a part of a log, with starts of its choices.
 
-        Errors on held-out rows that predictions do not need are then not computed. "auto" fits only
-        its candidates.
+        Parameters
+        ----------
+        settled : ErrorModel
+            The error model with its choices for the whole log.
+        starts : tuple of Start or None
+            Where the choice of what to calibrate starts.
         """
-        return replace(
-            self,
-            error_model=self.error_model.starting_at(start.error_model),
-            near=start.geometry,
-            refinement=start.refinement,
-            held_out=False,
-        )
+        error_model = self.error_model.starting_at(settled).without_errors()
+        return replace(self, error_model=error_model, starts=starts)
 
     def with_geometry_chosen(self, rows: Rows) -> Spec:
         """Return the specification with the parameters to calibrate, chosen on the rows or given.
@@ -212,11 +208,9 @@ class Spec:
                 weights=rows.weights,
                 outside=self.error_model.learns,
                 parameters=None if automatic else self.calibrate,
-                starts=() if self.near is None else self.near.starts,
+                starts=self.starts,
             )
-        refinement = self.refinement
-        if self.near is None:
-            refinement = self.error_model.refinement(self, geometry, rows)
+        refinement = self.error_model.refinement(self, geometry, rows)
         geometry = geometry.smaller(refinement.geometry)
         return replace(
             self,
@@ -234,7 +228,7 @@ class Spec:
             spec = self.with_geometry_chosen(rows)
         if not spec.calibrate:
             return spec
-        if spec.geometry is not None and not spec.held_out:
+        if spec.geometry is not None and not spec.error_model.tells_errors:
             return replace(spec.recalibrated(rows), calibrate=())
         result, messages = fit_geometry(
             cast(Chain, spec.mechanical),
@@ -256,7 +250,7 @@ class Spec:
 
     def recalibrated(self, rows: Rows) -> Spec:
         """Return the specification calibrated to other rows, without errors of held-out rows."""
-        spec = replace(self, held_out=False)
+        spec = self
         if self.geometry is not None and self.geometry.start is not None:
             counts = torch.from_numpy(rows.counts)
             start = self.geometry.start

@@ -16,7 +16,7 @@ from hybridkin._core.turns import one_thread
 from hybridkin.calibration.measured import folds as folds_of_rows
 from hybridkin.datasets.logs import Log
 from hybridkin.hybrid._rows import Rows
-from hybridkin.hybrid._spec import FitStart, Spec
+from hybridkin.hybrid._spec import ErrorModel, Spec, Starts
 from hybridkin.hybrid.estimator import HybridForwardModel
 from hybridkin.hybrid.held_out import CrossFit, Predictions, Split
 from hybridkin.hybrid.log_fit import Anew, FitOnce, fit_once
@@ -107,7 +107,9 @@ def cross_fit(
     if choices == "settled":
         held_out = partial(_held_out_settled, fits)
     else:
-        starts = {name: fit.start for name, fit in fits.items()}
+        starts = {}
+        for name, fit in fits.items():
+            starts[name] = (fit.fitted.error.settled, fit.starts)
         of_fold = models_for or partial(_unchanged, models)
         held_out = partial(_held_out_anew, of_fold, weighted, starts)
     measured = weighted.measured
@@ -191,7 +193,7 @@ def _unchanged(models: Models, rows: Log) -> Models:
 def _held_out_anew(
     models_for: Callable[[Any], Models],
     weighted: _WeightedLog,
-    starts: Mapping[str, FitStart],
+    starts: Mapping[str, tuple[ErrorModel, Starts]],
     train: NDArray,
     test: NDArray,
 ) -> dict[str, Predictions]:
@@ -200,7 +202,7 @@ def _held_out_anew(
     held_out = {}
     for name, model in models_for(training_log).items():
         spec, rows = weighted.prepared(model)
-        anew = Anew(spec.starting_at(starts[name]), rows)
+        anew = Anew(spec.starting_at(*starts[name]), rows)
         held_out[name] = anew.held_out(train, test)
     return held_out
 

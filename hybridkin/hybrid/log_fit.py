@@ -30,12 +30,10 @@ from hybridkin.hybrid._selection import (
     expected_with_new_choices,
 )
 from hybridkin.hybrid._spec import (
-    UNREFINED,
-    FitStart,
     FittedError,
     FittedHybrid,
-    Refinement,
     Spec,
+    Starts,
 )
 from hybridkin.hybrid._worse import worse_than_mechanical
 from hybridkin.hybrid.cv_results import CvResults
@@ -72,8 +70,6 @@ class HybridFit:
         The attributes of the model.
     geometry : GeometryChoice or None
         How the parameters to calibrate were chosen.
-    refinement : Refinement
-        What was learned of the calibrated model before its residual.
     messages : tuple of str
         Warnings, which were not issued.
     """
@@ -87,7 +83,6 @@ class HybridFit:
     no_drift: Drift
     calibration: CalibrationResult | None = None
     geometry: GeometryChoice | None = None
-    refinement: Refinement = UNREFINED
     play: HysteresisOperator | None = None
     state_range: TrainingRange | None = None
     pace: PaceRange | None = None
@@ -130,10 +125,11 @@ class FitOnce:
     radius: Radius | None = None
 
     @property
-    def start(self) -> FitStart:
-        """Where the choices of fits to parts of the log start."""
-        settled = self.fitted.error.settled
-        return FitStart(settled, self.spec.geometry, self.spec.refinement)
+    def starts(self) -> Starts:
+        """Where the choice of what to calibrate starts in parts of the log."""
+        if self.spec.geometry is None:
+            return ()
+        return self.spec.geometry.starts
 
     def effective(self, log: Rows) -> Tensor:
         """Return what the actuators do at the rows of a log (N, n)."""
@@ -207,7 +203,6 @@ class FitOnce:
             no_drift=Drift.of_range(rows.q, rows.tips.shape[1]),
             calibration=fitted.spec.calibration,
             geometry=self.spec.geometry,
-            refinement=self.spec.refinement,
             play=play,
             state_range=states,
             pace=pace,
@@ -223,8 +218,8 @@ def fit_once(spec: Spec, log: Rows) -> FitOnce:
     play, messages = play_of(chosen, log.in_runs())
     rows = commands
     if play is not None:
-        chosen = replace(chosen, commanded=commands.directions)
         rows = log.effective(play).distinct()
+        rows = replace(rows, commanded=commands.directions)
     return FitOnce(chosen, log, rows, play, fit_hybrid(chosen, rows), messages)
 
 
@@ -286,8 +281,8 @@ def _table_anew(spec: Spec, fit: FitOnce) -> CrossFit:
         fit = replace(fit, log=fit.log.distinct())
     log = fit.log
     if fit.fitted.error.candidates:
-        spec = spec.starting_at(fit.start)
-    anew = Anew(replace(spec, held_out=False), log)
+        spec = spec.starting_at(fit.fitted.error.settled, fit.starts)
+    anew = Anew(spec.without_errors(), log)
     measured = log.take(log.counted)
     splits = folds(measured.X, measured.groups)
     held_out = starmap(anew.held_out, splits)

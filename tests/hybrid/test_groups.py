@@ -18,7 +18,7 @@ from hybridkin.hybrid._error_models import (
 from hybridkin.hybrid._fit import fit_hybrid
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._selection import Auto
-from hybridkin.hybrid._spec import FitStart, Spec
+from hybridkin.hybrid._spec import Spec
 from hybridkin.hybrid.held_out import chosen_blend
 
 CHAIN = ConstantCurvatureChain([0.05])
@@ -80,7 +80,7 @@ def test_the_candidates_of_auto_hold_out_motions(part):
     fits = [fit_hybrid(spec, Rows(q, x, groups=groups)) for groups in (None, motions)]
     assert fits[1].error.comparison["chosen"] == "mechanical"
     if part:  # with a start that suits the noise
-        near = spec.starting_at(FitStart(fits[0].error.settled, None))
+        near = spec.starting_at(fits[0].error.settled, ())
         fits[1] = fit_hybrid(near, Rows(q, x, groups=motions))
     corrections = []
     for fitted in fits:

@@ -57,7 +57,8 @@ def test_a_held_out_motion_does_not_change_its_own_predictions(settings):
     x[held_out] += [0.3, -0.2, 0.5]
     starts = {}
     for name, model in models_of(robot, mechanical, settings).items():
-        starts[name] = fit_once(*_WeightedLog(rows, rows.counts).prepared(model)).start
+        fit = fit_once(*_WeightedLog(rows, rows.counts).prepared(model))
+        starts[name] = (fit.fitted.error.settled, fit.starts)
     of_fold = partial(_models_for, robot, settings, mechanical)
     found = []
     for log in (rows, replace(rows, x=x)):
@@ -92,7 +93,7 @@ def test_a_fit_near_another_one_chooses_as_from_nothing():
         model = HybridForwardModel(robot.chain, error_model, coupling="serial")
         spec, log = model.prepared(rows.q, rows.x, groups=rows.motions)
         fitted = fit_once(spec, log)
-        near = fit_once(spec.starting_at(fitted.start), log)
+        near = fit_once(spec.starting_at(fitted.fitted.error.settled, ()), log)
         assert near.fitted.error.result.alphas == fitted.fitted.error.result.alphas
         x = fitted.fitted.predict(rows.q)
         assert_allclose(near.fitted.predict(rows.q), x, rtol=0.0, atol=1e-7)
