@@ -28,7 +28,7 @@ from hybridkin.hybrid._error_models import NoCorrection, RegressorModel
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._selection import Auto
 from hybridkin.hybrid._spec import UNREFINED, Spec
-from hybridkin.hybrid.held_out import HeldOut, Predictions, chosen_blend
+from hybridkin.hybrid.held_out import CrossFit, Outer, Predictions
 from hybridkin.hybrid.log_fit import fit_to_log
 
 SERIAL = ("elm", "linear", "quadratic", "pose", "network")
@@ -214,18 +214,12 @@ def test_the_selection_compares_weighted_fits_without_the_rows_that_it_predicts(
         splits = [*GroupKFold(6, shuffle=True, random_state=0).split(q, groups=motions)]
     else:
         splits = [*KFold(10, shuffle=True, random_state=0).split(q)]
-    held_out = np.empty((3, *x.shape))
-    fold = np.empty(len(q), dtype=int)
-    for k, (train, test) in enumerate(splits):
-        held_out[:, test] = predicted(train, test)
-        fold[test] = k
     inner, outer = inner_and_outer(q)
-    both = HeldOut.of(
-        Predictions(held_out, x, weights, groups),
-        Predictions(predicted(inner, outer), x[outer], weights[outer], None),
-        np.append(fold, fold[outer]),
-    )
-    shares, expected = chosen_blend(results["candidate"][:-1], both)
+    inside = np.ones((3, 1), dtype=bool)
+    held_out = [Predictions(predicted(*split), inside) for split in splits]
+    beyond = Outer(predicted(inner, outer), x[outer], weights[outer], outer)
+    both = CrossFit.of(results["candidate"][:-1], rows, splits, held_out, beyond)
+    shares, expected = both.weights, both.results()
     # Calibrations of a comparison end at 1e-5 of its errors; a pick, 0.1, may be close.
     assert_allclose([*results["weights"].values()], shares, atol=0.11)
     for name in ("mean_distance", "std_distance", "io_distance"):
