@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from hybridkin._core.arrays import as_array, give_back
+from hybridkin._core.progress import quiet
 from hybridkin.ik._feedback import Feedback
 from hybridkin.ik._settings import StepSettings
 from hybridkin.ik.results import Track, statuses
@@ -35,7 +36,7 @@ class Loop:
     plant: Plant | None = None
     feedback: str | None = "model"
     readings: Feedback = field(default_factory=Feedback)
-    progress: Callable[[int, int], None] | None = None
+    progress: Callable[[int, int], None] = quiet
 
 
 def followed(

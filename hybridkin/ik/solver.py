@@ -26,6 +26,7 @@ from hybridkin._core.arrays import (
     whole,
 )
 from hybridkin._core.html import html_table
+from hybridkin._core.progress import quiet
 from hybridkin.ik._compiled import Core, core_of
 from hybridkin.ik._feedback import MOST_PERIODS, Feedback
 from hybridkin.ik._gram import row_gram
@@ -549,7 +550,7 @@ class InverseKinematics:
         delay: float = 0.0,
         memory: float = math.inf,
         tol: float | None = None,
-        progress: Callable[[int, int], None] | None = None,
+        progress: Callable[[int, int], None] = quiet,
         state: Any = None,
     ) -> Track:
         """Return the motion that follows a path, one step per point, eq. (1).
@@ -647,7 +648,7 @@ class InverseKinematics:
         require(state is None, "`state` requires `q0` of shape (n,), one start.")
         # The start is chosen on the model alone: the robot moves once.
         alone = plant is None and feedback == "model"
-        on_model = Loop(progress=progress if alone else None)
+        on_model = Loop(progress=progress if alone else quiet)
         tracks: list[Track] = []
         for start in self._starts(target[:1], starts, timed.as_numpy):
             tracks.append(followed(settings, start, timed, on_model))

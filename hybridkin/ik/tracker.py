@@ -367,7 +367,7 @@ class Tracker(Portable):
         periods: list[float],
         plant: Plant | None,
         feedback: str | None,
-        progress: Callable[[int, int], None] | None,
+        progress: Callable[[int, int], None],
     ) -> list[Tensor]:
         """Return columns with a row for every point of the path (T, ...).
 
@@ -385,8 +385,7 @@ class Tracker(Portable):
         held = damped = torch.zeros(1, dtype=torch.bool, device=targets.device)
         rows = []
         for i, target in enumerate(targets.split(1)):
-            if progress is not None:
-                progress(i, n)
+            progress(i, n)
             tip = None
             if plant is not None:
                 tip = self._measured(plant, i)

@@ -27,20 +27,14 @@ def shaped(
     return arrays.shaped(plain(value, name), name, need, length)
 
 
-def shaped_or_none(
+def shaped_or_empty(
     value: object, name: str, need: Sequence[int | str], length: int | None = None
-) -> NDArray[np.float64] | None:
-    """Return `shaped` numbers, or None for None."""
+) -> NDArray[np.float64]:
+    """Return `shaped` numbers; for None an array without rows."""
     if value is None:
-        return None
+        others = [int(axis) if str(axis).isdigit() else 0 for axis in need[1:]]
+        return np.empty((0, *others))
     return shaped(value, name, need, length)
-
-
-def scaled(scale: float, values: NDArray | None) -> NDArray | None:
-    """Return values in another unit, or None for None."""
-    if values is None:
-        return None
-    return scale * values
 
 
 def times(value: ArrayLike | None, n_rows: int) -> NDArray | None:

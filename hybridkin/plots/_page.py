@@ -23,7 +23,7 @@ _DOT = 0.016  # size of a marker
 def page(
     scene: Scene,
     fps: float,
-    progress: Callable[[int, int], None] | None,
+    progress: Callable[[int, int], None],
 ) -> str:
     """Return the page as HTML that needs no other file."""
     try:
@@ -43,7 +43,7 @@ def _recorded(
     server: Any,
     scene: Scene,
     fps: float,
-    progress: Callable[[int, int], None] | None,
+    progress: Callable[[int, int], None],
 ) -> str:
     """Draw all frames on a server that nobody looks at, and return what it recorded."""
     longest = float((scene.high - scene.low).max())
@@ -53,7 +53,7 @@ def _recorded(
     server.initial_camera.position = middle + _EYE
     server.scene.add_frame("/base", axes_length=0.15, axes_radius=0.004)
     paths = [Line("path reached", scene.x[None], COLORS[0], 1.0)]
-    if scene.target is not None:
+    if len(scene.target):
         paths.append(Line("target", scene.target[None], "black", 1.0))
     for line in paths:
         _Stroke(server.scene, line.label, line, longest).show(0)
@@ -70,8 +70,7 @@ def _recorded(
             for stroke in strokes:
                 stroke.show(k)
         recording.insert_sleep(1.0 / fps)
-        if progress is not None:
-            progress(k + 1, len(scene.rows))
+        progress(k + 1, len(scene.rows))
     return recording.as_html()
 
 

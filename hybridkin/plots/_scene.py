@@ -40,8 +40,8 @@ class Scene(NamedTuple):
     low: NDArray  # (3,) corners of the box around all points
     high: NDArray
     x: NDArray  # (T, 3) path reached
-    target: NDArray | None  # (T, 3)
-    error: NDArray | None  # (T,)
+    target: NDArray  # (T, 3), or (0, 3)
+    error: NDArray  # (T,), or (0,)
     error_name: str
     steps: NDArray  # (T,) of the time axis
     when: str  # name of the time axis
@@ -59,7 +59,7 @@ class Stage:
         xlim, ylim, zlim = np.stack([scene.low, scene.high], axis=1)
         ax.set(xlim=xlim, ylim=ylim, zlim=zlim)
         label_space(ax, scene.unit)
-        if scene.target is not None:
+        if len(scene.target):
             ax.plot(*scene.target.T, color="black", linewidth=1.0, label="target")
         trail = ax.plot([], [], [], color=COLORS[0], linewidth=1.2, linestyle="--")
         self.trail = trail[0]
@@ -71,7 +71,7 @@ class Stage:
             self.artists += artists
         small_legend(ax, loc="upper left", bbox_to_anchor=(-0.25, 1.0))
         self.cursor = None
-        if error_ax is not None and scene.error is not None:
+        if error_ax is not None and len(scene.error):
             error_ax.plot(scene.steps, scene.error, color=COLORS[0], linewidth=1.5)
             error_ax.set(xlabel=scene.when, ylabel=scene.error_name)
             error_ax.set_ylim(bottom=0.0)
@@ -86,7 +86,7 @@ class Stage:
         for artist, line in zip(self.artists, scene.moving, strict=True):
             artist.set_data_3d(*line.points[k].T)
         self.title_ax.set_title(scene.captions[k], fontsize="medium")
-        if self.cursor is not None and scene.error is not None:
+        if self.cursor is not None:
             line, dot = self.cursor
             line.set_xdata(np.repeat(scene.steps[row], 2))
             dot.set_data([scene.steps[row]], [scene.error[row]])

@@ -16,12 +16,12 @@ from typing_extensions import Self
 
 from hybridkin._core.arrays import whole
 from hybridkin._core.files import MARK, write_file
+from hybridkin._core.progress import quiet
 from hybridkin.plots._arrays import (
     distance,
     plain,
-    scaled,
     shaped,
-    shaped_or_none,
+    shaped_or_empty,
     times,
 )
 from hybridkin.plots._canvas import (
@@ -66,9 +66,9 @@ class TrackAnimation(Display):
     Attributes
     ----------
     x, target : ndarray of shape (T, 3)
-        Tips reached and targets [m]; `target` may be None.
-    error : ndarray of shape (T,) or None
-        Error that is shown, expected or the distance from the target [m].
+        Tips reached and targets [m]; without a target `target` has no rows.
+    error : ndarray of shape (T,)
+        Error that is shown, expected or the distance from the target [m]; empty without both.
     rows : ndarray of shape (K,)
         Rows that are frames.
     fps : float
@@ -105,12 +105,12 @@ class TrackAnimation(Display):
     ) -> None:
         self.x = shaped(x, "x", "T3")
         T = len(self.x)
-        self.target = shaped_or_none(target, "target", "T3", T)
-        self.error = shaped_or_none(expected, "expected", "T", T)
+        self.target = shaped_or_empty(target, "target", "T3", T)
+        self.error = shaped_or_empty(expected, "expected", "T", T)
         self.error_name = "expected error"
-        if self.error is None:
+        if not len(self.error):
             self.error_name = "error"
-            if self.target is not None:
+            if len(self.target):
                 self.error = distance(self.x, self.target)
         self.t = times(t, T)
         shown = shaped(np.arange(T) if rows is None else rows, "rows", "K")
@@ -176,9 +176,10 @@ class TrackAnimation(Display):
         if q.ndim != 2 or len(q) == 0:
             raise ValueError(f"`q` must have shape (T, n) with T >= 1, got {q.shape}.")
         rows = _evenly(times(t, len(q)), len(q), n_frames)
-        ends = shaped_or_none(tips, "tips", "T3", len(q))
-        if ends is not None:
-            ends = ends[rows]
+        ends = None
+        if tips is not None:
+            tips = shaped(tips, "tips", "T3", len(q))
+            ends = tips[rows]
         body = BackboneDisplay.from_estimator(model, q[rows], tips=ends, names=names)
         name = "tip (measured)"
         if x is None:
@@ -232,7 +233,7 @@ class TrackAnimation(Display):
         unit: str = "cm",
         speed: float = 1.0,
         dpi: float | None = None,
-        progress: Callable[[int, int], None] | None = None,
+        progress: Callable[[int, int], None] = quiet,
     ) -> Path:
         """Write a film or a page, and return where.
 
@@ -290,8 +291,7 @@ class TrackAnimation(Display):
                 for k in range(len(self.rows)):
                     stage.show(k)
                     writer.grab_frame()
-                    if progress is not None:
-                        progress(k + 1, len(self.rows))
+                    progress(k + 1, len(self.rows))
             if kind == ".gif":
                 _mark(staging)
 
@@ -307,7 +307,7 @@ class TrackAnimation(Display):
         lines = []
         if self.body is not None:
             lines += self.body.lines(tip=False)
-        if self.target is not None:
+        if len(self.target):
             way = np.stack([self.target[self.rows], x], axis=1)
             lines.append(Line("tip error", way, "black", 2.0))
             lines.append(Line("", way[:, :1], "black", 1.0, marker="x", style="none"))
@@ -317,7 +317,7 @@ class TrackAnimation(Display):
     def limits(self) -> tuple[NDArray, NDArray]:
         """Return the corners (3,) of a box around all points, with a margin [m]."""
         parts = [self.x, *(line.points.reshape(-1, 3) for line in self.lines())]
-        if self.target is not None:
+        if len(self.target):
             parts.append(self.target)
         everything = np.concatenate(parts)
         finite = everything[np.isfinite(everything).all(axis=1)]
@@ -335,8 +335,8 @@ class TrackAnimation(Display):
             when = f"step {row}"
         else:
             when = f"t = {self.t[row]:.2f} s"
-        error = scaled(scale_of(unit), self.error)
-        if error is None:
+        error = scale_of(unit) * self.error
+        if not len(error):
             return when
         if not np.isfinite(error[row]):
             return f"{when}, {self.error_name} not known"
@@ -351,8 +351,8 @@ class TrackAnimation(Display):
             low=scale * low,
             high=scale * high,
             x=scale * self.x,
-            target=scaled(scale, self.target),
-            error=scaled(scale, self.error),
+            target=scale * self.target,
+            error=scale * self.error,
             error_name=f"{self.error_name} [{unit}]",
             steps=steps,
             when=when,
@@ -374,10 +374,10 @@ def _evenly(t: NDArray | None, n_rows: int, most: int) -> NDArray:
 def _stage(figure: Figure, scene: Scene) -> Stage:
     """Return the robot on the left of a figure, and the error, if there is one, on the right."""
     grid = figure.add_gridspec(1, 2, width_ratios=(1.5, 1.0))
-    place = grid[:] if scene.error is None else grid[0]
+    place = grid[0] if len(scene.error) else grid[:]
     space = figure.add_subplot(place, projection="3d")
     error_ax = None
-    if scene.error is not None:
+    if len(scene.error):
         error_ax = figure.add_subplot(grid[1])
     stage = Stage(scene, space, error_ax)
     stage.show(0)

@@ -15,7 +15,7 @@ from typing_extensions import Self
 
 from hybridkin._core.arrays import whole
 from hybridkin._core.texts import plot_label
-from hybridkin.plots._arrays import distance, plain, shaped, shaped_or_none
+from hybridkin.plots._arrays import distance, plain, shaped, shaped_or_empty
 from hybridkin.plots._canvas import (
     COLORS,
     Display,
@@ -79,7 +79,7 @@ class WorkspaceDisplay(Display):
     ) -> None:
         self.x = shaped(x, "x", "N3")
         self.predicted = shaped(predicted, "predicted", "N3", len(self.x))
-        self.backbone = shaped_or_none(backbone, "backbone", "P3")
+        self.backbone = shaped_or_empty(backbone, "backbone", "P3")
         self.row = row
         if row is not None:
             whole(row, "row", -len(self.x), len(self.x) - 1)
@@ -111,12 +111,12 @@ class WorkspaceDisplay(Display):
             pad=0.1,
             extend="max",
         )
-        if self.backbone is not None:
+        if len(self.backbone):
             line = scale * self.backbone.T
             space.plot(*line, color=_BODY, linewidth=4, label="robot (model)")
         if self.row is not None:
             self._draw_row(space, scale, self.row)
-        if self.backbone is not None or self.row is not None:
+        if len(self.backbone) or self.row is not None:
             small_legend(space, loc="upper center", bbox_to_anchor=(0.5, 0.03), ncols=3)
         label_space(space, unit)
         return self._drawn(space)
@@ -189,7 +189,7 @@ class BackboneDisplay(Display):
     Attributes
     ----------
     points : ndarray of shape (K, P, 3)
-        As given [m]; likewise the others.
+        As given [m]; likewise the others, without rows if they are absent.
     ax_, figure_ : matplotlib Axes and Figure
         Where it was drawn last.
 
@@ -243,12 +243,12 @@ class BackboneDisplay(Display):
             raise ValueError(
                 f"`names` must hold {n} names, one per actuator, got {names!r:.80}."
             )
-        self.disks = shaped_or_none(disks, "disks", "KDC3", K)
-        self.frames = shaped_or_none(frames, "frames", "KF44", K)
+        self.disks = shaped_or_empty(disks, "disks", "KDC3", K)
+        self.frames = shaped_or_empty(frames, "frames", "KF44", K)
         self.tips = shaped(
             self.points[:, -1] if tips is None else tips, "tips", "K3", K
         )
-        self.predicted = shaped_or_none(predicted, "predicted", "K3", K)
+        self.predicted = shaped_or_empty(predicted, "predicted", "K3", K)
         self.rigid = rigid
 
     @classmethod
@@ -337,13 +337,13 @@ class BackboneDisplay(Display):
             lines = [Line("backbone", self.points, _BODY, 4.0)]
         if body:
             lines += self._actuator_lines()
-        if body and self.disks is not None and self.disks.size:
+        if body and self.disks.size:
             lines.append(Line("", _joined(self.disks.swapaxes(0, 1)), "#808080", 1.0))
         if tip:
             lines.append(
                 Line("tip", self.tips[:, None], "black", 1.0, marker="o", style="none")
             )
-        if self.predicted is not None:
+        if len(self.predicted):
             way = np.stack([self.tips, self.predicted], axis=1)
             lines.append(
                 Line("learned correction", way, COLORS[0], 1.5, style=":", marker=".")
@@ -382,12 +382,12 @@ class BackboneDisplay(Display):
         for line in self.lines():
             points = scale * line.points[0]
             space.plot(*points.T, label=plot_label(line.label) or None, **line.look())
-        if self.disks is not None and self.disks.size:
+        if self.disks.size:
             disks = scale * self.disks[0]
             space.add_collection3d(
                 Poly3DCollection(disks, alpha=0.15, facecolor="0.5", lw=0.0)
             )
-        if self.frames is not None:
+        if len(self.frames):
             self._draw_frames(space, self.frames[0], scale)
 
     def _draw_frames(self, ax: Space, frames: NDArray, scale: float) -> None:

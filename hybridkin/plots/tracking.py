@@ -18,7 +18,7 @@ from hybridkin.plots._arrays import (
     named,
     plain,
     shaped,
-    shaped_or_none,
+    shaped_or_empty,
     times,
 )
 from hybridkin.plots._canvas import (
@@ -303,7 +303,7 @@ class ActuatorDisplay:
                 raise ValueError(
                     f"`names` must hold {n} names, one per actuator, got {names!r:.80}."
                 )
-        self.limits = shaped_or_none(limits, "limits", ("2", n))
+        self.limits = shaped_or_empty(limits, "limits", ("2", n))
 
     @classmethod
     def from_tracks(
@@ -408,7 +408,7 @@ class ActuatorDisplay:
             if self.names and i == 0:
                 for line, column in zip(lines, columns, strict=True):
                     line.set_label(plot_label(self.names[column]))
-        if self.limits is not None:
+        if len(self.limits):
             look = {"colors": 2 * colors, "linestyles": "dashed", "linewidth": 0.8}
             values = (scale * self.limits)[:, columns].ravel()
             ax.hlines(values, steps[0], steps[-1], label="limits", **look)
