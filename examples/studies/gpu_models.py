@@ -185,7 +185,9 @@ def with_play(operators: Callable[[Any], list[Any]]) -> Any:
     """Return a hybrid with backlash, and with further operators in series."""
     model = hybrid("linear", play=0.02)
     series = operators(model.play_)
-    model.play_ = series[0] if len(series) == 1 else HysteresisSeries(series)
+    model._fit = model._fit.with_play(
+        series[0] if len(series) == 1 else HysteresisSeries(series)
+    )
     return model
 
 

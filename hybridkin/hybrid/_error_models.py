@@ -8,7 +8,6 @@ from __future__ import annotations
 import copy
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
 from dataclasses import replace
 from math import inf, nan
 from typing import Any, Generic, NamedTuple, TypeVar, cast
@@ -197,14 +196,14 @@ class FeatureModel(TipModel):
             assert isinstance(chain, ArcChain)
             readout = read_out.readout.up_to(chain)
             fit = read_out._replace(readout=readout)
-            fits.append(self._fitted(fit, of_marker))
+            fits.append(self._with_correction(fit, of_marker))
         return replace(_of_markers(fits), settled=fits[0].settled)
 
     def fit_tip(self, rows: Rows, spec: Spec) -> FittedError:
         """Return the fitted readout; without motion of the rows there is nothing to learn."""
         if not rows.directions.moved.size:
             return _nothing(self, rows)
-        return self._fitted(self.read_out(rows, spec), rows)
+        return self._with_correction(self.read_out(rows, spec), rows)
 
     def read_out(self, rows: Rows, spec: Spec) -> ReadoutFit:
         """Return the readout of least tip error."""
@@ -224,7 +223,7 @@ class FeatureModel(TipModel):
         except torch.linalg.LinAlgError as error:  # pyright: ignore
             raise too_far() from error
 
-    def _fitted(self, fit: ReadoutFit, rows: Rows) -> FittedError:
+    def _with_correction(self, fit: ReadoutFit, rows: Rows) -> FittedError:
         module = _on_moved_directions(fit.readout, rows.directions)
         if self.coupling == "serial":
             correction = InnerCorrection(module)
@@ -347,7 +346,7 @@ class RegressorModel(TipModel, Generic[_Regressor]):
         if directions.still.size:
             matrix, offset = directions.projection()
             rows = replace(rows, X=(rows.X @ matrix + offset).astype(rows.X.dtype))
-        regressor = self._fitted(rows)
+        regressor = self._learned(rows)
         module = error_module(cast(Regressor, regressor), rows.q)
         noise = nan
         if self.tells_errors:
@@ -361,8 +360,8 @@ class RegressorModel(TipModel, Generic[_Regressor]):
             held_out=self.holds_out,
         )
 
-    def _fitted(self, rows: Rows) -> _Regressor:
-        return _fitted(self.regressor, rows)
+    def _learned(self, rows: Rows) -> _Regressor:
+        return _fit_to_residuals(self.regressor, rows)
 
     def knows_held_out_error(self, rows: Rows) -> bool:
         """Return whether the `noise` of its fit is that of held-out rows, or groups if given."""
@@ -389,11 +388,13 @@ class RegressorModel(TipModel, Generic[_Regressor]):
 class ForeignModel(RegressorModel[Any]):
     """A regressor of another library, which sees residuals of unit spread."""
 
-    def _fitted(self, rows: Rows) -> Any:
-        scaling = UnitSpread.of(_residual(rows), rows.counts)
-        if not sees_scale(self.regressor):
-            return _fitted(self.regressor, rows)
-        return _fitted(ResidualRegressor(self.regressor, scaling), rows)
+    def _learned(self, rows: Rows) -> Any:
+        regressor = self.regressor
+        if sees_scale(regressor):
+            scaling = UnitSpread.of(_residual(rows), rows.counts)
+            regressor = ResidualRegressor(regressor, scaling)
+        with TURNS.filters:  # it may change them while it fits
+            return _fit_to_residuals(regressor, rows)
 
 
 class NetworkModel(RegressorModel[ELMRegressor]):
@@ -461,13 +462,14 @@ class KernelModel(RegressorModel[KernelRidge]):
     def __init__(self) -> None:
         super().__init__(KernelRidge())
 
-    def _fitted(self, rows: Rows) -> KernelRidge:
+    def _learned(self, rows: Rows) -> KernelRidge:
         assert rows.residual is not None
         tuned = tuned_kernel(rows.X, rows.residual, rows.counts, rows.groups)
-        return _fitted(tuned, rows)
+        with TURNS.filters:  # scikit-learn's solver changes them
+            return _fit_to_residuals(tuned, rows)
 
     def _settled(self, regressor: KernelRidge) -> ErrorModel:
-        return RegressorModel(_copy(regressor))
+        return ForeignModel(_copy(regressor))
 
 
 class FittedBlend(NamedTuple):
@@ -536,7 +538,7 @@ def _copy(regressor: _Regressor) -> _Regressor:
     return copied
 
 
-def _fitted(regressor: _Regressor, rows: Rows) -> _Regressor:
+def _fit_to_residuals(regressor: _Regressor, rows: Rows) -> _Regressor:
     """Return a copy of the regressor fitted to the residuals, with the arguments that it takes."""
     copied: Any = clone(regressor)
     within: Any = copied
@@ -549,12 +551,8 @@ def _fitted(regressor: _Regressor, rows: Rows) -> _Regressor:
         options["sample_weight"] = rows.weights
     if rows.groups is not None and has_fit_parameter(within, "groups"):
         options["groups"] = rows.groups
-    turn = nullcontext()
-    if isinstance(regressor, KernelRidge):
-        turn = TURNS.filters
     try:
-        with turn:
-            copied.fit(rows.X, rows.residual, **options)
+        copied.fit(rows.X, rows.residual, **options)
     except ValueError as error:
         if not _takes_one_column(within, rows):
             raise

@@ -56,21 +56,53 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     output: str
     n_features_in_: int
     module_: ForwardModel
-    fitted_module_: Hybrid
     change_: Change
     mechanical_model_: ForwardModel | None
-    calibration_: CalibrationResult | None
-    error_model_: object
-    candidates_: dict[str, Hybrid] | None
-    cv_results_: CvResults | None
-    play_: HysteresisOperator | None
-    radius_: Radius | None
-    _fitted: HybridFit
+    _fit: HybridFit
     _past: Past | None
     _drift: Drift
     _plausible_rows: PlausibleRows | None = None
     # Those that need no other check, and do not change by hysteresis.
     _plain_rows: PlausibleRows | None = None
+
+    @property
+    def fitted_module_(self) -> Hybrid:
+        """The module of the fit, without what has changed since."""
+        return self._fit.module
+
+    @property
+    def error_model_(self) -> object:
+        """The fitted error model."""
+        return self._fit.error.result
+
+    @property
+    def calibration_(self) -> CalibrationResult | None:
+        """The result of the calibration."""
+        return self._fit.calibration
+
+    @property
+    def cv_results_(self) -> CvResults | None:
+        """The comparison of the candidates of error_model="auto"."""
+        return self._fit.error.comparison
+
+    @property
+    def candidates_(self) -> dict[str, Hybrid] | None:
+        """The candidates of error_model="auto", fitted to all rows."""
+        return self._fit.candidates
+
+    @property
+    def play_(self) -> HysteresisOperator | None:
+        """The hysteresis."""
+        return self._fit.play
+
+    @property
+    def radius_(self) -> Radius | None:
+        """The estimated error radius."""
+        return self._fit.radius
+
+    def structure_in_words(self) -> list[str]:
+        """Return the errors of the structure, and a forecast for more rows; none without them."""
+        return self._fit.error.structure_in_words()
 
     def predict(
         self,
@@ -219,7 +251,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     @property
     def training_range_(self) -> TrainingRange:
         """The range of q in the fit, where it lies after `adapt` [unit of q]."""
-        return self._fitted.training_range.moved(-self.change_.shift)
+        return self._fit.training_range.moved(-self.change_.shift)
 
     @property
     def _repr_html_(self) -> Callable[[], str]:
@@ -299,7 +331,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def _are_states_seen(self, X: object) -> NDArray[np.bool_]:
         """Return whether the log had the states inside of the hysteresis, and such a pace (N,)."""
         commands = Commands.of(X)
-        states_of_log = self._states_of_log
+        states_of_log = self._fit.state_range
         if self.play_ is None or states_of_log is None:
             return np.ones(len(commands), dtype=bool)
         rows = check_inputs(self, commands.q)
@@ -308,29 +340,16 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         states = self.play_.each_inner_state(rows, commands.run_of_rows, commands.time)
         for k, state in enumerate(states):
             seen &= ((low[k] <= state) & (state <= high[k])).all(axis=1)
-        if self._fitted.pace is not None and commands.time is not None:
+        if self._fit.pace is not None and commands.time is not None:
             paces = each_pace(
                 rows, commands.run_of_rows, commands.time, self.play_.time_constants
             )
-            seen &= self._fitted.pace.holds(paces, len(rows))
+            seen &= self._fit.pace.holds(paces, len(rows))
         return seen
-
-    @property
-    def _states_of_log(self) -> TrainingRange | None:
-        """Range of the states inside of `play_` in the log; None if it is not that of the fit."""
-        fit = self._fitted
-        return fit.state_range if self.play_ is fit.play else None
 
     def take_fit(self, fit: HybridFit) -> None:
         """Become the model of a fit; the robot has not changed since."""
-        self._fitted = fit
-        self.fitted_module_ = fit.module
-        self.error_model_ = fit.error.result
-        self.calibration_ = fit.calibration
-        self.cv_results_ = fit.error.comparison
-        self.candidates_ = fit.candidates
-        self.play_ = fit.play
-        self.radius_ = fit.radius
+        self._fit = fit
         self.change_ = Change.none(self.n_features_in_)
         self._drift = fit.no_drift
         self._past = None
@@ -339,7 +358,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def count_as_fitted(self, q: NDArray, x: NDArray) -> None:
         """Count rows q (N, n) with tips x (N, m) as fitted: those of a log that was thinned."""
         digests = np.unique(row_digests(q, x))
-        self._fitted = replace(self._fitted, fitted_rows=digests)
+        self._fit = replace(self._fit, fitted_rows=digests)
 
     def _follow_robot(self) -> None:
         """Set the module and its mechanical model after the change and the drift of the robot."""
@@ -402,6 +421,6 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if rows.dtype != _FLOAT64:
             with np.errstate(over="ignore"):  # too large for float32
                 arrays = [array.astype(rows.dtype) for array in arrays]
-        if self._fitted.single_output:
+        if self._fit.single_output:
             arrays = [array[:, 0] if array.ndim > 1 else array for array in arrays]
         return arrays

@@ -341,7 +341,7 @@ class HybridForwardModel(HybridPredictor):
         residual = error.reshape(rows.tips.shape) - learned
         drift = self._drift.learned(rows.q.numpy(), residual, rows.counts, decay)
         if alpha is None:
-            alpha = drift.likeliest_alpha(self._fitted.error.noise)
+            alpha = drift.likeliest_alpha(self._fit.error.noise)
         self._drift = drift._replace(alpha=float(alpha))
         self._follow_robot()
         return self
@@ -419,13 +419,13 @@ class HybridForwardModel(HybridPredictor):
         self.change_, message = likeliest_change(
             self.fitted_module_,
             rows,
-            self._fitted.error.noise,
+            self._fit.error.noise,
             self._drift.scale,
             parameters,
         )
         if message is not None:
             warnings.warn(message, stacklevel=2)
-        self._drift = self._fitted.no_drift
+        self._drift = self._fit.no_drift
         self._past = None
         self._follow_robot()
         return self

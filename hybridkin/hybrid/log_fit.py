@@ -89,6 +89,10 @@ class HybridFit:
     radius: Radius | None = None
     messages: tuple[str, ...] = ()
 
+    def with_play(self, play: HysteresisOperator | None) -> Self:
+        """Return the same with another hysteresis, whose states the log does not show."""
+        return replace(self, play=play, state_range=None, pace=None)
+
     @property
     def candidates(self) -> dict[str, Hybrid] | None:
         """The candidates of "auto", fitted to all rows; None for other error models."""

@@ -130,7 +130,7 @@ def test_an_adapted_model_is_the_fit_moved_and_shifted(case):
     shift, motion = model.change_
     turn = motion[:3, :3]
     q = model.effective(q)[:20]
-    model.play_ = None
+    model._fit = model._fit.with_play(None)
     at = torch.from_numpy(q)
     then = torch.from_numpy(q + shift)
     x, J = model.module_.forward_and_jacobian(at)

@@ -96,7 +96,7 @@ def test_a_file_holds_friction_and_creep(fitted, tmp_path):
 def test_a_series_that_a_file_cannot_hold_is_refused(tmp_path):
     q, x, groups, _ = log(CREEP, 4, seed=0)
     model = HybridForwardModel(CHAIN, "linear", play=0.02).fit(q, x, groups=groups)
-    model.play_ = HysteresisSeries([CREEP, CREEP])
+    model._fit = model._fit.with_play(HysteresisSeries([CREEP, CREEP]))
     with pytest.raises(TypeError, match=r"`play_` HysteresisSeries\(.* stored as code"):
         save_model(model, tmp_path / "model.safetensors")
 

@@ -190,5 +190,5 @@ def test_names_of_motions_and_the_order_of_rows_do_not_matter(choice, monkeypatc
     other = HybridForwardModel(CHAIN, kind, **options).fit(q[order], x[order], groups=names[order])
     assert_allclose(other.predict(new), one.predict(new), rtol=0, atol=1e-8)
     assert_array_equal(other.in_domain(new), one.in_domain(new))
-    assert other._fitted.error.noise == pytest.approx(one._fitted.error.noise, rel=1e-6)
+    assert other._fit.error.noise == pytest.approx(one._fit.error.noise, rel=1e-6)
     assert np.abs(one.predict_error(new)).max() > 5e-3

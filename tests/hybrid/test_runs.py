@@ -85,7 +85,7 @@ def test_runs_and_times_have_no_effect_without_hysteresis(error_model):
         model = HybridForwardModel(CHAIN, error_model).fit(X, x[twice])
         models.append(model)
     assert_array_equal(models[1].predict(q), models[0].predict(q))
-    assert models[1]._fitted.error.noise == models[0]._fitted.error.noise
+    assert models[1]._fit.error.noise == models[0]._fit.error.noise
     for X, model in zip((q[twice], commands), models, strict=True):
         model.partial_fit(X, x[twice] + 0.01)
     assert_array_equal(models[1].predict(commands), models[0].predict(q[twice]))

@@ -139,13 +139,15 @@ def _drifting():
 
 
 def _with_smooth_hysteresis(model, q):
-    model.play_ = PrandtlIshlinskiiOperator([0.0, 0.01, 0.02], [[0.2, 0.3, 0.4], [0.7, 0.8, 1.1]])
+    model._fit = model._fit.with_play(
+        PrandtlIshlinskiiOperator([0.0, 0.01, 0.02], [[0.2, 0.3, 0.4], [0.7, 0.8, 1.1]])
+    )
     return model, q
 
 
 def _with_creep(model, q):
     creep = CreepOperator([[0.1, 0.2, 0.3], [0.2, 0.1, 0.0]], [2.0, 30.0])
-    model.play_ = HysteresisSeries([model.play_, creep])
+    model._fit = model._fit.with_play(HysteresisSeries([model.play_, creep]))
     return model, q
 
 

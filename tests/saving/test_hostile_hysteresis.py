@@ -76,7 +76,7 @@ def test_every_hysteresis_of_a_fit_is_loaded(k, name, tmp_path):
     model = fitted(OPERATORS[name], rows, None if k % 3 else GROUPS)
     twin = loaded(model, tmp_path)
     assert_array_equal(twin.predict(rows), model.predict(rows))
-    assert_array_equal(twin._states_of_log, model._states_of_log)
+    assert_array_equal(twin._fit.state_range, model._fit.state_range)
 
 
 @pytest.mark.slow
@@ -92,7 +92,7 @@ def test_a_hysteresis_may_be_replaced_after_the_fit(before, after, tmp_path):
     """The log knows the states of the hysteresis of the fit alone."""
     rows = ROWS["runs and times"]
     model = fitted(OPERATORS[before], rows, coverage=0.8)
-    model.play_ = OPERATORS.get(after)
+    model._fit = model._fit.with_play(OPERATORS.get(after))
     twin = loaded(model, tmp_path)
     for found, expected in zip(
         twin.predict(rows, return_radius=True),

@@ -215,7 +215,7 @@ def _in_words(loaded: LoadedModel, model: HybridForwardModel) -> list[str]:
     """Return what a model chose and expects, its error radius, and motions that its log lacks."""
     words = [
         *auto_in_words(model, loaded.log_unit),
-        *model._fitted.error.structure_in_words(),
+        *model.structure_in_words(),
     ]
     if model.radius_ is not None:
         words.append(f"Estimated error radius: {model.radius_}.")
