@@ -78,7 +78,7 @@ def compile_into(folder: Path, target: str, names: list[str]) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     libraries = []
     with tempfile.TemporaryDirectory(dir=folder) as work:
-        Path(work, "kinds.h").write_text(shared["c_header"]())
+        shared["write_headers"](work)
         running = {}
         for name in names or variants:
             options = variants[name].split()
@@ -88,9 +88,14 @@ def compile_into(folder: Path, target: str, names: list[str]) -> list[Path]:
                 libraries.append(library)
                 continue
             made = Path(work, library.name)
-            source = str(NATIVE / "src/hk.c")
+            sources = str(NATIVE / "src")
             process = subprocess.Popen(
-                [*command, "-I", work, *options, "-o", str(made), source, "-lm"],
+                [
+                    *command,
+                    *("-I", work, "-I", sources),
+                    *options,
+                    *("-o", str(made), f"{sources}/hk.c", "-lm"),
+                ],
                 stderr=subprocess.PIPE,
                 text=True,
             )

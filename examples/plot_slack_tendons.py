@@ -31,7 +31,6 @@ from hybridkin import (
     HybridForwardModel,
     calibrate,
     datasets,
-    fit_play,
 )
 
 RADII = np.full(3, 0.0045)
@@ -110,16 +109,13 @@ def predictions(data, train, test, models=MODELS, angles=True, thin=1):
             model = with_kernel(chain, q[train], x[train], groups[train])
             found[name] = model.predict(q[test])
     if "elastic + play" in models:
-        fit = fit_play(
-            elastic,
-            q[train],
-            x[train],
-            groups[train],
-            parameters=ELASTIC,
-            loss="soft_l1",
-        )
-        y, chain = fit.play.apply_by_group(q, groups), fit.result.chain
-        found["elastic + play"], found["play"] = tips(chain, y[test]), fit.width
+        search = HybridForwardModel(elastic, "drop", hysteresis="auto")
+        search.fit(q[train], x[train], groups=groups[train])
+        hysteresis = search.hysteresis_
+        y = hysteresis.apply_by_group(q, groups)
+        chain = fitted(elastic, y[train], x[train], ELASTIC)
+        found["elastic + play"] = tips(chain, y[test])
+        found["play"] = float(np.max(hysteresis.width))
         model = with_kernel(chain, y[train], x[train], groups[train])
         found["elastic + play + kernel"] = model.predict(y[test])
     return found

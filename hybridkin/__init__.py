@@ -11,39 +11,33 @@ if TYPE_CHECKING:
     from hybridkin._core.commands import Commands
     from hybridkin._core.model import ForwardModel, as_forward_model, jacobian
     from hybridkin.calibration.calibrate import CalibrationResult, calibrate
-    from hybridkin.calibration.play_fit import PlayFit, fit_play
     from hybridkin.chains import robots
-    from hybridkin.chains.arc_chain import ArcChain
     from hybridkin.chains.chain import Chain
     from hybridkin.chains.constant_curvature import ConstantCurvatureChain
-    from hybridkin.chains.creep import CreepOperator
     from hybridkin.chains.elastic_tendons import ElasticTendonChain
     from hybridkin.chains.force_tendons import ForceTendonChain
-    from hybridkin.chains.play import PlayOperator
-    from hybridkin.chains.prandtl_ishlinskii import (
-        PrandtlIshlinskiiOperator,
-    )
+    from hybridkin.chains.length_driven import LengthDrivenChain
     from hybridkin.chains.rigid import RigidChain
-    from hybridkin.chains.series import HysteresisSeries
     from hybridkin.hybrid.choose_rows import choose_rows
     from hybridkin.hybrid.cross_fit import cross_fit
     from hybridkin.hybrid.estimator import HybridForwardModel
     from hybridkin.hybrid.held_out import CrossFit
+    from hybridkin.hybrid.model_description import ModelDescription
+    from hybridkin.hysteresis.value import Hysteresis
     from hybridkin.ik import tasks, trajectories
     from hybridkin.ik.results import IKSolution, IKStatus, Step, Track
     from hybridkin.ik.solver import InverseKinematics
     from hybridkin.ik.tracker import Tracker
     from hybridkin.learning.elm import ELMRegressor
     from hybridkin.learning.elm_cv import ELMRegressorCV
+    from hybridkin.saving.opened_model import open_model
     from hybridkin.saving.saved_model import load_model, save_model
 
 __all__ = [
-    "ArcChain",
     "CalibrationResult",
     "Chain",
     "Commands",
     "ConstantCurvatureChain",
-    "CreepOperator",
     "CrossFit",
     "ELMRegressor",
     "ELMRegressorCV",
@@ -51,13 +45,12 @@ __all__ = [
     "ForceTendonChain",
     "ForwardModel",
     "HybridForwardModel",
-    "HysteresisSeries",
+    "Hysteresis",
     "IKSolution",
     "IKStatus",
     "InverseKinematics",
-    "PlayFit",
-    "PlayOperator",
-    "PrandtlIshlinskiiOperator",
+    "LengthDrivenChain",
+    "ModelDescription",
     "RigidChain",
     "Step",
     "Track",
@@ -68,10 +61,10 @@ __all__ = [
     "choose_rows",
     "cross_fit",
     "datasets",
-    "fit_play",
     "jacobian",
     "load_model",
     "native",
+    "open_model",
     "plots",
     "robots",
     "save_model",
@@ -83,21 +76,19 @@ _NAMES_OF = {
     "_core.commands": ("Commands",),
     "_core.model": ("ForwardModel", "as_forward_model", "jacobian"),
     "calibration.calibrate": ("CalibrationResult", "calibrate"),
-    "calibration.play_fit": ("PlayFit", "fit_play"),
-    "chains.arc_chain": ("ArcChain",),
     "chains.chain": ("Chain",),
     "chains.constant_curvature": ("ConstantCurvatureChain",),
-    "chains.creep": ("CreepOperator",),
     "chains.elastic_tendons": ("ElasticTendonChain",),
     "chains.force_tendons": ("ForceTendonChain",),
-    "chains.play": ("PlayOperator",),
-    "chains.prandtl_ishlinskii": ("PrandtlIshlinskiiOperator",),
+    "chains.length_driven": ("LengthDrivenChain",),
     "chains.rigid": ("RigidChain",),
-    "chains.series": ("HysteresisSeries",),
     "hybrid.choose_rows": ("choose_rows",),
     "hybrid.cross_fit": ("cross_fit",),
-    "hybrid.estimator": ("HybridForwardModel",),
     "hybrid.held_out": ("CrossFit",),
+    "hybrid.model_description": ("ModelDescription",),
+    "saving.opened_model": ("open_model",),
+    "hybrid.estimator": ("HybridForwardModel",),
+    "hysteresis.value": ("Hysteresis",),
     "ik.results": ("IKSolution", "IKStatus", "Step", "Track"),
     "ik.solver": ("InverseKinematics",),
     "ik.tracker": ("Tracker",),

@@ -4,7 +4,7 @@ import shutil
 import subprocess
 from pathlib import Path
 
-from hybridkin._core.kernel_numbers import c_header
+from hybridkin._core.kernel_numbers import write_headers
 from hybridkin.native import library
 
 LIMIT = 64 * 1024  # bytes
@@ -15,7 +15,7 @@ _SOURCES = Path(library.__file__).parent / "src"
 def painted(folder, *options):
     """Return the compiled program that prints the stack of functions."""
     source, program = Path(__file__).parent / "native" / "stack_test.c", folder / "stack_test"
-    Path(folder, "kinds.h").write_text(c_header())
+    write_headers(folder)
     flags = ["-std=gnu99", "-O2", "-Wall", "-Werror", f"-I{_SOURCES}", f"-I{folder}"]
     command = [CC, *flags, source, *options, "-o", program, "-lm", "-lpthread", "-ldl"]
     subprocess.run(command, check=True)

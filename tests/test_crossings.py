@@ -22,7 +22,6 @@ from sklearn.linear_model import LinearRegression
 from hybridkin import (
     Commands,
     ConstantCurvatureChain,
-    CreepOperator,
     ElasticTendonChain,
     ELMRegressor,
     ELMRegressorCV,
@@ -108,7 +107,7 @@ ERROR_MODELS = {
 FACTORS = {
     "robot": tuple(name for name in ROBOTS if name != "forces"),  # which is slow
     "markers": ("tip", "two", "two, some missing"),
-    "play": ("none", "width", "operator", "auto"),
+    "hysteresis": ("none", "width", "friction, creep", "creep, friction", "auto"),
     "error_model": tuple(ERROR_MODELS),
     "coupling": ("parallel", "serial"),
     "output": ("position", "pose"),
@@ -152,10 +151,10 @@ def allowed(case):
     if case.get("coupling") == "serial" and model in ("kernel", "regression", "auto"):
         return False
     # Choices take long, and have tests of their own: not one within the other.
-    if case.get("play") == "auto" and model in ("auto", "kernel", "ELM-CV"):
+    if case.get("hysteresis") == "auto" and model in ("auto", "kernel", "ELM-CV"):
         return False
     # Motions need rows in order of time; changed robots need three coordinates or poses.
-    return not (case.get("play") == "auto" and case.get("groups") is False)
+    return not (case.get("hysteresis") == "auto" and case.get("groups") is False)
 
 
 def pairwise(factors, seed=0):
@@ -260,7 +259,7 @@ def fitted(case):
         coupling=case["coupling"],
         calibrate=calibrate[case["calibrate"]],
         guard=case["guard"],
-        play=play_of(case["play"], robot),
+        hysteresis=hysteresis_of(case["hysteresis"], robot),
         output=case["output"],
         random_state=0,
     )
@@ -276,11 +275,17 @@ def fitted(case):
     return Fitted(model, unchanged, log, robot)
 
 
-def play_of(play, robot):
-    """Return the argument `play` of a model: none, a width, an operator, or "auto"."""
-    if play == "operator":
-        return operators(robot.n, 0.1 * robot.half)["plays, creep"]
-    return {"none": None, "width": 0.1 * robot.half, "auto": "auto"}[play]
+def hysteresis_of(kind, robot):
+    """Return the argument `hysteresis` of a model: none, a width, a value, or "auto"."""
+    values = operators(robot.n, 0.1 * robot.half)
+    of_kind = {
+        "none": 0.0,
+        "width": 0.1 * robot.half,
+        "friction, creep": values["plays, creep"],
+        "creep, friction": values["creep, play, plays"],
+        "auto": "auto",
+    }
+    return of_kind[kind]
 
 
 def name_of(case):
@@ -359,8 +364,7 @@ def test_a_file_holds_the_model(crossing, tmp_path):
         after = getattr(again, method)(log.commands)
         np.testing.assert_allclose(after, before, rtol=1e-12, atol=1e-12, err_msg=method)
     np.testing.assert_array_equal(again.training_range_, model.training_range_)
-    if model.play_ is not None:
-        np.testing.assert_array_equal(again.play_.width, model.play_.width)
+    assert again.hysteresis_ == model.hysteresis_
     pickled = pickle.loads(pickle.dumps(model))
     np.testing.assert_array_equal(pickled.predict(log.commands), model.predict(log.commands))
 
@@ -376,7 +380,7 @@ def test_limits_of_a_track_leave_room(crossing, tmp_path):
 
 def test_a_clone_fits_the_same(crossing):
     case, (_, model, log, _) = crossing
-    if case["error_model"] == "auto" and case["play"] != "none":
+    if case["error_model"] == "auto" and case["hysteresis"] != "none":
         return  # takes as long as the fit itself; those without backlash are enough
     again = clone(model).fit(log.commands, log.x, groups=log.groups)
     np.testing.assert_allclose(
@@ -390,14 +394,14 @@ def test_a_clone_fits_the_same(crossing):
 def test_the_training_range_is_that_of_the_log(crossing):
     case, (model, unchanged, log, robot) = crossing
     low, high = unchanged.training_range_
-    if model.play_ is None:
+    if not model.hysteresis_:
         np.testing.assert_allclose(low, log.q.min(axis=0), rtol=0, atol=1e-12 * robot.half)
         np.testing.assert_allclose(high, log.q.max(axis=0), rtol=0, atol=1e-12 * robot.half)
     else:
-        width = np.max(model.play_.width)
-        for part in model.play_.parts:
-            if isinstance(part, CreepOperator):  # at most this share of a motion is late
-                late = part.gains.reshape(len(part.gains), -1).sum(axis=0)
+        width = np.max(model.hysteresis_.width)
+        for stage in model.hysteresis_.stages:
+            if stage.needs_time:  # at most this share of a motion is late
+                late = stage.shares.reshape(len(stage.shares), -1).sum(axis=0)
                 width = width + late * np.ptp(log.q, axis=0)
         assert (low >= log.q.min(axis=0) - 1e-12).all()
         assert (high <= log.q.max(axis=0) + 1e-12).all()
@@ -461,8 +465,8 @@ def test_commands_lead_by_the_hysteresis(crossing):
         expected = reference.step(torch.from_numpy(target))
     np.testing.assert_allclose(tracker.q, expected, rtol=0, atol=1e-6 * robot.half)
     effective = np.array(sent)
-    if model.play_ is not None:
-        effective, _ = model.play_.apply(effective, dt=0.01)
+    if model.hysteresis_:
+        effective, _ = model.hysteresis_.apply(effective, dt=0.01)
     np.testing.assert_allclose(tracker.effective, effective[-1], rtol=0, atol=1e-12 * robot.half)
 
 

@@ -39,16 +39,14 @@ from hybridkin import (
     ELMRegressorCV,
     ForceTendonChain,
     HybridForwardModel,
+    Hysteresis,
     InverseKinematics,
-    PlayOperator,
-    PrandtlIshlinskiiOperator,
     RigidChain,
     app,
     as_forward_model,
     calibrate,
     choose_rows,
     datasets,
-    fit_play,
     jacobian,
     load_model,
     plots,
@@ -152,7 +150,7 @@ READ = {
 SETTINGS = {"n_folds": 2, "auto": False, "loss": "linear", "coverage": None}
 
 
-SETTINGS |= {"play": None, "max_rows": None}
+SETTINGS |= {"hysteresis": 0.0, "max_rows": None}
 
 
 OUT, SENT = FOLDER / "out", FOLDER / "sent.csv"
@@ -236,29 +234,33 @@ ENTRIES = {
     ),
     "as_forward_model": (as_forward_model, {"model": torch.sin}),
     "jacobian": (jacobian, {"model": trunk(), "q": torch.tensor(Q[:3])}),
-    "PlayOperator": (PlayOperator, {"width": np.array([0.1, 0.0, 0.2])}),
-    "PlayOperator.apply": (
-        PlayOperator([0.01, 0.0, 0.1]).apply,
+    "Hysteresis.backlash": (Hysteresis.backlash, {"width": np.array([0.1, 0.0, 0.2])}),
+    "Hysteresis.apply": (
+        Hysteresis.backlash([0.01, 0.0, 0.1]).apply,
         {"q": Q, "state": np.tile(Q[0], (3, 1))},
     ),
-    "PlayOperator.command": (
-        PlayOperator([0.01, 0.0, 0.1]).command,
+    "Hysteresis.command": (
+        Hysteresis.backlash([0.01, 0.0, 0.1]).command,
         {"y": Q, "state": np.tile(Q[0], (3, 1))},
     ),
-    "PlayOperator.apply_by_group": (
-        PlayOperator(0.01).apply_by_group,
+    "Hysteresis.apply_by_group": (
+        Hysteresis.backlash(0.01).apply_by_group,
         {"q": Q, "groups": GROUPS},
     ),
-    "PrandtlIshlinskiiOperator": (
-        PrandtlIshlinskiiOperator,
+    "Hysteresis.friction": (
+        Hysteresis.friction,
         {"widths": np.array([0.0, 0.1, 0.2]), "slopes": np.array([0.3, 0.8])},
     ),
-    "PrandtlIshlinskiiOperator.apply": (
-        PrandtlIshlinskiiOperator([0.0, 0.1], [0.3]).apply,
+    "Hysteresis.creep": (
+        Hysteresis.creep,
+        {"shares": np.array([0.1, 0.2]), "times": np.array([3.0, 80.0])},
+    ),
+    "friction.apply": (
+        Hysteresis.friction([0.0, 0.1], [0.3]).apply,
         {"q": Q, "state": np.tile(Q[0], (4, 1))},
     ),
-    "PrandtlIshlinskiiOperator.command": (
-        PrandtlIshlinskiiOperator([0.0, 0.1], [0.3]).command,
+    "friction.command": (
+        Hysteresis.friction([0.0, 0.1], [0.3]).command,
         {"y": Q, "state": np.tile(Q[0], (4, 1))},
     ),
     "robots.from_toml": (robots.from_toml, {"path": ROBOT}),
@@ -426,17 +428,6 @@ COSTLY = {
     "LoadedModel.expected_errors": (LOADED.expected_errors, {"q": Q}),
     "RobotDescription.to_log": (DESCRIPTION.to_log, {"q": Q}),
     "RobotDescription.from_log": (DESCRIPTION.from_log, {"q": Q}),
-    "fit_play": (
-        fit_play,
-        {
-            "chain": TENDONS,
-            "q": 1e-3 * X,
-            "x": X,
-            "groups": GROUPS,
-            "widths": [1e-4],
-            "parameters": ["radii"],
-        },
-    ),
     "evaluate_log": (
         workflow.evaluate_log,
         {"loaded": LOADED, "log": LOG, "out": None, "force": True},
@@ -588,12 +579,6 @@ WEIGHTS = 0.5 + np.arange(24.0) % 2
 LINEAR = HybridForwardModel(trunk(), "linear")
 
 
-PLAY = {"groups": np.arange(8) // 4, "widths": [0.001], "parameters": ("radii",)}
-
-
-PLAY |= {"q": Q[:8], "x": X[:8]}
-
-
 # Name of the argument, numbers, entry point.
 ARRAYS = {
     "calibrate.q": ("q", Q, lambda v: radii(q=v)),
@@ -601,11 +586,13 @@ ARRAYS = {
     "calibrate.weights": ("sample_weight", WEIGHTS, lambda v: radii(sample_weight=v)),
     "choose": ("candidates", Q, lambda v: choose_rows(trunk(), v, 3)[1]),
     "choose.measured": ("measured", Q, lambda v: choose_rows(trunk(), Q, 3, measured=v)[1]),
-    "play.q": ("q", Q[:8], lambda v: fit_play(trunk(), **{**PLAY, "q": v}).cv_distance),
-    "play.x": ("x", X[:8], lambda v: fit_play(trunk(), **{**PLAY, "x": v}).cv_distance),
-    "play.width": ("width", HALF / 1e3, lambda v: PlayOperator(v).apply(Q)[0]),
-    "play.command": ("y", Q, lambda v: PlayOperator(0.01).command(v)[0]),
-    "play.apply_by_group": ("q", Q, lambda v: PlayOperator(0.01).apply_by_group(v, GROUPS)),
+    "backlash.width": ("width", HALF / 1e3, lambda v: Hysteresis.backlash(v).apply(Q)[0]),
+    "backlash.command": ("y", Q, lambda v: Hysteresis.backlash(0.01).command(v)[0]),
+    "backlash.apply_by_group": (
+        "q",
+        Q,
+        lambda v: Hysteresis.backlash(0.01).apply_by_group(v, GROUPS),
+    ),
     "hybrid.fit X": ("X", Q, lambda v: fitted(LINEAR, X=v)),
     "hybrid.fit y": ("y", X, lambda v: fitted(LINEAR, y=v)),
     "hybrid.fit weights": ("sample_weight", WEIGHTS, lambda v: fitted(LINEAR, sample_weight=v)),
@@ -655,7 +642,7 @@ ARRAYS = {
 }
 
 
-LONG = ("calibrate", "play.q", "play.x", "hybrid.fit", "elm_cv", "ik.q_", "ik.dq_max", "ik.weights")
+LONG = ("calibrate", "hybrid.fit", "elm_cv", "ik.q_", "ik.dq_max", "ik.weights")
 
 
 LONG += ("ik.solve", "ik.track")
@@ -701,14 +688,14 @@ META = ROWS.to("meta")
 @pytest.mark.parametrize(
     ("name", "call"),
     [
-        ("q", lambda: trunk().contradiction(META)),
+        ("q", lambda: trunk().contradictions(META)),
         ("q", lambda: trunk().metres(ROWS[:, :0])),
         ("n_points", lambda: trunk().backbone(ROWS, 2.5)),
         ("n_points", lambda: trunk().backbone(ROWS, 2**63)),
         ("tangents", lambda: trunk().geometry_jacobian(ROWS, {})),
         (r"tangents\['base'\]", lambda: trunk().geometry_jacobian(ROWS, {"base": torch.ones(4)})),
         ("markers", lambda: tendon_chain().with_markers([(0,)])),
-        ("state", lambda: PlayOperator(0.1).apply(Q, np.nan * Q[:3])),
+        ("state", lambda: Hysteresis.backlash(0.1).apply(Q, np.nan * Q[:3])),
         ("routing", lambda: trunk(routing=["segment"])),
         ("timing", lambda: trajectories.line(X[0], X[1], timing=X)),
         ("duration", lambda: trajectories.line(X[0], X[1], duration=1e300)),
@@ -720,14 +707,13 @@ META = ROWS.to("meta")
         ("groups", lambda: Log(Q, X, GROUPS[:3])),
         ("groups", lambda: Log(Q, X, torch.tensor(GROUPS).to("meta"))),
         ("groups", lambda: Log(Q, X, np.where(GROUPS == 1, np.inf, GROUPS))),
-        ("q", lambda: PlayOperator(0.1).apply_by_group(Q[:, :0], GROUPS)),
+        ("q", lambda: Hysteresis.backlash(0.1).apply_by_group(Q[:, :0], GROUPS)),
         ("stage", lambda: trunk(stage=Q)),
         ("actuators_per_segment", lambda: plots.ActuatorDisplay({"a": Q}, None)),
         ("names", lambda: plots.ActuatorDisplay({"a": Q}, [3], names=True)),
         ("actuators", lambda: plots.BackboneDisplay(X[None], actuators=None)),
         ("t", lambda: plots.TrackAnimation(X, t=np.where(np.arange(24) < 2, np.inf, 0.0))),
         ("loss", lambda: choose_geometry(trunk(), Q, X, loss=None)),
-        ("q", lambda: fit_play(trunk(), Q[:0], X, GROUPS)),
         ("n_folds", lambda: FitSettings(n_folds=np.nan)),
         ("max_rows", lambda: FitSettings(max_rows=0)),
         ("auto", lambda: FitSettings(auto=np.nan)),
@@ -761,8 +747,8 @@ def test_a_number_whose_square_overflows_counts_as_infinite():
 
 def test_a_state_in_numpy_continues_a_motion_in_torch():
     state = Q[:3, ::-1].copy()[:, ::-1]
-    found, _ = PlayOperator(0.1).apply(ROWS, state)
-    torch.testing.assert_close(found, torch.tensor(PlayOperator(0.1).apply(Q, state)[0]))
+    found, _ = Hysteresis.backlash(0.1).apply(ROWS, state)
+    torch.testing.assert_close(found, torch.tensor(Hysteresis.backlash(0.1).apply(Q, state)[0]))
 
 
 @pytest.mark.parametrize("size", [1e300, 5e-324])

@@ -216,7 +216,7 @@ def test_commands_for_the_recording_run(tmp_path, data_home):
     lines = (data_home / "ftdcr_v4" / "train.csv").read_text(encoding="utf-8").splitlines()
     (tmp_path / "train.csv").write_text("\n".join([lines[0], *lines[1::6]]), encoding="utf-8")
     shutil.copytree(ROOT / "examples" / "robots", tmp_path / "examples" / "robots")
-    command = [word for word in RECORDING[-1] if word not in ("--play", "auto")]
+    command = [word for word in RECORDING[-1] if word not in ("--hysteresis", "auto")]
     out = hybridkin([*command, *QUICK, "--no-auto"], tmp_path)
     found = re.findall(r"^\W+(mechanical, calibrated|hybrid, ELM)[ |]+([\d.]+)", out, re.MULTILINE)
     assert {name: float(mean) < 12.0 for name, mean in found} == {

@@ -30,7 +30,9 @@ def model_file(tmp_path_factory):
     data = datasets.load_trunk()
     rows = datasets.paper_split(data, random_state=0)[0][:300]
     chain = robots.bionic_handling_assistant()
-    model = HybridForwardModel(chain, "quadratic", calibrate="default", play=0.002, random_state=0)
+    model = HybridForwardModel(
+        chain, "quadratic", calibrate="default", hysteresis=0.002, random_state=0
+    )
     model.fit(data.q[rows], data.x[rows], groups=np.repeat(range(30), 10))
     file = tmp_path_factory.mktemp("model") / "model.safetensors"
     save_model(model, file)

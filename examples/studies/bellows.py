@@ -100,7 +100,7 @@ class Recording:
             model = make_pipeline(StandardScaler(), features, penalties)
             return model.fit(self.q[fitted], self.x[fitted]).predict(q_new)
         model = HybridForwardModel(nominal(), random_state=0, **MODELS[name])
-        if model.play is None:
+        if model.hysteresis is None:
             model.fit(self.q[fitted], self.x[fitted], groups=self.days[fitted])
             return model.predict(q_new)
         commands = Commands(self.q, self.runs, self.time)

@@ -37,13 +37,7 @@ from log_mistakes import Case, advised, fits
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hybridkin import (
-    CreepOperator,
-    HybridForwardModel,
-    PlayOperator,
-    cross_fit,
-    save_model,
-)
+from hybridkin import HybridForwardModel, Hysteresis, cross_fit, save_model
 from hybridkin.app import check_log, workflow
 from hybridkin.app.workflow.errors import Promise
 from hybridkin.app.workflow.report import Report
@@ -157,12 +151,12 @@ def _payload(run: Run) -> NDArray:
 
 def _backlash(run: Run) -> NDArray:
     width = 0.06 * np.ptp(run.q, axis=0).max()
-    return run.robot.tips(PlayOperator(width).apply(run.q)[0])
+    return run.robot.tips(Hysteresis.backlash(width).apply(run.q)[0])
 
 
 def _creep(run: Run) -> NDArray:
     steps = np.full(len(run.q), PERIOD)
-    return run.robot.tips(CreepOperator([0.3], [1.0]).apply(run.q, dt=steps)[0])
+    return run.robot.tips(Hysteresis.creep([0.3], [1.0]).apply(run.q, dt=steps)[0])
 
 
 def _misread(run: Run) -> NDArray:

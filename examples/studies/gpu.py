@@ -104,7 +104,7 @@ def outputs(module: Any, q: Tensor) -> dict[str, Tensor]:
 def predictions(model: Any, q: np.ndarray) -> dict[str, Any]:
     """Return what an estimator predicts of NumPy rows, by name."""
     rows: Any = q
-    if getattr(model, "play_", None) is not None:
+    if getattr(model, "hysteresis_", None):
         rows = Commands(q, time=np.arange(float(len(q))))
     x, J = model.predict_and_jacobian(rows)
     found = {"predicted x": x, "predicted J": J}
@@ -140,9 +140,12 @@ def compare_model(study: Study, name: str, kind: Kind, n: int) -> None:
         by_twin = predictions(twin, q.numpy())
         for what, numbers in predictions(kind.model, q.numpy()).items():
             study.compare(name, what, apart(numbers, by_twin[what]), SMOOTH, n)
-    if getattr(kind.model, "play_", None) is not None:
+    if getattr(kind.model, "hysteresis_", None):
         times = np.ones(n)
-        ends = kind.model.play_.apply(q, dt=times), twin.play_.apply(there, dt=times)
+        ends = (
+            kind.model.hysteresis_.apply(q, dt=times),
+            twin.hysteresis_.apply(there, dt=times),
+        )
         for what, end, of_end in zip(("effective q", "state"), *ends, strict=True):
             study.compare(name, what, apart(end, of_end), SMOOTH, n)
     # A file does not depend on the device of the model that was saved.

@@ -17,15 +17,13 @@ from torch import Tensor
 
 from hybridkin import (
     ConstantCurvatureChain,
-    CreepOperator,
     ElasticTendonChain,
     ELMRegressor,
     ELMRegressorCV,
     ForceTendonChain,
     ForwardModel,
     HybridForwardModel,
-    HysteresisSeries,
-    PrandtlIshlinskiiOperator,
+    Hysteresis,
     RigidChain,
     as_forward_model,
     tasks,
@@ -181,16 +179,6 @@ def on_chain(chain: Any, low: NDArray, high: NDArray, error_model: Any) -> Any:
     return HybridForwardModel(chain, error_model, random_state=0).fit(q, x)
 
 
-def with_play(operators: Callable[[Any], list[Any]]) -> Any:
-    """Return a hybrid with backlash, and with further operators in series."""
-    model = hybrid("linear", play=0.02)
-    series = operators(model.play_)
-    model._fit = model._fit.with_play(
-        series[0] if len(series) == 1 else HysteresisSeries(series)
-    )
-    return model
-
-
 def blend() -> ForwardModel:
     """Return the module of a blend of two corrections and the mechanical model."""
     corrections = []
@@ -226,10 +214,9 @@ _FORCES = limits(3, 0.0, 1.5)
 _TURNS = limits(7, -1.5, 1.5)
 _STAGE = np.array([0.08, -0.01, -0.01, -0.01]), np.array([0.12, 0.01, 0.01, 0.01])
 _CHAMBERS = limits(3, 0.2, 0.3)
-_SMOOTH = PrandtlIshlinskiiOperator(
-    [0.0, 0.01, 0.02], [[0.2, 0.3, 0.4], [0.7, 0.8, 1.1]]
-)
-_CREEP = CreepOperator([[0.1, 0.2, 0.3], [0.2, 0.1, 0.0]], [2.0, 30.0])
+_BACKLASH = Hysteresis.backlash(0.02)
+_SMOOTH = Hysteresis.friction([0.0, 0.01, 0.02], [[0.2, 0.3, 0.4], [0.7, 0.8, 1.1]])
+_CREEP = Hysteresis.creep([[0.1, 0.2, 0.3], [0.2, 0.1, 0.0]], [2.0, 30.0])
 
 CHAINS: dict[str, Callable[[], Kind]] = {
     "extensible segments": lambda: Kind(trunk(), *limits(9, LOW, HIGH)),
@@ -322,10 +309,10 @@ LEARNED: dict[str, Callable[[], Kind]] = {
         HybridForwardModel(None, network()).fit(*log()[:2]), *_CHAMBERS
     ),
     "blend": lambda: Kind(blend(), *_CHAMBERS, is_saved=False),
-    "backlash": lambda: Kind(with_play(lambda play: [play]), *_CHAMBERS),
-    "smooth hysteresis": lambda: Kind(with_play(lambda _: [_SMOOTH]), *_CHAMBERS),
+    "backlash": lambda: Kind(hybrid("linear", hysteresis=_BACKLASH), *_CHAMBERS),
+    "smooth hysteresis": lambda: Kind(hybrid("linear", hysteresis=_SMOOTH), *_CHAMBERS),
     "backlash and creep": lambda: Kind(
-        with_play(lambda play: [play, _CREEP]), *_CHAMBERS
+        hybrid("linear", hysteresis=_BACKLASH | _CREEP), *_CHAMBERS
     ),
     "adapted": lambda: Kind(adapted(), *_CHAMBERS),
     "adapted poses": lambda: Kind(adapted(output="pose"), *_CHAMBERS, pose_of_rows),

@@ -36,7 +36,7 @@ PLANTS: dict[str, dict[str, Any]] = {
 """Arguments of `TrunkPlant` by name; the seed of a plant is its position."""
 
 NOMINAL, CALIBRATED = "mechanical, nominal", "mechanical, calibrated"
-PAPER, AUTO, AUTO_PLAY = "parallel, the paper's ELM", "auto", 'auto, play="auto"'
+PAPER, AUTO, AUTO_PLAY = "parallel, the paper's ELM", "auto", 'auto, hysteresis="auto"'
 DATA_ONLY = ("data alone, quadratic", "data alone, kernel ridge")
 AUTO_MECHANICS = "mechanical, as auto took it"
 STRUCTURAL = "serial, structural"
@@ -159,7 +159,7 @@ def _learners(case: Case) -> dict[str, Callable[[], HybridForwardModel]]:
     auto = partial(HybridForwardModel, case.chain, AUTO, random_state=seed)
     learners[AUTO] = auto
     if case.in_time:
-        learners[AUTO_PLAY] = partial(auto, play="auto")
+        learners[AUTO_PLAY] = partial(auto, hysteresis="auto")
     return learners
 
 

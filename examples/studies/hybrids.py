@@ -173,7 +173,7 @@ def held_out_motions(
     Whole motions in five folds; all motions of a pair of segments held out, three times; and the
     motions of two segments, learned from those of a single one, where groups are the motions or the
     segments that move. Mechanical models: a constant-curvature chain, and one of elastic tendons.
-    `auto, play="auto"` fits backlash as well; its predictions use the motion so far. Of
+    `auto, hysteresis="auto"` fits backlash as well; its predictions use the motion so far. Of
     asl_trunk_static whole runs are held out, in five folds.
 
     Parameters

@@ -1,4 +1,4 @@
-"""Hysteresis of actuators: one backlash, or what `play="auto"` finds.
+"""Hysteresis of actuators: one backlash, or what `hysteresis="auto"` finds.
 
 The tables and the figure of the docs page "When the past matters"::
 
@@ -30,23 +30,24 @@ from hybridkin import (
     Commands,
     ELMRegressorCV,
     HybridForwardModel,
-    PlayOperator,
+    Hysteresis,
     datasets,
-    fit_play,
     robots,
 )
+from hybridkin.hysteresis.log import HysteresisLog
+from hybridkin.hysteresis.search import search_width
 
 TRUNK = robots.bionic_handling_assistant()
 ROWS = 40  # in a motion
 NOISE = 5e-4  # [m]
-Hysteresis = Callable[[NDArray], NDArray]
+Motion = Callable[[NDArray], NDArray]
 
 
 def many_plays(q: NDArray) -> NDArray:
     """Return the sum of 25 plays with widths up to 8 cm (T, n) [m]."""
     half = np.linspace(0.0, 0.04, 25)
     density = np.exp(-half / 0.012)
-    plays = [PlayOperator(2.0 * r).apply(q)[0] for r in half]
+    plays = [Hysteresis.backlash(2.0 * r).apply(q)[0] for r in half]
     return np.tensordot(density / density.sum(), plays, 1)
 
 
@@ -126,21 +127,32 @@ def fits(
     Parameters
     ----------
     model : HybridForwardModel
-        Its settings, but for `play`.
+        Its settings, but for `hysteresis`.
     q, x, groups, runs, weights : ndarray
         Rows as for its `fit`.
     """
 
-    def fitted(play: float | str | None) -> HybridForwardModel:
-        hybrid = clone(model).set_params(play=play)
+    def fitted(hysteresis: float | str) -> HybridForwardModel:
+        hybrid = clone(model).set_params(hysteresis=hysteresis)
         rows = timed(q, groups if runs is None else runs)
         return hybrid.fit(rows, x, weights, groups)
 
-    none = fitted(None)
+    none = fitted(0.0)
     used = slice(None) if weights is None else weights > 0.0
-    widths = np.ptp(q, axis=0).max() * np.geomspace(0.003, 0.8, 30)
-    chain = none.mechanical_model_
-    single = fit_play(chain, q[used], x[used], groups[used], widths, ["base"])
+    groups_used = groups[used]
+    time = np.arange(len(groups_used), dtype=float)
+    log = HysteresisLog(
+        none.mechanical_model_,
+        q[used],
+        x[used],
+        np.ones(len(time)),
+        groups_used,
+        groups_used,
+        time,
+    )
+    widest = np.ptp(q, axis=0).max()
+    widths = [0.0, *(widest * np.geomspace(0.003, 0.8, 30))]
+    single = search_width(log.thinned(), widths).best
     return {"none": none, "one backlash": fitted(single.width), "auto": fitted("auto")}
 
 
@@ -151,13 +163,11 @@ def trunk_model() -> HybridForwardModel:
 
 def commands(model: HybridForwardModel, y: NDArray, groups: NDArray) -> NDArray:
     """Return the commands for motions y (N, n) of the actuators."""
-    play = model.play_
-    if play is None:
-        return y
-    return by_group(lambda rows: play.command(rows, dt=1.0)[0], y, groups)
+    hysteresis = model.hysteresis_
+    return by_group(lambda rows: hysteresis.command(rows, dt=1.0)[0], y, groups)
 
 
-def simulated(kind: str, hysteresis: Hysteresis, draws: int) -> list[list[str]]:
+def simulated(kind: str, hysteresis: Motion, draws: int) -> list[list[str]]:
     """Return lines of the table: errors on 12 new motions, and of commands for 12 paths."""
     errors: dict[str, list[tuple[float, float]]] = {}
     for seed in range(draws):

@@ -73,7 +73,11 @@ def main() -> None:
                 q, groups = motions(rng, 24)
                 commands = timed(q, groups // in_a_row)
                 model = HybridForwardModel(
-                    TRUNK, "quadratic", coupling="serial", play="auto", coverage=0.9
+                    TRUNK,
+                    "quadratic",
+                    coupling="serial",
+                    hysteresis="auto",
+                    coverage=0.9,
                 )
                 model.fit(commands, measured(friction, commands, rng), groups=groups)
                 q, groups = motions(rng, 48)

@@ -25,7 +25,7 @@ import numpy as np
 from hysteresis import TRUNK, by_group, creep, many_plays, tips
 from numpy.typing import NDArray
 
-from hybridkin import Commands, PlayOperator, load_model, robots
+from hybridkin import Commands, Hysteresis, load_model, robots
 from hybridkin.app import workflow
 from hybridkin.datasets import Log
 
@@ -33,7 +33,7 @@ ROWS = 60  # in a motion
 NOISE = 5e-4  # [m]
 PERIOD = 1.0  # from row to row [s]
 KINDS = {
-    "backlash": lambda q: PlayOperator(0.02).apply(q)[0],
+    "backlash": lambda q: Hysteresis.backlash(0.02).apply(q)[0],
     "smooth friction": many_plays,
     "creep": creep,
 }

@@ -178,7 +178,7 @@ def fit(setup: Setup, model: str) -> dict[str, Any]:
     setup : Setup
         Robot and log.
     model : str
-        A command such as "fit" or "fit --play auto", or the `error_model` of a hybrid.
+        A command such as "fit" or "fit --hysteresis auto", or the `error_model` of a hybrid.
 
     Returns
     -------
@@ -583,7 +583,10 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--first", type=int, default=0, help="seed of the first robot")
     parser.add_argument("--paths", type=int, default=2, help="for each robot")
     parser.add_argument(
-        "--models", nargs="+", default=[FIT], help='such as "fit --play auto" lwpr'
+        "--models",
+        nargs="+",
+        default=[FIT],
+        help='such as "fit --hysteresis auto" lwpr',
     )
     parser.add_argument(
         "--tendons", type=int, default=3, help="in a segment; 4: two pairs"

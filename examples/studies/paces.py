@@ -18,14 +18,7 @@ import numpy as np
 from hysteresis import TRUNK, by_group, tips
 from numpy.typing import NDArray
 
-from hybridkin import (
-    Commands,
-    CreepOperator,
-    HybridForwardModel,
-    HysteresisSeries,
-    PlayOperator,
-)
-from hybridkin.chains.hysteresis import HysteresisOperator
+from hybridkin import Commands, HybridForwardModel, Hysteresis
 
 ROWS = 60  # in a motion
 STEPS = 10  # of the robot between two rows
@@ -33,11 +26,11 @@ NOISE = 5e-4  # [m]
 MOTIONS = 24
 NEW = 40
 SPEEDS = (0.05, 0.2, 0.5, 1.0, 2.0, 3.0, 10.0)
-CREEP = CreepOperator([0.12, 0.1, 0.08], [1.2, 9.0, 45.0])
-BACKLASH = PlayOperator(0.02)
-KINDS: dict[str, HysteresisOperator] = {
+CREEP = Hysteresis.creep([0.12, 0.1, 0.08], [1.2, 9.0, 45.0])
+BACKLASH = Hysteresis.backlash(0.02)
+KINDS: dict[str, Hysteresis] = {
     "creep": CREEP,
-    "backlash and creep": HysteresisSeries([BACKLASH, CREEP]),
+    "backlash and creep": BACKLASH | CREEP,
     "backlash": BACKLASH,
 }
 HEADER = ["hysteresis", "seed", "speed", "rows", "in the domain", "of these covered"]
@@ -54,7 +47,7 @@ def motions(rng: np.random.Generator, n: int, speed: float = 1.0) -> Commands:
 
 
 def measured(
-    commands: Commands, operator: HysteresisOperator, rng: np.random.Generator
+    commands: Commands, operator: Hysteresis, rng: np.random.Generator
 ) -> NDArray:
     """Return the tips (N, 3) of the robot, whose commands go on between the rows [m]."""
 

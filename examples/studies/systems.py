@@ -21,13 +21,11 @@ import numpy as np
 
 from hybridkin import (
     Commands,
-    CreepOperator,
     ElasticTendonChain,
     ELMRegressor,
     HybridForwardModel,
-    HysteresisSeries,
+    Hysteresis,
     InverseKinematics,
-    PrandtlIshlinskiiOperator,
     datasets,
     native,
     robots,
@@ -52,11 +50,8 @@ MODELS = {
     "network": lambda: fitted(ELMRegressor(30, random_state=0)),
     "serial": lambda: fitted("quadratic", coupling="serial"),
 }
-HYSTERESIS = HysteresisSeries(
-    [
-        PrandtlIshlinskiiOperator([0.0, 0.001, 0.003], [0.3, 0.6]),
-        CreepOperator([0.1], [2.0]),
-    ]
+HYSTERESIS = Hysteresis.friction([0.0, 0.001, 0.003], [0.3, 0.6]) | Hysteresis.creep(
+    [0.1], [2.0]
 )
 CONTROLLERS = {
     "trunk": lambda: InverseKinematics(TRUNK, dq_max=0.1, ddq_max=2.0, **LIMITS),
@@ -68,7 +63,7 @@ CONTROLLERS = {
         dt=0.01,
     ),
     "hysteresis": lambda: InverseKinematics(
-        fitted("linear", play=HYSTERESIS), dq_max=0.1, **LIMITS
+        fitted("linear", hysteresis=HYSTERESIS), dq_max=0.1, **LIMITS
     ),
     "pose": lambda: InverseKinematics(tasks.PoseTask(TRUNK), **LIMITS),
     "half-space": lambda: InverseKinematics(

@@ -1,4 +1,4 @@
-"""What the actuators of a robot are."""
+"""What the actuators of a robot are: rest, kind, segments and balance."""
 
 from __future__ import annotations
 
@@ -23,6 +23,8 @@ class ActuatorLayout(NamedTuple):
         The actuators of every segment, in order of their angles.
     balance : ndarray of shape (n, k)
         Directions along which tendons that do not pull against each other never move [1].
+    tendons : ndarray of shape (n,) of bool
+        Which are tendons of given length.
     """
 
     rest: NDArray
@@ -30,10 +32,11 @@ class ActuatorLayout(NamedTuple):
     signed: NDArray
     segments: list[list[int]]
     balance: NDArray
+    tendons: NDArray
 
     @classmethod
     def independent(cls, n: int) -> ActuatorLayout:
         """Return the layout of n actuators of which nothing is known."""
         segments = [[i] for i in range(n)]
         none = np.zeros(n, dtype=bool)
-        return cls(np.zeros(n), none, ~none, segments, np.zeros((n, 0)))
+        return cls(np.zeros(n), none, ~none, segments, np.zeros((n, 0)), none)

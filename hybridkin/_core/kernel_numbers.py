@@ -30,6 +30,9 @@ KINDS = (
     "stacked",
     "with_pose",
 )
+# Stages of hysteresis, numbered from 1: each has its kernel in a header of this name.
+SOURCES = Path(__file__).parents[1] / "native" / "src"
+STAGES = sorted(path.stem.removeprefix("stage_") for path in SOURCES.glob("stage_*.h"))
 ACTIVATIONS = ("logistic", "tanh", "sin", "gaussian")
 
 # Largest sizes that the kernels support; exported code has those of its model.
@@ -190,6 +193,7 @@ def c_header() -> str:
     numbers: dict[str, float] = {
         f"HK_{kind.upper()}": 1 + i for i, kind in enumerate(KINDS)
     }
+    numbers |= {f"HK_STAGE_{name.upper()}": 1 + i for i, name in enumerate(STAGES)}
     numbers |= {f"HK_{name.upper()}": i for i, name in enumerate(ACTIVATIONS)}
     numbers |= {
         name: n for name, n in globals().items() if name.startswith(("HK_", "IK_"))
@@ -206,6 +210,19 @@ def c_header() -> str:
         else:
             lines.append(f"enum {{ {name} = {number} }};")
     return "\n".join([*lines, ""])
+
+
+def stages_header() -> str:
+    """Return the kernels of the stages of hysteresis as a C header, `stages.h`."""
+    lines = [f'#include "stage_{name}.h"' for name in STAGES]
+    calls = [f"DO(HK_STAGE_{name.upper()}, {name})" for name in STAGES]
+    return "\n".join([*lines, f"#define HK_EACH_STAGE(DO) {' '.join(calls)}", ""])
+
+
+def write_headers(folder: str | Path) -> None:
+    """Write the headers that the C sources include and that are no files: kinds.h and stages.h."""
+    Path(folder, "kinds.h").write_text(c_header())
+    Path(folder, "stages.h").write_text(stages_header())
 
 
 def checksum(sources: Path) -> int:

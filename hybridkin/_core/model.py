@@ -4,21 +4,25 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.autograd import grad
 
+from hybridkin._core.actuation import DIRECT, Actuation
 from hybridkin._core.actuators import ActuatorLayout
-from hybridkin._core.arrays import as_array
-from hybridkin._core.blocks import check_tensor
-from hybridkin._core.derived import KEPT, entries_of
+from hybridkin._core.arrays import identity
+from hybridkin._core.blocks import check_tensor, check_vectors, in_blocks
+from hybridkin._core.frames import Frames, Marker
 from hybridkin._core.html import html_table
-from hybridkin._core.stored import KINDS_OF_MODELS, Layout, Restore, Stored
+from hybridkin._core.plan import NoKernel, Plan
+from hybridkin._core.plausible import PlausibleRows, UnknownRows
+from hybridkin._core.portable import PortableModule
+from hybridkin._core.stored import Layout, Stored
 
 if TYPE_CHECKING:
     from pytorch_kinematics import Transform3d
@@ -28,132 +32,6 @@ Function = Callable[[Tensor], Tensor]
 """A function that works row by row."""
 
 
-class Portable:
-    """An object whose pickle and joblib hash are the same in every process.
-
-    Tensors, also those in dicts, are pickled as plain arrays. They are restored on their device,
-    or on the CPU if this machine lacks it. What belongs to the process is not pickled.
-    """
-
-    def __init_subclass__(cls, **options: object) -> None:
-        """Register a class that sets a `layout`, for plans and for files."""
-        super().__init_subclass__(**options)
-        layout = vars(cls).get("layout")
-        if layout is not None and layout.kind:
-            KINDS_OF_MODELS[layout.kind] = cls
-
-    def __getstate__(self) -> dict[str, Any]:
-        state = vars(self).copy()  # one copy: another thread may add its program
-        for name in ("_program", "_lock", KEPT):
-            state.pop(name, None)
-        return _portable(state)
-
-    def __copy__(self) -> Self:
-        """Return a deep copy: the state holds arrays in place of tensors."""
-        return copy.deepcopy(self)
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state)
-
-
-def _portable(state: dict[str, Any]) -> dict[str, Any]:
-    """Return a state, and the dicts in it, with all tensors as arrays."""
-    portable = type(state)()
-    for name, value in state.items():
-        if isinstance(value, Tensor):
-            value = _Pickled(value)
-        elif isinstance(value, dict):
-            value = _portable(value)
-        portable[name] = value
-    return portable
-
-
-class _Pickled:
-    """A tensor that is pickled as an array; torch's own pickles contain memory addresses."""
-
-    def __init__(self, tensor: Tensor) -> None:
-        self.array = tensor.numpy(force=True)
-        self.device = str(tensor.device)
-        is_leaf = tensor.requires_grad and tensor.is_leaf  # a copy has no graph
-        self.learned = isinstance(tensor, nn.Parameter), is_leaf
-
-    def __reduce__(self) -> tuple[Callable[..., Tensor], tuple[Any, ...]]:
-        if self.learned == (False, False):
-            return _restored, (self.array, self.device)
-        return _restored, (self.array, self.device, *self.learned)
-
-
-def _restored(
-    array: NDArray, device: str, parameter: bool = False, requires_grad: bool = False
-) -> Tensor:
-    tensor = torch.tensor(array, device="cpu")
-    with suppress(AssertionError, RuntimeError):  # this machine may lack the device
-        tensor = tensor.to(device)
-    if parameter:
-        return nn.Parameter(tensor, requires_grad)
-    return tensor.requires_grad_(requires_grad)
-
-
-class PortableModule(Portable, nn.Module):
-    """A module of buffers whose pickle and joblib hash are the same in every process.
-
-    A class that sets `layout` can be saved to files and compiled.
-    """
-
-    # no kind: it could only be stored as code.
-    layout: ClassVar[Layout] = Layout("", {})
-    # Entries of states of earlier versions that are computed from the others now.
-    computed: ClassVar[tuple[str, ...]] = ()
-
-    def stored(self) -> Stored:
-        """Return the description of the module: kind, settings, arrays and parts.
-
-        Raises
-        ------
-        TypeError
-            For modules that could only be stored as code.
-        """
-        layout = self.layout
-        if not layout.kind:
-            raise TypeError(_only_code(self))
-        parts = {name: _described(self._modules.get(name)) for name in layout.parts}
-        settings = {name: vars(self)[name] for name in layout.settings}
-        arrays = {}
-        for name, entry in zip(layout.arrays, self.entries(), strict=True):
-            arrays[name] = None if entry is None else entry.detach()
-        stored = Stored.of(layout.kind, arrays, parts, **settings)
-        for name in layout.derived:
-            stored.derived[name] = as_array(getattr(self, name).detach())
-        return stored
-
-    def entries(self) -> list[Tensor | None]:
-        """Return the entries of the state that describe the module, in the order of `layout`."""
-        return entries_of(self, [*self.layout.arrays])
-
-    @classmethod
-    def from_stored(cls, stored: Stored, restore: Restore) -> Self:
-        """Return the module built from a description; `restore` builds its parts."""
-        arguments: dict[str, Any] = dict(stored.tensors(**cls.layout.arrays))
-        for name, kind in cls.layout.settings.items():
-            arguments[name] = stored.value(name, kind)
-        for name in cls.layout.parts:
-            part = stored.parts.get(name)
-            arguments[name] = None if part is None else restore(part)
-        return cls(**arguments)
-
-    def _load_from_state_dict(
-        self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any
-    ) -> None:
-        for key in [*state_dict]:
-            if key.removeprefix(prefix).split(".")[0] in self.computed:
-                del state_dict[key]
-        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
-
-    if TYPE_CHECKING:  # attributes that no statement assigns are buffers
-
-        def __getattr__(self, name: str) -> Tensor: ...
-
-
 class ForwardModel(PortableModule):
     """A model of a robot: a torch module that maps every row of q to a row of x.
 
@@ -161,16 +39,25 @@ class ForwardModel(PortableModule):
     calibration and plots use nothing else. A subclass defines `forward`, and
     `forward_and_jacobian` if it has a closed form.
 
+    Everything else is an answer that suits a model of which nothing is known: no geometry, no
+    limits, no segments, no warnings. A model that knows more overrides it.
+
     Attributes
     ----------
     n_actuators : int
         Length of q; 0 if unknown, e.g. for a function.
     n_outputs : int
         Length of x; 0 if unknown.
+    markers : tuple of K tuples of four floats
+        Places of the points of the robot that are the outputs, see `Marker`; empty: unknown.
+    takes_lengths : bool
+        Whether q holds lengths, or their changes, of a known geometry.
     """
 
     n_actuators: int = 0
     n_outputs: int = 0
+    markers: tuple[Marker, ...] = ()
+    takes_lengths: ClassVar[bool] = False
 
     def _repr_html_(self) -> str:
         return html_table(type(self).__name__, self.html_rows())
@@ -203,14 +90,125 @@ class ForwardModel(PortableModule):
         """Sign of q in which an actuator can only pull, () or (n,); 0 if it can also push."""
         return 0.0
 
+    # What is known of the actuators.
+
+    @property
+    def unit_of_q(self) -> str | list[str]:
+        """Unit of q, or of each actuator."""
+        return "as in training"
+
+    @property
+    def unit_of_x(self) -> str:
+        """Unit of x."""
+        return "as in training"
+
+    @property
+    def in_metres(self) -> bool:
+        """Whether q is taken as metres, without a gain."""
+        return True
+
+    @property
+    def actuator_layout(self) -> ActuatorLayout:
+        """Rest, kind and segment of every actuator."""
+        return ActuatorLayout.independent(self.n_actuators)
+
+    @property
+    def rings(self) -> tuple[slice, ...]:
+        """Actuators that stand about the backbone together, segment by segment; maybe none."""
+        return ()
+
+    def effective_directions(self) -> NDArray:
+        """Return the projector (n, n) on directions of q that move the robot; default: all."""
+        return np.eye(self.n_actuators)
+
+    def balanced(self, q: NDArray, low: NDArray, high: NDArray) -> NDArray:
+        """Return rows near q (N, n) in which no tendons pull against each other, within limits.
+
+        Rows that have no such neighbour are left out. Default: q itself.
+        """
+        return q
+
+    def pulled(self, q: Tensor, low: Tensor, high: Tensor) -> Tensor:
+        """Return how far actuators are pulled, 0 to 1, at q (..., n): from `high` to `low`."""
+        return (high - q) / (high - low)
+
+    def slack(self, q: Tensor) -> Tensor:
+        """Return which actuators are slack at q (..., n), bool; default: none."""
+        return torch.zeros_like(q, dtype=torch.bool)
+
+    # What is known of the body.
+
+    @property
+    def hysteresis(self) -> Actuation:
+        """The hysteresis between commands and q, which is what the actuators do; maybe none."""
+        return DIRECT
+
     @property
     def has_pose(self) -> bool:
         """Whether the model has poses of the tip, as a chain has."""
         return False
 
+    def geometry(self) -> dict[str, Tensor]:
+        """Return the geometry by name; empty if the model has none that can be calibrated."""
+        return {}
+
+    @property
+    def default_parameters(self) -> tuple[str, ...]:
+        """Names of the entries of the geometry that a calibration fits by default."""
+        return ()
+
+    @property
+    def origin(self) -> Tensor:
+        """Where the base of the robot is in the measuring frame, shape (3,) [m]."""
+        return torch.zeros(3, dtype=torch.float64, device="cpu")
+
+    @property
+    def reach(self) -> Tensor:
+        """Length of the robot, the unit of its motions, shape () [m]; 1 where it is unknown."""
+        return torch.ones((), dtype=torch.float64, device="cpu")
+
+    @property
+    def least_radius(self) -> float:
+        """Smallest radius of the body [m]; infinite: unknown."""
+        return math.inf
+
+    @property
+    def n_arcs(self) -> int:
+        """Number of arcs of the body; 0: it is not made of arcs."""
+        return 0
+
+    @property
+    def has_one_arc_per_segment(self) -> bool:
+        """Whether the body is made of segments of one arc each."""
+        return False
+
+    def frames_and_moves(self, rows: Tensor) -> Frames:
+        """Return the frames after all segments at rows q (N, n), with derivatives of the end.
+
+        Only models with `n_arcs` have them.
+        """
+        raise NotImplementedError
+
+    def with_tip(self, at: float) -> ForwardModel:
+        """Return a model of another point of the robot, `at` in segments from the base."""
+        raise TypeError(
+            f"`chain` must have with_tip(at), e.g. a chain of arcs, got {type(self).__name__}."
+        )
+
+    def joined(self, tips: list[ForwardModel]) -> ForwardModel:
+        """Return the model of all markers of models of one marker each, as from `each_tip`."""
+        raise NotImplementedError
+
+    # Other models of the same robot.
+
     @property
     def robot(self) -> ForwardModel:
         """The model with the geometry: the mechanical model of a hybrid, else the model itself."""
+        return self
+
+    @property
+    def without_hysteresis(self) -> ForwardModel:
+        """The model of actuators that do what they are commanded."""
         return self
 
     @property
@@ -227,21 +225,33 @@ class ForwardModel(PortableModule):
         """Return one model for each point of the robot: a chain of K markers has K."""
         return [self]
 
-    @property
-    def actuator_layout(self) -> ActuatorLayout:
-        """Rest, kind and segment of every actuator."""
-        return ActuatorLayout.independent(self.n_actuators)
-
-    def softer(self) -> Sequence[ForwardModel]:
-        """Return the same robot with actuators that give way, where that may matter."""
-        return []
-
     def unit_messages(self, q: Tensor, name: str, factor: float = 1.0) -> list[str]:
         """Return warnings if q (N, n) holds values too large to be metres or radians.
 
         `factor` scales the limits.
         """
         return []
+
+    def check_actuators(self, q: Tensor, name: str = "q") -> list[str]:
+        """Return warnings about the units of q (..., n); raise if it cannot be a log."""
+        return []
+
+    def contradictions(self, q: Tensor, name: str = "q") -> list[str]:
+        """Return a warning if the actuators of q (..., n) contradict each other."""
+        return []
+
+    def tip_messages(
+        self, q: Tensor, x: Tensor, name: str, calibrated: bool = False
+    ) -> list[str]:
+        """Return a warning if tips x (N, m), measured at rows q (N, n), span too far for metres.
+
+        If the model is calibrated, its own tips are counted with them. Missing markers are NaN.
+        """
+        return []
+
+    def plausible_rows(self) -> PlausibleRows:
+        """Return bounds of rows that need no warning about units or contradictions."""
+        return UnknownRows.of(self.n_actuators)
 
     @property
     def size(self) -> float:
@@ -268,6 +278,15 @@ class ForwardModel(PortableModule):
         All tips of q with ``|q| <= largest``, shape () or (n,). Default: 0, no bound is known.
         """
         return x.new_zeros(x.shape[:-1])
+
+    def by_rows(
+        self,
+        function: Callable[[Tensor], tuple[Tensor, ...]],
+        q: Tensor,
+        size: int = 4096,
+    ) -> tuple[Tensor, ...]:
+        """Return the tensors (..., K) of a function of rows (N, n) at q (..., n), by blocks."""
+        return in_blocks(function, q, size)
 
     def forward(self, q: Tensor) -> Tensor:
         """Return x of shape (..., n_outputs) for q of shape (..., n_actuators)."""
@@ -326,6 +345,14 @@ class ForwardModel(PortableModule):
         """Return x (N, m) of inner coordinates z (N, C) and dx/dz (N, m, C)."""
         return self.forward_and_jacobian(z)
 
+    def tips_by_coordinates(self) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
+        """Return `from_coordinates_and_jacobian` for many calls without derivatives."""
+        return self.from_coordinates_and_jacobian
+
+    def up_to_tip(self, coordinates: Tensor) -> Tensor:
+        """Return inner coordinates of the whole robot (C, ...), or their slope, up to the tip."""
+        return coordinates
+
     def compliance_columns(self, q: Tensor) -> Tensor:
         """Return A (N, 3 K, C) at rows q (N, n): a force w at the tip moves it along A A' w.
 
@@ -333,16 +360,7 @@ class ForwardModel(PortableModule):
         """
         return self.forward_and_jacobian(q)[1]
 
-
-class PoseModel(ForwardModel):
-    """A forward model of the tip position that can also return the tip pose."""
-
-    n_outputs: int = 3
-
-    @property
-    def has_pose(self) -> bool:
-        """Whether the model has poses of the tip."""
-        return True
+    # Poses, which a `PoseModel` has.
 
     def pose(self, q: Tensor) -> Tensor:
         """Return the tip's pose in the measuring frame, shape (..., 4, 4)."""
@@ -364,6 +382,244 @@ class PoseModel(ForwardModel):
         from pytorch_kinematics import Transform3d  # takes a second and loads pyplot
 
         return Transform3d(matrix=self.pose(q))
+
+    def softer(self) -> list[ForwardModel]:
+        """Return the same robot with actuators that give way, where that may matter."""
+        return []
+
+    # The robot after a change.
+
+    def shifted(self, shift: Tensor) -> ForwardModel:
+        """Return the model f(q + shift), after a shift (n,) of the actuator zeros [unit of q]."""
+        return Shifted(self, shift) if shift.any() else self
+
+    def moved(self, motion: Tensor) -> ForwardModel:
+        """Return the model T f(q), after a motion T (4, 4) of the base."""
+        return self if is_at_rest(motion) else Moved(self, motion)
+
+
+class PoseModel(ForwardModel):
+    """A forward model of the tip position that can also return the tip pose."""
+
+    n_outputs: int = 3
+
+    @property
+    def unit_of_x(self) -> str:
+        """Unit of x."""
+        return "m"
+
+    @property
+    def has_pose(self) -> bool:
+        """Whether the model has poses of the tip."""
+        return True
+
+
+class Wrapped(PoseModel):
+    """A model that stands before or after another one, of positions or of poses.
+
+    Parameters
+    ----------
+    model : ForwardModel
+        The other model.
+    """
+
+    model: ForwardModel
+
+    def __init__(self, model: ForwardModel) -> None:
+        super().__init__()
+        self.model = model
+        self.n_actuators = model.n_actuators
+        self.n_outputs = model.n_outputs
+
+    @property
+    def unit_of_q(self) -> str | list[str]:
+        """Unit of q of the other model."""
+        return self.model.unit_of_q
+
+    @property
+    def unit_of_x(self) -> str:
+        """Unit of x of the other model."""
+        return self.model.unit_of_x
+
+    @property
+    def has_pose(self) -> bool:
+        """Whether the other model has poses."""
+        return self.model.has_pose
+
+    @property
+    def robot(self) -> ForwardModel:
+        """The model with the geometry, changed like this one."""
+        robot = self.model.robot
+        return self if robot is self.model else self.around(robot)
+
+    @property
+    def tip_model(self) -> ForwardModel:
+        """The model of the tip alone, changed like this one."""
+        tip = self.model.tip_model
+        return self if tip is self.model else self.around(tip)
+
+    @property
+    def plane(self) -> tuple[Tensor, Tensor] | None:
+        """The plane of the log."""
+        return self.model.plane
+
+    @property
+    def hysteresis(self) -> Actuation:
+        """The hysteresis between commands and q."""
+        return self.model.hysteresis
+
+    @property
+    def without_hysteresis(self) -> ForwardModel:
+        """The model of actuators that do what they are commanded."""
+        return self.around(self.model.without_hysteresis)
+
+    def around(self, model: ForwardModel) -> ForwardModel:
+        """Return another model, changed like this one."""
+        raise NotImplementedError
+
+    def forward(self, q: Tensor) -> Tensor:
+        """Return the outputs of the other model for what it gets, shape (..., m) [m]."""
+        return self.model(self._inner(q))
+
+    def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return x (..., m) and dx/dq (..., m, n)."""
+        return self.model.forward_and_jacobian(self._inner(q))
+
+    def pose_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return `pose(q)` and `pose_jacobian(q)` in one pass."""
+        return self.model.pose_and_jacobian(self._inner(q))
+
+    def domain_distance(self, q: Tensor) -> Tensor:
+        """Return the distance from the training rows of what the other model gets, (...)."""
+        return self.model.domain_distance(self._inner(q))
+
+    def has_shape(self, q: Tensor) -> Tensor:
+        """Return whether the other model has a shape, (...), bool."""
+        return self.model.has_shape(self._inner(q))
+
+    def _inner(self, q: Tensor) -> Tensor:
+        """Return what the other model gets for q."""
+        return q
+
+
+def _place_within(plan: Plan, stored: Stored, *before: str) -> int:
+    """Return the place of the model within; kernels know no model of the kinds `before` there."""
+    place = plan.node_of(stored.part("model"))
+    if plan.kind(place) in before:
+        raise NoKernel(f"a model {plan.kind(place)} within one {stored.kind}")
+    return place
+
+
+def _write_shifted(plan: Plan, stored: Stored) -> int:
+    model = _place_within(plan, stored, "shifted")
+    n, m = plan.lengths(model)
+    return plan.node("shifted", n, m, [stored.array("shift", (n,))], model)
+
+
+class Shifted(Wrapped):
+    """The model f(q + shift) of a robot whose actuator zeros have shifted.
+
+    Parameters
+    ----------
+    model : ForwardModel
+        f.
+    shift : Tensor of shape (n,)
+        Shift of the zeros [unit of q].
+    """
+
+    layout = Layout(
+        "shifted", {"shift": "n"}, parts=("model",), write_plan=_write_shifted
+    )
+
+    def __init__(self, model: ForwardModel, shift: Tensor) -> None:
+        super().__init__(model)
+        self.register_buffer("shift", shift)
+        self.n_actuators = len(shift)
+
+    @property
+    def plane(self) -> tuple[Tensor, Tensor] | None:
+        """The plane of the log, where it lies after the shift."""
+        plane = self.model.plane
+        return None if plane is None else (plane[0] - self.shift, plane[1])
+
+    def around(self, model: ForwardModel) -> ForwardModel:
+        """Return another model after the same shift."""
+        return model.shifted(self.shift)
+
+    def misses(self, x: Tensor, largest: Tensor) -> Tensor:
+        """Return by how much targets are out of reach of f, shape (...) [m]."""
+        return self.model.misses(x, largest + self.shift.abs().to(largest.device))
+
+    def _inner(self, q: Tensor) -> Tensor:
+        check_vectors(
+            q, len(self.shift), "q", f"this robot has {len(self.shift)} actuators"
+        )
+        return q + self.shift.to(q)
+
+
+def _write_moved(plan: Plan, stored: Stored) -> int:
+    model = _place_within(plan, stored, "shifted", "moved")
+    n, m = plan.lengths(model)
+    motion = stored.array("motion", (4, 4))
+    return plan.node("moved", n, m, [motion[:3, :3], motion[:3, 3]], model)
+
+
+class Moved(Wrapped):
+    """The model T f(q) of a robot whose base has moved.
+
+    Parameters
+    ----------
+    model : ForwardModel
+        f, whose outputs are one or several tips in space.
+    motion : Tensor of shape (4, 4)
+        T, the motion of the base in the measuring frame.
+    """
+
+    layout = Layout(
+        "moved", {"motion": "44"}, parts=("model",), write_plan=_write_moved
+    )
+
+    def __init__(self, model: ForwardModel, motion: Tensor) -> None:
+        super().__init__(model)
+        self.register_buffer("motion", motion)
+
+    def around(self, model: ForwardModel) -> ForwardModel:
+        """Return another model after the same motion."""
+        return model.moved(self.motion)
+
+    def forward(self, q: Tensor) -> Tensor:
+        """Return T f(q), shape (..., m) [m]."""
+        return moved_points(super().forward(q), self.motion)
+
+    def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return T f(q) (..., m) and its derivative (..., m, n)."""
+        x, J = super().forward_and_jacobian(q)
+        return moved_points(x, self.motion), _turned(J.mT, self.motion).mT
+
+    def pose_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return `pose(q)` and `pose_jacobian(q)` in one pass."""
+        T, J = super().pose_and_jacobian(q)
+        return self.motion.to(T) @ T, _turned(J.mT, self.motion).mT
+
+    def misses(self, x: Tensor, largest: Tensor) -> Tensor:
+        """Return by how much targets before T are out of reach of f, shape (...) [m]."""
+        before = moved_points(x, torch.linalg.inv(self.motion))
+        return self.model.misses(before, largest)
+
+
+def is_at_rest(motion: Tensor) -> bool:
+    """Return whether a motion (4, 4) moves nothing."""
+    return torch.equal(motion, identity(4, motion))
+
+
+def moved_points(x: Tensor, motion: Tensor) -> Tensor:
+    """Return points (..., 3), or several of them in (..., m), moved by a motion (4, 4)."""
+    return _turned(x, motion) + motion[:3, 3].to(x).repeat(x.shape[-1] // 3)
+
+
+def _turned(v: Tensor, motion: Tensor) -> Tensor:
+    """Return vectors (..., 3), or several of them in (..., m), rotated by a motion (4, 4)."""
+    return (v.unflatten(-1, (-1, 3)) @ motion[:3, :3].to(v).mT).flatten(-2)
 
 
 class FunctionModel(ForwardModel):
@@ -527,22 +783,3 @@ def _called(function: Function, q: Tensor) -> Tensor:
             "`tasks.PositionTask.from_numpy(function, jacobian)`."
         )
     return x if dtype == q.dtype else x.to(q.dtype)
-
-
-def _described(module: nn.Module | None) -> Stored | None:
-    if module is None:
-        return None
-    if isinstance(module, PortableModule):
-        return module.stored()
-    if not isinstance(module, nn.ModuleList):
-        raise TypeError(_only_code(module))
-    parts = {str(k): _described(part) for k, part in enumerate(module)}
-    return Stored.of("list", parts=parts)
-
-
-def _only_code(module: nn.Module) -> str:
-    return (
-        f"a {type(module).__name__} could only be stored as code; a saved model is made of chains "
-        "(ConstantCurvatureChain, ElasticTendonChain, RigidChain) and of error models given by "
-        "name, ELMs, a LinearRegression or a KernelRidge with the kernel 'rbf'."
-    )

@@ -9,6 +9,7 @@ from typing import TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import Self
 
 _FLOAT64 = np.dtype(np.float64)
 
@@ -56,3 +57,25 @@ class PlausibleRows:
         lengths = np.linalg.norm(self.weights, axis=1)
         largest = float(lengths.max(initial=np.finfo(float).tiny))
         return 1.0 / largest - math.hypot(*self.rest.tolist())
+
+
+class UnknownRows(PlausibleRows):
+    """No bounds: they are not known, so the model itself checks all rows."""
+
+    @classmethod
+    def of(cls, n: int) -> Self:
+        """Return the bounds of rows of n actuators."""
+        return cls(np.zeros(n), np.zeros((0, n)))
+
+    def hold(self, q: NDArray) -> bool:
+        """Return False: the model has to look."""
+        return False
+
+    def hold_row(self, q: object) -> TypeGuard[NDArray]:
+        """Return False: the model has to look."""
+        return False
+
+    @cached_property
+    def small(self) -> float:
+        """Infinite: no length of q is known to be too large."""
+        return math.inf

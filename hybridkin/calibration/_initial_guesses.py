@@ -14,7 +14,6 @@ from torch import Tensor
 from hybridkin._core.rotations import rigid_motion
 from hybridkin.calibration._least_squares import Rows
 from hybridkin.calibration.measured import points
-from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
 
 _Chain = TypeVar("_Chain", bound=Chain)
@@ -49,7 +48,7 @@ def initial_guesses(chain: Chain, rows: Rows, names: tuple[str, ...]) -> list[Gu
     free_base = "base" in names
     if free_base:
         guesses.append(Guess(aligned(chain, rows)))
-    if not isinstance(chain, ArcChain):
+    if not chain.rings:
         return guesses
     if "angles" in names or "turns" in names:
         step = max(1, len(rows.q) // _ROWS)
@@ -57,7 +56,7 @@ def initial_guesses(chain: Chain, rows: Rows, names: tuple[str, ...]) -> list[Gu
         scales = _SCALES if "radii" in names else (1.0,)
         guesses += _best_rings(chain, few, free_base, scales)
     elif free_base:
-        mirrored = [(True, 0.0)] * len(chain.actuators_per_segment)
+        mirrored = [(True, 0.0)] * len(chain.rings)
         image = aligned(_with_rings(chain, mirrored), rows)
         if rows.rmse(image) < rows.rmse(guesses[-1].chain):
             guesses.append(Guess(image, mirrored=True))
@@ -81,12 +80,12 @@ def _alignment(chain: Chain, rows: Rows) -> tuple[Tensor, float]:
 
 
 def _best_rings(
-    chain: ArcChain, rows: Rows, free_base: bool, scales: tuple[float, ...]
+    chain: Chain, rows: Rows, free_base: bool, scales: tuple[float, ...]
 ) -> list[Guess]:
     """Return the best guesses of a search ring by ring, for several scales of the radii."""
     error_of = cache(partial(_error, chain, rows, free_base))
     best: dict[_Rings, tuple[float, float]] = {}  # least error, and its scale
-    n_segments = len(chain.actuators_per_segment)
+    n_segments = len(chain.rings)
     for scale, mirrored in product(scales, (False, True)):
         rings: _Rings = ((mirrored, 0.0),) * n_segments
         error = math.inf
@@ -114,26 +113,24 @@ def _best_rings(
     return [*likely[False], *likely[True]]
 
 
-def _error(
-    chain: ArcChain, rows: Rows, align: bool, rings: _Rings, scale: float
-) -> float:
+def _error(chain: Chain, rows: Rows, align: bool, rings: _Rings, scale: float) -> float:
     """Return the root mean square tip distance with these rings and scaled radii."""
     changed = _scaled(_with_rings(chain, rings), scale)
     return _alignment(changed, rows)[1] if align else rows.rmse(changed)
 
 
-def _scaled(chain: ArcChain, scale: float) -> ArcChain:
+def _scaled(chain: Chain, scale: float) -> Chain:
     """Return the chain with all radii times a factor."""
     if scale == 1.0:
         return chain
     return chain.with_geometry(radii=scale * chain.geometry()["radii"])
 
 
-def _with_rings(chain: ArcChain, rings: Sequence[tuple[bool, float]]) -> ArcChain:
+def _with_rings(chain: Chain, rings: Sequence[tuple[bool, float]]) -> Chain:
     """Return the chain with every ring of actuators mirrored or not, then turned."""
     angles = chain.geometry()["angles"]
     changed = []
-    parts = angles.split(list(chain.actuators_per_segment))
-    for ring, (mirrored, turn) in zip(parts, rings, strict=True):
-        changed.append((-ring if mirrored else ring) + turn)
+    for ring, (mirrored, turn) in zip(chain.rings, rings, strict=True):
+        sign = -1.0 if mirrored else 1.0
+        changed.append(sign * angles[ring] + turn)
     return chain.with_geometry(angles=torch.cat(changed))

@@ -2,35 +2,20 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from torch import Tensor
 
 from hybridkin._core.rotations import cross_matrix, rotation
 from hybridkin.calibration.natural_scales import GEOMETRY
-from hybridkin.chains.arc_chain import ALIASES, ArcChain
 from hybridkin.chains.chain import Chain
-from hybridkin.chains.rigid import RigidChain
 
-# Geometry that keeps its sign, and the factor by which it can grow or shrink from its start.
-_FACTORS = {
-    "radii": 5.0,
-    "lengths": 5.0,
-    "gains": 5.0,
-    "bending_stiffness": 1e4,
-    "axial_stiffness": 1e4,
-    "weight": 1e4,
-}
 _WIDEST = 1e6  # a prior of a million natural units has no effect, and is finite
-_LARGEST_TAPER = 0.95
-_SHORTEST = -0.1  # of the robot's length: a marker may sit a little before the end
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,21 +153,11 @@ class Pose(Parameter):
         return entry
 
 
-def parameter_names(chain: Chain) -> list[str]:
-    """Return the names that `calibrate` accepts for a chain."""
-    names = [*chain.geometry()]
-    if isinstance(chain, ArcChain):
-        names += ALIASES
-    return names
-
-
 def parameter(chain: Chain, name: str) -> Parameter:
     """Return one parameter at the chain's present geometry."""
-    geometry = {key: value.detach().cpu() for key, value in chain.geometry().items()}
-    entry = name
-    if name not in geometry:
-        entry = ALIASES[name]
-    start = geometry[entry]
+    part = chain.part_of(name)
+    entry = part.entry
+    start = chain.geometry()[entry].detach().cpu()
     if entry == "base":
         reach = float(chain.reach)
         units = np.array([1.0, 1.0, 1.0, reach, reach, reach])
@@ -190,71 +165,22 @@ def parameter(chain: Chain, name: str) -> Parameter:
         labels = tuple(f"base[{axis}]" for axis in axes)
         kinds = ("rad", "rad", "rad", "m", "m", "m")
         return Pose(name, entry, start, labels, units, kinds, (6,))
-    shape = tuple(start.shape)
-    directions = np.eye(start.numel())
-    shown = np.arange(start.numel())
-    if name == "turns" and isinstance(chain, ArcChain):
-        counts = np.array(chain.actuators_per_segment)
-        directions = np.repeat(np.eye(len(counts)), counts, axis=0)
-        shown = np.cumsum(counts) - counts
-        shape = (len(counts),)
-    elif name == "gain":
-        directions = np.ones((start.numel(), 1))
-        shown = shown[:1]
-        shape = ()
-    elif name != entry:  # "tool"
-        directions = directions[:, -1:]
-        shown = shown[-1:]
-        shape = ()
-    unit, kind, low, high = _scale(chain, geometry, entry)
-    units = np.broadcast_to(unit, len(shown))
-    form = Factors if entry in _FACTORS else Shifts
+    scale = chain.scale_of(entry)
+    units = np.broadcast_to(scale.unit, len(part.shown))
+    form = Factors if scale.keeps_sign else Shifts
     return form(
         name,
         entry,
         start,
-        _labels(name, shape),
+        _labels(name, part.shape),
         units,
-        tuple(np.broadcast_to(kind, len(shown)).tolist()),
-        shape,
-        torch.from_numpy(directions * units),
-        shown,
-        low,
-        high,
+        tuple(np.broadcast_to(scale.kind, len(part.shown)).tolist()),
+        part.shape,
+        torch.from_numpy(part.directions * units),
+        part.shown,
+        scale.low,
+        scale.high,
     )
-
-
-class _Scale(NamedTuple):
-    """Natural unit of an entry, the kind of this unit, and the physical limits of its numbers."""
-
-    unit: ArrayLike
-    kind: str | list[str]
-    low: float = -math.inf
-    high: float = math.inf
-
-
-def _scale(chain: Chain, geometry: Mapping[str, Tensor], entry: str) -> _Scale:
-    reach = float(chain.reach)
-    if entry in _FACTORS:
-        return _Scale(1.0, "-", 1.0 / _FACTORS[entry], _FACTORS[entry])
-    if entry == "rest_bends":
-        return _Scale(1.0, "rad", -math.pi, math.pi)
-    if entry == "angles":
-        return _Scale(1.0, "rad")
-    if entry == "taper":
-        return _Scale(1.0, "-", 0.0, _LARGEST_TAPER)
-    if entry == "offsets":
-        return _Scale(reach, "m", low=_SHORTEST * reach)
-    if entry == "joint_zeros" and isinstance(chain, RigidChain):
-        kinds = list(chain.units)
-        return _Scale(np.where(np.array(kinds) == "m", reach, 1.0), kinds)
-    if entry == "tendon_zeros":
-        return _Scale(float(geometry["radii"].mean()), "m")
-    if entry == "actuator_zeros":
-        gains = geometry["gains"]
-        kind = "m" if (gains == 1.0).all() else "q"
-        return _Scale(float(geometry["radii"].mean() / gains.abs().mean()), kind)
-    return _Scale(reach, "m")
 
 
 def _labels(name: str, shape: tuple[int, ...]) -> tuple[str, ...]:

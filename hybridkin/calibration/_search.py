@@ -13,8 +13,6 @@ from hybridkin.calibration._least_squares import ROUGH, Fit, Rows, solve
 from hybridkin.calibration._parameters import Problem
 from hybridkin.calibration.natural_scales import GEOMETRY
 from hybridkin.chains.chain import Chain
-from hybridkin.chains.constant_curvature import ConstantCurvatureChain
-from hybridkin.chains.elastic_tendons import ElasticTendonChain
 
 _EQUAL = 1.0 - 1e-4  # among guesses with nearly equal errors the given chain is taken
 _BETTER = 0.8  # a mirror image must lower the error to this fraction,
@@ -57,8 +55,8 @@ def widened(
 ) -> Start:
     """Return the start of a fit of more parameters, or of elastic tendons, from another start."""
     chain = start.problem.chain
-    if elastic and isinstance(chain, ConstantCurvatureChain):
-        chain = ElasticTendonChain.from_chain(chain)
+    if elastic:
+        chain = chain.with_elastic_tendons()
     problem = Problem.of(chain, names)
     values = {}
     for part, place in start.problem.places():

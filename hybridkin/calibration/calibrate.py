@@ -23,10 +23,8 @@ from hybridkin._core.arrays import (
     one_of,
 )
 from hybridkin._core.distinct import distinct_rows, targets_that_count
-from hybridkin._core.model import Portable
-from hybridkin._core.units import motion_message
+from hybridkin._core.portable import Portable
 from hybridkin.calibration._least_squares import HELD_OUT, LOSSES, Fit, Rows, solve
-from hybridkin.calibration._parameters import parameter_names
 from hybridkin.calibration._search import Start, search
 from hybridkin.calibration._unidentified import sentences
 from hybridkin.calibration.measured import (
@@ -36,7 +34,6 @@ from hybridkin.calibration.measured import (
     with_missing_markers,
 )
 from hybridkin.calibration.natural_scales import GEOMETRY
-from hybridkin.chains.arc_chain import ALIASES
 from hybridkin.chains.chain import Chain
 
 __all__ = ["CalibrationResult", "calibrate"]
@@ -239,6 +236,7 @@ def fit_geometry(
 
     A `start` from `search` for the same chain and parameters replaces the search.
     """
+    # The public entry: a function or an estimator has no geometry.
     if not isinstance(chain, Chain):
         raise TypeError(
             "`chain` must be a ConstantCurvatureChain, an ElasticTendonChain, a RigidChain or "
@@ -271,7 +269,7 @@ def fit_geometry(
         start.message,
         _few(best, rows),
         unphysical_message,
-        best.chain().contradiction(q),
+        *best.chain().contradictions(q),
     ]
     if not unit_messages:
         messages.append(_unexplained(best, rows))
@@ -414,7 +412,7 @@ def _cross_validate(best: Fit, rows: Rows, groups: NDArray, loss: str) -> float:
 
 def _check_parameters(chain: Chain, parameters: Sequence[str]) -> tuple[str, ...]:
     names = (parameters,) if isinstance(parameters, str) else tuple(parameters)
-    available = parameter_names(chain)
+    available = chain.parameter_names
     unknown = [str(name) for name in names if name not in available]
     if unknown or not names or len(set(names)) < len(names):
         hint = "."
@@ -424,7 +422,7 @@ def _check_parameters(chain: Chain, parameters: Sequence[str]) -> tuple[str, ...
             f"`parameters` must name different entries of {available} for this chain, got "
             f"{names}{hint}"
         )
-    for alias, entry in ALIASES.items():
+    for alias, entry in chain.aliases.items():
         if alias in names and entry in names:
             raise ValueError(
                 f"`parameters` must not hold both {entry!r} and {alias!r}, which is a part of it; "
@@ -446,13 +444,7 @@ def check_data(
         raise ValueError("`q` must hold at least one row, got none.")
     messages = chain.check_actuators(q)
     x = torch.from_numpy(with_missing_markers(x.numpy(force=True), "x"))
-    predicted = chain(q)
-    measured = torch.where(x.isnan(), predicted, x)
-    reach = float(chain.reach.detach())
-    motion = motion_message("x", measured, predicted, reach)
-    if motion is not None:
-        messages = [*messages, motion]
-    return q, x, messages
+    return q, x, [*messages, *chain.tip_messages(q, x, "x")]
 
 
 def _check_weights(sample_weight: Numbers | None, q: Tensor) -> Tensor:

@@ -20,8 +20,6 @@ from hybridkin.calibration._search import Start, search, widened
 from hybridkin.calibration.calibrate import check_data
 from hybridkin.calibration.measured import evenly_spaced, folds, inner_and_outer
 from hybridkin.chains.chain import Chain
-from hybridkin.chains.constant_curvature import ConstantCurvatureChain
-from hybridkin.chains.elastic_tendons import ElasticTendonChain
 
 # rows and folds for the scores
 _MOST = 400
@@ -126,13 +124,7 @@ class _Candidate(NamedTuple):
     @property
     def free_rings(self) -> set[str]:
         """The free parameters of the actuator rings that require a search."""
-        names = set(self.parameters)
-        rings = set()
-        if "angles" in names or "turns" in names:
-            rings.add("angles")
-        if "radii" in names and not isinstance(self.chain, ElasticTendonChain):
-            rings.add("radii")
-        return rings
+        return self.chain.free_rings(self.parameters)
 
 
 class _Split(NamedTuple):
@@ -281,21 +273,16 @@ def _candidates(
     chain: Chain, q: Tensor, parameters: Sequence[str] | None
 ) -> list[_Candidate]:
     """Return the sets to choose from, the smaller ones first."""
-    elastic = None
-    if isinstance(chain, ConstantCurvatureChain) and not any(chain.extensible):
-        if chain.contradictory(q).any():
-            elastic = ElasticTendonChain.from_chain(chain)
     sets = chain.parameter_sets
     if parameters is not None:
         sets = [tuple(parameters)]
     candidates = [_Candidate(_name(names), chain, names) for names in sets]
-    if elastic is None:
-        return candidates
-    elastic_sets = [names for names in elastic.parameter_sets if len(names) > 1]
-    if parameters is not None:
-        elastic_sets = [_elastic_parameters(chain, elastic, sets[0])]
-    for names in elastic_sets:
-        candidates.append(_Candidate(_RIVAL + _name(names), elastic, names))
+    for elastic in chain.rivals(q):
+        elastic_sets = [names for names in elastic.parameter_sets if len(names) > 1]
+        if parameters is not None:
+            elastic_sets = [_elastic_parameters(chain, elastic, sets[0])]
+        for names in elastic_sets:
+            candidates.append(_Candidate(_RIVAL + _name(names), elastic, names))
     return candidates
 
 

@@ -9,6 +9,10 @@ from hybridkin._core.blocks import in_blocks
 from hybridkin._core.kernel_numbers import HK_LEAST_LENGTH
 from hybridkin._core.named_rows import named_rows, without_warnings
 from hybridkin.chains.arc_chain import ArcChain
+from hybridkin.chains.calibratable import Scale
+
+_FACTORS = ("bending_stiffness", "axial_stiffness", "weight")
+_FACTOR = 1e4  # by which these can grow or shrink in a calibration
 
 COMPRESSED = (
     f"compressed: in {{rows}} an arc is below {HK_LEAST_LENGTH:g} of its rest length"
@@ -17,6 +21,12 @@ COMPRESSED = (
 
 class ElasticBody(ArcChain):
     """A chain of arcs in balance; results are NaN where it has no shape."""
+
+    def scale_of(self, entry: str) -> Scale:
+        """Return the natural scale of the numbers of an entry of the geometry."""
+        if entry in _FACTORS:
+            return Scale.factor(_FACTOR)
+        return super().scale_of(entry)
 
     def has_shape(self, q: Tensor) -> Tensor:
         """Return whether the body has a shape at q (..., n), shape (...), bool."""

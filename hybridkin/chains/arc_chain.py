@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
@@ -16,11 +16,9 @@ from torch import Tensor
 
 from hybridkin._core.actuators import ActuatorLayout
 from hybridkin._core.arrays import as_array, identity, whole
-from hybridkin._core.blocks import in_blocks
+from hybridkin._core.frames import Frames
 from hybridkin._core.plan import NoKernel, Plan
-from hybridkin._core.plausible import PlausibleRows
 from hybridkin._core.stored import Restore, Stored
-from hybridkin._core.units import LONGEST_PULL, length_message
 from hybridkin.chains._arcs import (
     Segments,
     rolled,
@@ -31,18 +29,21 @@ from hybridkin.chains._arcs import (
 )
 from hybridkin.chains._checks import arc_geometry
 from hybridkin.chains._paths import bend_matrix, path_starts, reading_matrix
+from hybridkin.chains.body import Body, actuator_path, disk
+from hybridkin.chains.calibratable import Part, Scale
 from hybridkin.chains.markers import MarkedChain
+from hybridkin.native.library import Program, program_of
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-ALIASES = {"turns": "angles", "tool": "offsets", "gain": "gains"}
-"""Parameters of `calibrate` that change a part of an entry of the geometry, and that entry."""
-
 Change = Callable[[Tensor], Tensor]
 _RANK = 1e-9  # of the largest singular value: smaller ones are zero
-_LONGEST = 10.0  # largest plausible length of an extensible segment [m]
-_REACHES = 50.0  # and in sizes of the robot
+_FACTOR = 5.0  # by which sizes can grow or shrink in a calibration
+_SHORTEST = -0.1  # of the robot's length: a marker may sit a little before the end
+_FACTORS = ("radii", "lengths", "gains")
+_TURNS = Scale(1.0, "rad")
+_BENDS = Scale(1.0, "rad", -math.pi, math.pi)
 STRUCTURE = {"actuators_per_segment": list, "markers": list, "routing": str}
 """Settings of every chain of arcs in files."""
 
@@ -84,18 +85,6 @@ def write_whole_chain(plan: Plan, stored: Stored) -> int:
     return plan.node_of(replace(stored, settings=settings))
 
 
-class Frames(NamedTuple):
-    """Frames after all segments and their offsets, in the base frame; the batch N comes last."""
-
-    axes: Tensor  # (3, 3, S, N): axis, component
-    points: Tensor  # (3, S, N) origins [m]
-    # Velocity and angular velocity of the robot's end by the lengths, x- and y-bendings.
-    moves: Tensor  # (3, 3, S, N)
-    spins: Tensor  # (3, 3, S, N)
-    arcs: Tensor  # lengths [m], then x-, then y-bendings, (3 S, N)
-    slope: Tensor  # d arcs / dq, (3 S, n) or (3 S, n, N)
-
-
 class ArcChain(MarkedChain):
     """A chain of circular arcs; subclasses define how the actuators shape them.
 
@@ -128,7 +117,11 @@ class ArcChain(MarkedChain):
         "starts",
     )
 
-    takes_lengths: ClassVar[bool] = True  # q holds lengths or their changes, not forces
+    aliases: ClassVar[dict[str, str]] = {
+        "turns": "angles",
+        "tool": "offsets",
+        "gain": "gains",
+    }
 
     actuators_per_segment: tuple[int, ...]
     routing: str
@@ -166,25 +159,19 @@ class ArcChain(MarkedChain):
         return torch.from_numpy(absolute).to(self.radii.device)
 
     @property
+    def n_arcs(self) -> int:
+        """Number of arcs of the body."""
+        return self.n_segments * self.arcs_per_segment
+
+    @property
     def has_one_arc_per_segment(self) -> bool:
         """Whether every segment is one arc."""
         return self.arcs_per_segment == 1
 
-    def unit_of(self, name: str) -> str:
-        """Return the unit of an entry of the geometry, or of a parameter of `calibrate`."""
-        return super().unit_of(ALIASES.get(name, name))
-
     @property
-    def in_metres(self) -> bool:
-        """Whether q is in metres: all gains are 1."""
-        return bool((self.gains == 1.0).all())
-
-    @property
-    def units(self) -> str | list[str]:
-        """Unit of q, or of each actuator; with gains any, for example counts."""
-        if not self.in_metres:
-            return "as in training"
-        return "m" if self.stage is None else ["rad"] + ["m"] * (self.n_actuators - 1)
+    def least_radius(self) -> float:
+        """Smallest radius of an actuator circle [m]."""
+        return float(self.radii.detach().min())
 
     @property
     def rest(self) -> Tensor:
@@ -200,14 +187,24 @@ class ArcChain(MarkedChain):
         if not self.in_metres:
             signed = np.ones_like(absolute)
             rest = np.where(absolute, 0.0, rest)
-        segments = []
+        segments = [[*range(ring.start, ring.stop)] for ring in self.rings]
+        balance = self._still_directions()
+        return ActuatorLayout(rest, absolute, signed, segments, balance, self._tendons)
+
+    @property
+    def _tendons(self) -> NDArray[np.bool_]:
+        """Which actuators (n,) are tendons of given length."""
+        return np.zeros(self.n_actuators, dtype=bool)
+
+    @property
+    def rings(self) -> tuple[slice, ...]:
+        """The actuators of every segment."""
+        rings = []
         first = 0
         for count in self.actuators_per_segment:
-            segments.append([*range(first, first + count)])
+            rings.append(slice(first, first + count))
             first += count
-        return ActuatorLayout(
-            rest, absolute, signed, segments, self._still_directions()
-        )
+        return tuple(rings)
 
     def _still_directions(self) -> NDArray:
         """Return the directions of q (n, k) that no arcs of the robot move, in orthonormal columns.
@@ -225,25 +222,38 @@ class ArcChain(MarkedChain):
         balance, _ = np.linalg.qr(still)
         return balance
 
-    def metres(self, q: Tensor) -> Tensor:
-        """Return q (..., n) in metres: lengths, or changes of length."""
-        self._check_shape(q)
-        return self.gains.to(q) * (q - self.rest.to(q))
+    def part_of(self, name: str) -> Part:
+        """Return what a parameter of `calibrate` changes of the geometry."""
+        if name not in self.aliases:
+            return super().part_of(name)
+        entry = self.aliases[name]
+        whole = super().part_of(entry)
+        if name == "turns":
+            counts = np.array(self.actuators_per_segment)
+            directions = np.repeat(np.eye(len(counts)), counts, axis=0)
+            first = np.cumsum(counts) - counts
+            return Part(entry, directions, first, (len(counts),))
+        if name == "gain":
+            return Part(entry, np.ones((len(whole.shown), 1)), whole.shown[:1], ())
+        return Part(entry, whole.directions[:, -1:], whole.shown[-1:], ())
 
-    @property
-    def _free_gain(self) -> tuple[str, ...]:
-        """The gain as a parameter that a calibration fits by default, if q is not in metres."""
-        return () if self.in_metres else ("gain",)
+    def scale_of(self, entry: str) -> Scale:
+        """Return the natural scale of the numbers of an entry of the geometry."""
+        if entry in _FACTORS:
+            return Scale.factor(_FACTOR)
+        if entry == "angles":
+            return _TURNS
+        if entry == "rest_bends":
+            return _BENDS
+        if entry == "offsets":
+            reach = float(self.reach)
+            return Scale(reach, "m", low=_SHORTEST * reach)
+        return super().scale_of(entry)
 
-    def _with_gain(self, sets: Sequence[tuple[str, ...]]) -> list[tuple[str, ...]]:
-        """Return sets of parameters, after the smallest, with the gain beside the radii.
-
-        Tips of tendons determine only their ratio: without the gain, its error moves into the
-        radii.
-        """
-        gain = self._free_gain
-        both = [(*names, *gain) if "radii" in names else names for names in sets]
-        return [(), ("base",), *both]
+    def free_rings(self, names: tuple[str, ...]) -> set[str]:
+        """Return which of "angles" and "radii" these parameters free."""
+        parts = {self.aliases.get(name, name) for name in names}
+        return parts & {"angles", "radii"}
 
     def _checked(
         self, routing: str, *, without_lengths: bool = True, **arguments: Any
@@ -275,12 +285,12 @@ class ArcChain(MarkedChain):
         Tensor of shape (..., 3)
             Tip position in the measuring frame [m].
         """
-        (x,) = self._by_rows(self._tips_of_rows, q, 8192)
+        (x,) = self.by_rows(self._tips_of_rows, q, 8192)
         return x
 
     def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return the tip (..., 3) [m] and its Jacobian (..., 3, n_actuators) [-] in one pass."""
-        x, J = self._by_rows(self._tips_and_jacobians, q)
+        x, J = self.by_rows(self._tips_and_jacobians, q)
         return x, J
 
     def _tips_of_rows(self, rows: Tensor) -> tuple[Tensor]:
@@ -338,7 +348,7 @@ class ArcChain(MarkedChain):
         self._check_tangents(tangents)
         self._check_shape(q)
         changes = {name: value.to(q) for name, value in tangents.items()}
-        (J,) = self._by_rows(partial(self._along_geometry, tangents=changes), q)
+        (J,) = self.by_rows(partial(self._along_geometry, tangents=changes), q)
         return J
 
     def _along_geometry(
@@ -470,6 +480,29 @@ class ArcChain(MarkedChain):
         start = self.base[:3, 3].to(points).expand(*q.shape[:-1], 1, 3)
         return torch.cat([start, points], dim=-2)
 
+    def body(self, q: Tensor, n_points: int) -> Body:
+        """Return what can be drawn of the robot at rows q (K, n), with points per segment."""
+        of_arc = max(2, n_points // self.arcs_per_segment)
+        frames = as_array(self.frames(q, of_arc))  # (K, S, P, 4, 4)
+        radii = self.radii.tolist()
+        segments = np.repeat(range(self.n_segments), self.actuators_per_segment)
+        actuators = []
+        for s, angle in zip(segments.tolist(), self.angles.tolist(), strict=True):
+            passed = slice(self.starts[s], s + 1)
+            actuators.append(actuator_path(frames, passed, radii[s], angle))
+        disks = [disk(frames[:, 0, 0], radii[0])]
+        for s, radius in enumerate(radii):
+            if self.routing == "base":
+                radius = max(radii[s:])
+            disks.append(disk(frames[:, s, -1], radius))
+        return Body(
+            points=as_array(self.backbone(q, n_points)),
+            actuators=actuators,
+            segments=segments.tolist(),
+            disks=np.stack(disks, axis=1),
+            is_rigid=False,
+        )
+
     def frames(self, q: Tensor, n_points: int) -> Tensor:
         """Return frames along all segments, shape (..., S, P, 4, 4), without the rigid offsets.
 
@@ -498,39 +531,6 @@ class ArcChain(MarkedChain):
             words.append(f"tip at {self.tip_at:g}")
         words.append(f"routing {self.routing!r}")
         return ", ".join(words)
-
-    def unit_messages(self, q: Tensor, name: str, factor: float = 1.0) -> list[str]:
-        """Return a warning if lengths exceed 10 m or 50 robots, or changes 4 backbone lengths."""
-        if not self.in_metres:
-            name = f"{name}` times `gains"
-        # Also test q itself, without zeros: `q` may hold speeds, or limits that are absent.
-        gains = self.gains.to(q)
-
-        def size(rows: Tensor) -> tuple[Tensor]:
-            metres = self.metres(rows).abs()
-            return (torch.minimum((gains * rows).abs(), metres),)
-
-        (metres,) = in_blocks(size, q)
-        beyond = metres > factor * self._largest_metres.to(q)
-        beyond[..., : self.stage is not None] = False  # an angle
-        length = self.reach.detach() / self.n_segments
-        usual = torch.where(self.absolute, length, self.radii.detach().max())
-        usual = usual.to(q).expand_as(metres)[beyond]
-        message = length_message(name, metres[beyond], 0.0, usual)
-        return [] if message is None else [message]
-
-    @property
-    def _largest_metres(self) -> Tensor:
-        """Largest plausible length or change of length (n,) [m]."""
-        reach = self.reach.detach()
-        longest = (_REACHES * reach).clamp(max=_LONGEST)
-        return torch.where(self.absolute, longest, LONGEST_PULL * reach)
-
-    def plausible_rows(self) -> PlausibleRows:
-        """Return bounds of rows that need no warning about their units."""
-        weights = torch.diag(self.gains.detach() / self._largest_metres)
-        first = int(self.stage is not None)  # the angle of a stage has no bound
-        return PlausibleRows(as_array(self.rest), as_array(weights[first:]))
 
     def _arcs_and_slope(self, rows: Tensor) -> tuple[Tensor, Tensor]:
         """Return arcs (3 S, N) of rows (N, n) and d arcs / dq, (3 S, n) or (3 S, n, N).
@@ -598,6 +598,31 @@ class ArcChain(MarkedChain):
             columns = self.by_arcs(columns)
         return self._in_measuring_frame(x), self._turned(columns)
 
+    def tips_by_coordinates(self) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
+        """Return `from_coordinates_and_jacobian`, from the compiled core if available."""
+        if self.n_outputs > 3 or program_of(self) is None:
+            return self.from_coordinates_and_jacobian
+        m = math.ceil(self.tip_at)
+        offsets = self.offsets[:m].numpy(force=True).copy()
+        offsets[-1] *= self.tip_at == m
+        arrays = {
+            "base": self.base.numpy(force=True),
+            "offsets": offsets,
+            "radii": np.ones(m),
+        }
+        # q are the arcs.
+        derived = {"arc_matrix": np.eye(3 * m), "arc_offset": np.zeros(3 * m)}
+        markers = [[float(m), *self.markers[-1][1:]]]
+        settings = {"markers": markers, "stage": None}
+        stored = Stored("constant_curvature", settings, arrays, derived=derived)
+        program = Program(Plan(stored))
+
+        def tips(z: Tensor) -> tuple[Tensor, Tensor]:
+            x, J = program.evaluate(z.numpy(), jacobian=True)
+            return torch.from_numpy(x), torch.from_numpy(J)
+
+        return tips
+
     def compliance_columns(self, q: Tensor) -> Tensor:
         """Return A (N, 3 K, 2 m) at rows q (N, n): a force w at the tip moves it along A A' w.
 
@@ -654,7 +679,8 @@ class ArcChain(MarkedChain):
         poses = torch.stack([*frames], dim=-3)
         if self.stage is None:
             return poses
-        return rolled(poses, self.metres(q)[..., :1])
+        angle = self.gains[:1].to(q) * (q[..., :1] - self.rest[:1].to(q))
+        return rolled(poses, angle)
 
     def _x_of(self, arcs: Tensor) -> Tensor:
         """Return x (N, 3 K) at arcs (3 m, K, N) up to the markers."""

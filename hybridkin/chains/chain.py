@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, ClassVar, TypeVar
 
 import torch
 from torch import Tensor, nn
 
-from hybridkin._core.arrays import check_shape, countable
+from hybridkin._core.arrays import as_array, check_shape, countable
 from hybridkin._core.blocks import check_tensor, check_vectors, in_blocks
 from hybridkin._core.derived import KEPT, entries_of
 from hybridkin._core.html import numbers
-from hybridkin._core.model import PoseModel
-from hybridkin._core.plausible import PlausibleRows
-from hybridkin._core.units import span_message
+from hybridkin._core.model import ForwardModel, PoseModel, is_at_rest
+from hybridkin._core.units import motion_message, span_message
+from hybridkin.chains.body import Body
+from hybridkin.chains.calibratable import Part, Scale
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -51,6 +51,11 @@ class Chain(PoseModel):
         "joint_zeros": "unit of q",
     }
 
+    # Names of parts of entries that `calibrate` knows too, and those entries.
+    aliases: ClassVar[dict[str, str]] = {}
+    # Entry of the geometry with the zeros of the actuators [unit of q]; empty: none.
+    _zeros: ClassVar[str] = ""
+
     base: Tensor
 
     @property
@@ -69,14 +74,57 @@ class Chain(PoseModel):
         raise NotImplementedError
 
     @property
-    def units(self) -> str | list[str]:
-        """Unit of q, or of each actuator."""
-        return "as in training"
+    def origin(self) -> Tensor:
+        """Where the base of the robot is in the measuring frame, shape (3,) [m]."""
+        return self.base[:3, 3]
+
+    @property
+    def mean_gain(self) -> float:
+        """Mean length of a unit of q [m]; 1 if q holds none."""
+        return 1.0
+
+    def rivals(self, q: Tensor) -> list[Chain]:
+        """Return other models of the same robot that rows q (N, n) give reason to compare."""
+        return []
+
+    def with_elastic_tendons(self) -> Chain:
+        """Return the robot with tendons that give way, if that is another model; else itself."""
+        return self
+
+    def shifted(self, shift: Tensor) -> ForwardModel:
+        """Return the robot after a shift (n,) of its zeros; a chain that has zeros stays one."""
+        if not self._zeros or not shift.any():
+            return super().shifted(shift)
+        zeros = self.geometry()[self._zeros]
+        return self.with_geometry(**{self._zeros: zeros - shift.to(zeros)})
+
+    def moved(self, motion: Tensor) -> Self:
+        """Return the chain after a motion (4, 4) of its base."""
+        if is_at_rest(motion):
+            return self
+        return self.with_geometry(base=motion.to(self.base) @ self.base)
 
     def geometry(self) -> dict[str, Tensor]:
         """Return the geometry by name, as in the constructor; entries that are None are omitted."""
         entries = zip(self._entries, entries_of(self, self._entries), strict=True)
         return {name: value for name, value in entries if value is not None}
+
+    @property
+    def parameter_names(self) -> list[str]:
+        """Names that `calibrate` accepts."""
+        return [*self.geometry(), *self.aliases]
+
+    def part_of(self, name: str) -> Part:
+        """Return what a parameter of `calibrate` changes of the geometry."""
+        return Part.whole(name, tuple(self.geometry()[name].shape))
+
+    def scale_of(self, entry: str) -> Scale:
+        """Return the natural scale of the numbers of an entry; of most it is the robot's length."""
+        return Scale(float(self.reach), "m")
+
+    def free_rings(self, names: tuple[str, ...]) -> set[str]:
+        """Return what these parameters free of the actuator rings that must be searched."""
+        return set()
 
     def unit_of(self, name: str) -> str:
         """Return the unit of an entry of the geometry: "m", "rad", "-" or another one."""
@@ -191,6 +239,10 @@ class Chain(PoseModel):
         """Return points (..., P, 3) along the robot, base to end [m]."""
         raise NotImplementedError
 
+    def body(self, q: Tensor, n_points: int) -> Body:
+        """Return what can be drawn of the robot at rows q (K, n): by default only its links."""
+        return Body.of_links(as_array(self.backbone(q)))
+
     def check_actuators(self, q: Tensor, name: str = "q") -> list[str]:
         """Return warnings about the units of q; raise if q cannot be a log of this robot.
 
@@ -224,10 +276,6 @@ class Chain(PoseModel):
         self._check_rows(rows, name)
         return self.unit_messages(rows, name)
 
-    def plausible_rows(self) -> PlausibleRows | None:
-        """Return bounds of rows that need no warning about units or contradictions, if known."""
-        return None
-
     def _why_shape(self) -> str:
         """Return why q must have its shape, for messages."""
         return f"this robot has {self.n_actuators} actuators"
@@ -236,7 +284,7 @@ class Chain(PoseModel):
         """Raise if q does not have the shape (..., n_actuators)."""
         check_vectors(q, self.n_actuators, name, self._why_shape())
 
-    def _by_rows(
+    def by_rows(
         self,
         function: Callable[[Tensor], tuple[Tensor, ...]],
         q: Tensor,
@@ -262,15 +310,30 @@ class Chain(PoseModel):
     @property
     def longest_usual(self) -> float:
         """Length of q up to which `unit_messages` has nothing to say; infinite: unknown."""
-        plausible = self.plausible_rows()
-        return math.inf if plausible is None else plausible.small
+        return self.plausible_rows().small
 
     def far_messages(self, x: Tensor, name: str) -> list[str]:
         """Return a warning if tips span more than 50 times the robot's size."""
-        origin = self.base[:3, 3].detach().to(x)
+        origin = self.origin.detach().to(x)
         points = torch.cat([origin[None], x.reshape(-1, 3)])
         finite = points[countable(points).all(-1)]
         message = span_message(name, finite, self.size, _FAR)
+        return [] if message is None else [message]
+
+    def tip_messages(
+        self, q: Tensor, x: Tensor, name: str, calibrated: bool = False
+    ) -> list[str]:
+        """Return a warning if measured tips span far more than those of the chain.
+
+        Tips x (N, m) are measured at rows q (N, n), missing ones NaN. Only if the chain is
+        calibrated its own tips are counted with them: else its base may be anywhere.
+        """
+        own = self(q).detach()
+        tips = x[:, : self.n_outputs]
+        tips = torch.where(tips.isnan(), own, tips)
+        if calibrated:
+            tips = torch.cat([own, tips])
+        message = motion_message(name, tips, own, self.size)
         return [] if message is None else [message]
 
     def misses(self, x: Tensor, largest: Tensor) -> Tensor:
@@ -283,10 +346,3 @@ class Chain(PoseModel):
     def longest(self, largest: Tensor) -> Tensor | float:
         """Return an upper bound of the distance from base to tip for ``|q| <= largest`` [m]."""
         return torch.inf
-
-    def contradiction(self, q: Tensor, name: str = "q") -> str | None:
-        """Return a warning if the actuators of q (..., n) contradict each other, else None.
-
-        Always None for a robot whose actuators cannot contradict each other.
-        """
-        return None

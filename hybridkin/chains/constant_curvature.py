@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from hybridkin._core.arrays import Numbers, Transform, as_array, identity
 from hybridkin._core.blocks import in_blocks
 from hybridkin._core.derived import derived
+from hybridkin._core.model import ForwardModel
 from hybridkin._core.plan import NoKernel, Plan
 from hybridkin._core.plausible import PlausibleRows
 from hybridkin._core.stored import Layout, Restore, Stored
@@ -23,12 +24,14 @@ from hybridkin.chains._checks import filled, float_dtype
 from hybridkin.chains._paths import bend_counts, bend_extremes, free_arcs
 from hybridkin.chains.arc_chain import (
     STRUCTURE,
-    ArcChain,
     Change,
     each_marker,
     frame_numbers,
 )
+from hybridkin.chains.calibratable import Scale
 from hybridkin.chains.chain import Chain
+from hybridkin.chains.elastic_tendons import ElasticTendonChain
+from hybridkin.chains.length_driven import PLANAR, LengthDrivenChain
 
 __all__ = ["ConstantCurvatureChain"]
 
@@ -97,7 +100,7 @@ def _write_plan(plan: Plan, stored: Stored) -> int:
     return plan.node("arcs", n, 3, [frame, offset, matrix], n_arcs, step, width)
 
 
-class ConstantCurvatureChain(ArcChain):
+class ConstantCurvatureChain(LengthDrivenChain):
     """Tip position of a chain of constant-curvature segments, from its actuator lengths.
 
     An arc has a centre-line length l and a bending vector b (norm: bend angle, direction: that of
@@ -178,7 +181,8 @@ class ConstantCurvatureChain(ArcChain):
         write_plan=_write_plan,
     )
     computed = layout.derived
-    _structure = (*ArcChain._structure, "bends", "stage")
+    _zeros = "actuator_zeros"
+    _structure = (*LengthDrivenChain._structure, "bends", "stage")
 
     bends: tuple[int, ...]  # number of directions in which each segment bends
 
@@ -241,18 +245,16 @@ class ConstantCurvatureChain(ArcChain):
         """The q (n,) at which tendons are not displaced and chambers have length 0."""
         return self.actuator_zeros
 
-    def softer(self) -> list[Chain]:
+    def softer(self) -> list[ForwardModel]:
         """Return the same robot with tendons that stretch and go slack, for some stiffnesses.
 
         Tendons in balance bend both alike; a single tendon does not. Empty for chambers.
         """
-        from hybridkin.chains.elastic_tendons import ElasticTendonChain
-
         if self.lengths is None or self.stage is not None or any(self.extensible):
             return []
         angles = self.angles.detach().split(self.actuators_per_segment)
         zeros = (self.gains * self.rest).detach()
-        chains = []
+        chains: list[ForwardModel] = []
         for stiffness in _SOFTER:
             chain = ElasticTendonChain(
                 self.radii.detach(),
@@ -269,6 +271,44 @@ class ConstantCurvatureChain(ArcChain):
             )
             chains.append(chain._marked(self.markers))
         return chains
+
+    def with_elastic_tendons(self) -> Chain:
+        """Return the robot with tendons that give way; a chain with chambers stays as it is."""
+        return self if any(self.extensible) else ElasticTendonChain.from_chain(self)
+
+    def rivals(self, q: Tensor) -> list[Chain]:
+        """Return the robot with elastic tendons, if those of q (N, n) contradict each other."""
+        if any(self.extensible) or not self.contradictory(q).any():
+            return []
+        return [self.with_elastic_tendons()]
+
+    def effective_directions(self) -> NDArray:
+        """Return the projector (n, n) on directions of q that bend a chain with tendons.
+
+        Its bendings are linear in q and do not depend on the common pull of its tendons, which is
+        one in metres. With chambers all directions move the chain.
+        """
+        if any(self.extensible):
+            return super().effective_directions()
+        zero = torch.from_numpy(np.zeros(self.n_actuators))
+        slopes = torch.func.jacrev(lambda row: self.arcs(row)[1].ravel())(zero)
+        gains = as_array(self.gains.detach())
+        slopes = as_array(slopes) / gains
+        of_metres = np.linalg.pinv(slopes, rcond=PLANAR) @ slopes
+        return gains[:, None] * of_metres / gains
+
+    def unit_of(self, name: str) -> str:
+        """Return the unit of an entry of the geometry: "m", "rad", "-" or another one."""
+        if name == "actuator_zeros" and self.in_metres:
+            return "m"
+        return super().unit_of(name)
+
+    def scale_of(self, entry: str) -> Scale:
+        """Return the natural scale of the numbers of an entry: of zeros it is a mean radius."""
+        if entry != "actuator_zeros":
+            return super().scale_of(entry)
+        unit = float(self.radii.detach().mean() / self.gains.detach().abs().mean())
+        return Scale(unit, "m" if self.in_metres else "q")
 
     def consistency(self, q: Tensor) -> Tensor:
         """Return by how much the actuator lengths of each segment contradict each other.
@@ -334,7 +374,7 @@ class ConstantCurvatureChain(ArcChain):
         least = torch.maximum(_NOTICED * self.radii.to(q), _CONTRADICTED * explained)
         return residual > least
 
-    def contradiction(self, q: Tensor, name: str = "q") -> str | None:
+    def contradictions(self, q: Tensor, name: str = "q") -> list[str]:
         """Return a warning if the tendons of inextensible segments contradict each other.
 
         Parameters
@@ -346,30 +386,30 @@ class ConstantCurvatureChain(ArcChain):
 
         Returns
         -------
-        str or None
-            The number of rows that are `contradictory`, and the worst of them. None if there are
+        list of str
+            The number of rows that are `contradictory`, and the worst of them. Empty if there are
             none; extensible segments are not checked.
         """
         rows = self._rows(q)
         if all(self.extensible):
-            return None
+            return []
         fixed_length = ~torch.tensor(self.extensible, device=q.device)
         with torch.no_grad():
             (wrong,) = in_blocks(
                 lambda q: (self.contradictory(q) & fixed_length,), rows
             )
             if not wrong.any():
-                return None
+                return []
             residual = self.consistency(rows) * wrong
         row, segment = divmod(int(residual.argmax()), self.n_segments)
         n_wrong = int(wrong.any(-1).sum())
-        return (
+        return [
             f"{n_wrong} of {len(rows)} rows of `{name}` pull the tendons of a segment together or "
             "release them, which bends nothing in a ConstantCurvatureChain but compresses a robot "
             f"or leaves tendons slack: the worst is row {row}, segment {segment + 1}, "
             f"{1e3 * float(residual.max()):.3g} mm rms. ElasticTendonChain models tendons that can "
             "only pull."
-        )
+        ]
 
     def plausible_rows(self) -> PlausibleRows:
         """Return bounds of rows that need no warning about units or contradictions.

@@ -23,11 +23,13 @@ from hybridkin.chains._checks import filled, float_dtype, stiffnesses
 from hybridkin.chains._elastic_body import COMPRESSED, ElasticBody, why_not
 from hybridkin.chains.arc_chain import (
     STRUCTURE,
+    ArcChain,
     Change,
     each_marker,
     frame_numbers,
 )
-from hybridkin.chains.constant_curvature import ConstantCurvatureChain
+from hybridkin.chains.calibratable import Scale
+from hybridkin.chains.length_driven import LengthDrivenChain
 
 __all__ = ["ElasticTendonChain"]
 
@@ -40,6 +42,7 @@ _SHAPING = (
     "tendon_zeros",
     "gains",
 )
+_NO_TENSION = 1e-300  # [m]
 _SOFT = 0.1  # stiffness of tendons in the guess, relative to their own
 _TABLE = 12  # largest number of tendons for which all responses are stored
 
@@ -93,7 +96,7 @@ def _write_plan(plan: Plan, stored: Stored) -> int:
     )
 
 
-class ElasticTendonChain(ElasticBody):
+class ElasticTendonChain(ElasticBody, LengthDrivenChain):
     """Tip position of an elastic backbone with tendons that can pull but not push.
 
     A shape a = (length changes, bending vectors of all segments) stretches the tendons by
@@ -229,9 +232,7 @@ class ElasticTendonChain(ElasticBody):
         self._set_geometry(geometry)
 
     @classmethod
-    def from_chain(
-        cls, chain: ConstantCurvatureChain, **options: Any
-    ) -> ElasticTendonChain:
+    def from_chain(cls, chain: ArcChain, **options: Any) -> ElasticTendonChain:
         """Return an elastic chain with the geometry of a plain chain with tendons.
 
         Parameters
@@ -288,6 +289,28 @@ class ElasticTendonChain(ElasticBody):
         stiffnesses = ("base", "bending_stiffness", "axial_stiffness")
         shape = ("turns", "rest_bends", "tool", *stiffnesses, "tendon_zeros")
         return self._with_gain([stiffnesses, shape, (*shape, "radii", "lengths")])
+
+    def shifted(self, shift: Tensor) -> ElasticTendonChain:
+        """Return the robot after a shift (n,) of its zeros [unit of q]."""
+        if not shift.any():
+            return self
+        zeros = self.tendon_zeros - (self.gains * shift).to(self.tendon_zeros)
+        return self.with_geometry(tendon_zeros=zeros)
+
+    def scale_of(self, entry: str) -> Scale:
+        """Return the natural scale of the numbers of an entry: of zeros it is a mean radius."""
+        if entry == "tendon_zeros":
+            return Scale(float(self.radii.detach().mean()), "m")
+        return super().scale_of(entry)
+
+    def free_rings(self, names: tuple[str, ...]) -> set[str]:
+        """Return "angles" if these parameters free them; radii need no search."""
+        return super().free_rings(names) - {"radii"}
+
+    def pulled(self, q: Tensor, low: Tensor, high: Tensor) -> Tensor:
+        """Return the tensions of the tendons at q (..., n), relative to the largest."""
+        tension = self.tensions(q)
+        return tension / tension.amax(-1, keepdim=True).clamp(min=_NO_TENSION)
 
     @property
     def pulls(self) -> Tensor:
@@ -403,14 +426,14 @@ class ElasticTendonChain(ElasticBody):
                 warnings.warn(f"{why} Results are NaN there.", stacklevel=2)
         return is_short
 
-    def contradiction(self, q: Tensor, name: str = "q") -> str | None:
+    def contradictions(self, q: Tensor, name: str = "q") -> list[str]:
         """Return a warning if the tendons compress the body too much, which then has no shape."""
         rows = self._rows(q)
         with torch.no_grad(), without_warnings():
             (arcs,) = in_blocks(lambda q: (self._arcs_of_rows(q).mT,), rows)
         is_short = rows.isfinite().all(1) & arcs.isnan().any(1)
         why = why_not(COMPRESSED, rows, is_short)
-        return None if why is None else f"`{name}` has no tip: {why}"
+        return [] if why is None else [f"`{name}` has no tip: {why}"]
 
     def plausible_rows(self) -> PlausibleRows:
         """Return bounds of rows that need no warning about their units or short arcs.

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from hybridkin._core.arrays import Numbers, Transform, whole
 from hybridkin._core.blocks import in_blocks
+from hybridkin._core.frames import Marker
 from hybridkin._core.named_rows import first_row
 from hybridkin._core.stored import Layout, Restore, Stored
 from hybridkin.chains._checks import filled, float_dtype, numeric, stiffnesses
@@ -25,12 +26,15 @@ from hybridkin.chains._equilibrium import (
 )
 from hybridkin.chains._slack import WithoutDerivative, applied
 from hybridkin.chains.arc_chain import STRUCTURE, ArcChain, Change
+from hybridkin.chains.calibratable import Scale
 from hybridkin.chains.chain import Chain
-from hybridkin.chains.markers import MarkedChain, Marker
+from hybridkin.chains.markers import MarkedChain
 
 __all__ = ["ForceTendonChain"]
 
 _MOST_ARCS = 50  # of a segment
+_LARGEST_TAPER = 0.95  # of a calibration
+_NO_FORCE = 1e-300  # [N]
 _WHY = {
     Outcome.BUCKLED: "buckled: in {rows} no load decides to which side the body falls",
     Outcome.COMPRESSED: COMPRESSED,
@@ -167,7 +171,6 @@ class ForceTendonChain(ElasticBody):
         "weight": "N/m",
         "taper": "-",
     }
-    takes_lengths = False
 
     gravity: tuple[float, ...]
     marker_offsets: Tensor  # (K, 3)
@@ -254,7 +257,7 @@ class ForceTendonChain(ElasticBody):
         return False
 
     @property
-    def units(self) -> str:
+    def unit_of_q(self) -> str:
         """Unit of q."""
         return "N" if (self.gains == 1.0).all() else "as in training"
 
@@ -282,16 +285,20 @@ class ForceTendonChain(ElasticBody):
         self._check_shape(q)
         return (self.gains.to(q) * q).clamp(min=0.0)
 
-    def metres(self, q: Tensor) -> Tensor:
-        """Return the forces (..., n) [N] of q (..., n): they take the place of length changes."""
-        return self.forces(q)
+    def scale_of(self, entry: str) -> Scale:
+        """Return the natural scale of the numbers of an entry of the geometry."""
+        if entry == "taper":
+            return Scale(1.0, "-", 0.0, _LARGEST_TAPER)
+        return super().scale_of(entry)
 
-    def unit_messages(self, q: Tensor, name: str, factor: float = 1.0) -> list[str]:
-        """Return no warning: forces have no plausible size that the geometry gives."""
-        return []
+    def pulled(self, q: Tensor, low: Tensor, high: Tensor) -> Tensor:
+        """Return the forces of the tendons at q (..., n), relative to the largest."""
+        forces = self.forces(q)
+        return forces / forces.amax(-1, keepdim=True).clamp(min=_NO_FORCE)
 
-    def plausible_rows(self) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Return None: every force is plausible."""
+    def slack(self, q: Tensor) -> Tensor:
+        """Return which tendons are slack, a bool tensor of the shape of q."""
+        return self.forces(q) == 0.0
 
     def _set_markers(self, markers: Sequence[Marker]) -> None:
         super()._set_markers(markers)

@@ -10,14 +10,13 @@ import torch
 from torch import Tensor, nn
 
 from hybridkin._core.arrays import number
+from hybridkin._core.frames import Marker
+from hybridkin._core.model import ForwardModel
 from hybridkin.chains._checks import filled
 from hybridkin.chains.chain import Chain
 
 if TYPE_CHECKING:
     from typing_extensions import Self
-
-Marker = tuple[float, float, float, float]
-"""Place on the backbone [segments from the base], and offset in the frame at that place [m]."""
 
 
 class MarkedChain(Chain):
@@ -133,9 +132,14 @@ class MarkedChain(Chain):
         single = len(self.markers) == 1
         return [self] if single else [self._marked([marker]) for marker in self.markers]
 
-    def up_to_tip(self, arcs: Tensor) -> Tensor:
+    def joined(self, tips: list[ForwardModel]) -> Self:
+        """Return the chain of all markers of chains of one marker each."""
+        markers = [marker for tip in tips for marker in tip.markers]
+        return self._marked(markers)
+
+    def up_to_tip(self, coordinates: Tensor) -> Tensor:
         """Return arcs (3 S, ...), or their slope, up to the tip, (3 m, ...)."""
-        return self.up_to_markers(arcs)[:, -1]
+        return self.up_to_markers(coordinates)[:, -1]
 
     def up_to_markers(self, arcs: Tensor) -> Tensor:
         """Return arcs (3 S, ...), or their slope, up to each of K markers, (3 m, K, ...).

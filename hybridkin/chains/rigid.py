@@ -37,6 +37,7 @@ from hybridkin.chains._joint_motions import (
     moving_frames,
 )
 from hybridkin.chains._mjcf import mjcf_path
+from hybridkin.chains.calibratable import Scale
 from hybridkin.chains.chain import Chain
 
 if TYPE_CHECKING:
@@ -168,6 +169,7 @@ class RigidChain(Chain):
     names: tuple[str, ...]
 
     _entries = ("base", "joint_zeros", "tool")
+    _zeros = "joint_zeros"
     _structure = ("n_actuators", "kinds", "names")
     _limits = ("q_min", "q_max", "dq_max", "ddq_max")
     _arrays = ("origins", "axes", "tip", "tool", *_limits, "base")
@@ -533,10 +535,18 @@ class RigidChain(Chain):
         return (self.couplings == whole_turns).all(0)
 
     @property
-    def units(self) -> list[str]:
+    def unit_of_q(self) -> list[str]:
         """The unit of every actuator: "rad" if it turns a joint, else "m"."""
         turns = (self.couplings[~self.slides] != 0.0).any(0)
         return ["rad" if turn else "m" for turn in turns.tolist()]
+
+    def scale_of(self, entry: str) -> Scale:
+        """Return the natural scale of the numbers of an entry of the geometry."""
+        if entry != "joint_zeros":
+            return super().scale_of(entry)
+        kinds = self.unit_of_q
+        units = np.where(np.array(kinds) == "m", float(self.reach), 1.0)
+        return Scale(units, kinds)
 
     def coordinates(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return joint positions from the origins at rows q (N, n), and dz/dq (n_joints, n)."""
@@ -569,7 +579,7 @@ class RigidChain(Chain):
         Tensor of shape (..., 3)
             Tip position in the measuring frame [m].
         """
-        (x,) = self._by_rows(
+        (x,) = self.by_rows(
             lambda rows: (self.from_coordinates(self._joints(rows)),), q
         )
         return x
@@ -579,14 +589,14 @@ class RigidChain(Chain):
 
         In closed form, in [m/rad] for revolute joints and [-] for prismatic ones.
         """
-        x, J = self._by_rows(
+        x, J = self.by_rows(
             lambda rows: self.from_coordinates_and_jacobian(self._joints(rows)), q
         )
         return x, J @ self.couplings.to(q)
 
     def pose_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return the tip's pose (..., 4, 4) in the measuring frame, and `pose_jacobian(q)`."""
-        pose, J = self._by_rows(self._pose_and_columns, q)
+        pose, J = self.by_rows(self._pose_and_columns, q)
         return pose, J @ self.couplings.to(q)
 
     def _pose_and_columns(self, rows: Tensor) -> tuple[Tensor, Tensor]:
@@ -623,7 +633,7 @@ class RigidChain(Chain):
             z = self._joints(rows)
             return (as_poses(self._frames(z, self._links().to(z))),)
 
-        (poses,) = self._by_rows(of_rows, q)
+        (poses,) = self.by_rows(of_rows, q)
         return poses
 
     def pose(self, q: Tensor) -> Tensor:

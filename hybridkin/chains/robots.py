@@ -14,7 +14,7 @@ from hybridkin._core.actuators import ActuatorLayout
 from hybridkin._core.arrays import Numbers, as_path, shaped
 from hybridkin._core.units import METRES, UNITS
 from hybridkin.chains._robot_files import chain_of, each, read_tables
-from hybridkin.chains.arc_chain import ALIASES, ArcChain
+from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
 
 __all__ = [
@@ -418,7 +418,7 @@ def _calibrated(names: list[str] | str, chain: ArcChain) -> tuple[str, ...] | st
         return "auto"
     if names == "default":
         return chain.default_parameters
-    known = (*chain.geometry(), *ALIASES)
+    known = (*chain.parameter_names,)
     if not {*names} <= {*known} or len({*names}) < len(names):
         raise ValueError(
             f'`calibrate` must name different entries of {known}, or be "auto" or "default", '

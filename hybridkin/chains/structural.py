@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from math import degrees
 from typing import NamedTuple
@@ -12,18 +12,16 @@ import torch
 from torch import Tensor
 
 from hybridkin._core.arrays import identity
+from hybridkin._core.frames import Frames
 from hybridkin._core.model import ForwardModel
 from hybridkin._core.plan import Plan
 from hybridkin._core.stored import Layout, Restore, Stored
 from hybridkin.chains._checks import pose
 from hybridkin.chains.arc_chain import (
-    ArcChain,
-    Frames,
     each_marker,
     frame_numbers,
     write_whole_chain,
 )
-from hybridkin.chains.markers import Marker
 
 _BLOCK = 2048  # rows, whose temporaries stay in the cache
 
@@ -149,7 +147,7 @@ class StructuralChain(ForwardModel):
 
     Parameters
     ----------
-    chain : ArcChain
+    chain : ForwardModel
         The chain, whose arcs are one for each segment.
     lengths : Tensor of shape (S,)
         Mean length lbar of every segment in the log [m]; 0 for a segment without one.
@@ -175,7 +173,7 @@ class StructuralChain(ForwardModel):
 
     def __init__(
         self,
-        chain: ArcChain,
+        chain: ForwardModel,
         lengths: Tensor,
         zeros: Tensor,
         maps: Tensor,
@@ -193,6 +191,7 @@ class StructuralChain(ForwardModel):
         self.register_buffer("motion", motion)
         self.n_actuators = chain.n_actuators
         self.n_outputs = chain.n_outputs
+        self.markers = chain.markers
 
     def extra_repr(self) -> str:
         """Return the sizes of the errors: the largest segment's, and the motion of the base."""
@@ -203,7 +202,7 @@ class StructuralChain(ForwardModel):
         turn = 2.0 * torch.asin(
             (self.motion[:3, :3] - identity(3, self.motion)).norm() / 8**0.5
         )
-        origin = self.chain.base[:3, 3].to(self.motion)
+        origin = self.chain.origin.to(self.motion)
         move = self.motion[:3, :3] @ origin + self.motion[:3, 3] - origin
         sizes = {
             "twist": (degrees(largest(self.twists)), "deg"),
@@ -219,19 +218,14 @@ class StructuralChain(ForwardModel):
         )
 
     @property
-    def robot(self) -> ArcChain:
+    def robot(self) -> ForwardModel:
         """The chain without these errors."""
         return self.chain
 
     @property
-    def without_errors(self) -> ArcChain:
+    def without_errors(self) -> ForwardModel:
         """The chain without these errors."""
         return self.chain
-
-    @property
-    def markers(self) -> tuple[Marker, ...]:
-        """Places and offsets of the outputs, as in the chain."""
-        return self.chain.markers
 
     @property
     def tip_model(self) -> StructuralChain:
@@ -248,12 +242,12 @@ class StructuralChain(ForwardModel):
 
     def forward(self, q: Tensor) -> Tensor:
         """Return the tip (..., 3), or all markers (..., 3 K) [m]."""
-        (x,) = self.chain._by_rows(self._x_of_rows, q, _BLOCK)
+        (x,) = self.chain.by_rows(self._x_of_rows, q, _BLOCK)
         return x
 
     def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return the tip (..., 3) [m] and its Jacobian (..., 3, n) in closed form."""
-        x, J = self.chain._by_rows(self._x_and_jacobian, q, _BLOCK)
+        x, J = self.chain.by_rows(self._x_and_jacobian, q, _BLOCK)
         return x, J
 
     def coordinates(self, q: Tensor) -> tuple[Tensor, Tensor]:
@@ -272,9 +266,14 @@ class StructuralChain(ForwardModel):
 
     def from_coordinates_and_jacobian(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """Return `from_coordinates` and its derivative (N, 3 K, 3 m) by the arcs."""
-        return self.moved(*self.chain.from_coordinates_and_jacobian(z))
+        return self.placed(*self.chain.from_coordinates_and_jacobian(z))
 
-    def moved(self, x: Tensor, columns: Tensor) -> tuple[Tensor, Tensor]:
+    def tips_by_coordinates(self) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
+        """Return `from_coordinates_and_jacobian` for many calls without derivatives."""
+        of_chain = self.chain.tips_by_coordinates()
+        return lambda z: self.placed(*of_chain(z))
+
+    def placed(self, x: Tensor, columns: Tensor) -> tuple[Tensor, Tensor]:
         """Return points (N, 3 K) and their derivatives (N, 3 K, C), moved by T."""
         turn = self.motion[:3, :3].to(columns)
         turned = turn @ columns.unflatten(1, (-1, 3))
@@ -288,10 +287,10 @@ class StructuralChain(ForwardModel):
     def from_stored(cls, stored: Stored, restore: Restore) -> StructuralChain:
         """Return the model built from a description."""
         model = super().from_stored(stored, restore)
-        if not isinstance(model.chain, ArcChain):
+        n_arcs = model.chain.n_arcs
+        if not n_arcs:
             need = "must be a chain of arcs"
             raise ValueError(f"`chain` {need}, got {type(model.chain).__name__}")
-        n_arcs = model.chain.n_segments * model.chain.arcs_per_segment
         lengths = model.lengths.tolist()
         if len(lengths) != n_arcs or min(lengths) < 0.0 or max(lengths) == 0.0:
             need = (
@@ -301,13 +300,14 @@ class StructuralChain(ForwardModel):
         pose(model.motion, "motion", model.motion.dtype)
         return model
 
-    def _around(self, chain: ArcChain) -> StructuralChain:
+    def _around(self, chain: ForwardModel) -> StructuralChain:
         """Return a model of another chain with the same errors."""
         weights = self._weights(self.lengths)
         return StructuralChain(chain, self.lengths, *weights, self.motion)
 
-    def _marked(self, markers: Sequence[Marker]) -> StructuralChain:
-        return self._around(self.chain._marked(markers))
+    def joined(self, tips: list[ForwardModel]) -> StructuralChain:
+        """Return the model of all markers of models of one marker each."""
+        return self._around(self.chain.joined(tips))
 
     def _weights(self, like: Tensor) -> Weights:
         weights = self.zeros, self.maps, self.twists, self.sags

@@ -13,23 +13,19 @@ from numpy.typing import NDArray
 from typing_extensions import Self
 
 from hybridkin._core.arrays import identity
-from hybridkin._core.model import ForwardModel
+from hybridkin._core.model import ForwardModel, moved_points
 from hybridkin._core.rotations import (
     cross_matrix,
     rigid_motion,
     rotation,
     rotation_vector,
 )
-from hybridkin.chains.chain import Chain
 from hybridkin.hybrid._drift import MISFITS, SWITCH, too_far
 from hybridkin.hybrid._module import Hybrid
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._wrapped import (
     in_columns,
-    moved,
-    moved_points,
     pose_difference,
-    shifted,
 )
 from hybridkin.native.library import evaluate
 
@@ -65,9 +61,8 @@ class Change(NamedTuple):
 
     def after(self, model: ForwardModel) -> ForwardModel:
         """Return a model after the change."""
-        return shifted(
-            moved(model, torch.from_numpy(self.motion)), torch.from_numpy(self.shift)
-        )
+        moved = model.moved(torch.from_numpy(self.motion))
+        return moved.shifted(torch.from_numpy(self.shift))
 
     def before(self, rows: Rows, output: str) -> Rows:
         """Return rows as they were before the change."""
@@ -187,12 +182,8 @@ class _Problem:
         self.q = rows.q
         self.y = torch.from_numpy(rows.tips)
         self.measured = ~np.isnan(rows.tips)
-        robot = fitted.robot
-        self.pivot = self.q.new_zeros(3)
-        self.reach = 1.0
-        if isinstance(robot, Chain):
-            self.pivot = robot.base[:3, 3].to(self.q)
-            self.reach = float(robot.reach)
+        self.pivot = fitted.robot.origin.to(self.q)
+        self.reach = float(fitted.robot.reach)
         self.scale = torch.from_numpy(scale)
 
     def change(self, theta: NDArray) -> Change:

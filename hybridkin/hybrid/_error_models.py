@@ -25,7 +25,6 @@ from hybridkin._core.directions import Directions
 from hybridkin._core.model import ForwardModel
 from hybridkin._core.turns import TURNS
 from hybridkin.calibration.measured import points
-from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.hybrid._drift import too_far
 from hybridkin.hybrid._features import (
     Features,
@@ -192,9 +191,7 @@ class FeatureModel(TipModel):
         fits = []
         for of_marker, marker in markers:
             assert marker.mechanical is not None
-            chain = marker.mechanical.robot
-            assert isinstance(chain, ArcChain)
-            readout = read_out.readout.up_to(chain)
+            readout = read_out.readout.up_to_tip_of(marker.mechanical.robot)
             fit = read_out._replace(readout=readout)
             fits.append(self._with_correction(fit, of_marker))
         return replace(_of_markers(fits), settled=fits[0].settled)
@@ -271,7 +268,7 @@ class ShapeModel(FeatureModel):
     def features(self, q: Tensor, mechanical: ForwardModel) -> Features:
         """Return the features for training rows q (N, n)."""
         robot = mechanical.robot
-        if isinstance(robot, ArcChain):
+        if robot.n_arcs:
             return PoseFeatures.of_range(q, robot)
         raise TypeError(
             "`mechanical_model` must be a chain of arcs with error_model='pose', got "

@@ -11,11 +11,13 @@ from torch import Tensor
 from typing_extensions import Self
 
 from hybridkin._core.blocks import check_vectors, in_blocks
+from hybridkin._core.frames import Frames
 from hybridkin._core.kernel_numbers import HK_POSE_FEATURES, HK_QUADRATIC_FEATURES
-from hybridkin._core.model import ForwardModel, PortableModule
+from hybridkin._core.model import ForwardModel
 from hybridkin._core.plan import NoKernel, Plan
+from hybridkin._core.portable import PortableModule
 from hybridkin._core.stored import Layout, Stored
-from hybridkin.chains.arc_chain import ArcChain, Frames, write_whole_chain
+from hybridkin.chains.arc_chain import write_whole_chain
 from hybridkin.learning.network import ACTIVATIONS, write_units
 
 _POSE_BLOCK = 2048  # rows of pose features, whose temporaries stay in the cache
@@ -189,13 +191,13 @@ class PoseFeatures(Features):
     ----------
     center, scale : Tensor of shape (n,)
         Map of the training range to [-1, 1] [unit of q].
-    chain : ArcChain
-        The robot. The features share its parameters and buffers.
+    chain : ForwardModel
+        The robot, made of arcs. The features share its parameters and buffers.
     """
 
     layout = Layout("pose_features", {"center": "n", "scale": "n"}, parts=("chain",))
 
-    def __init__(self, center: Tensor, scale: Tensor, chain: ArcChain) -> None:
+    def __init__(self, center: Tensor, scale: Tensor, chain: ForwardModel) -> None:
         super().__init__(center, scale)
         self.chain = chain
 
@@ -338,9 +340,9 @@ class Readout(ForwardModel):
         self.n_actuators = len(features.center)
         self.n_outputs = len(weights)
 
-    def up_to(self, chain: ArcChain) -> Readout:
-        """Return the readout for the arcs up to the tip of a chain, from that for all arcs."""
-        return Readout(self.features, chain.up_to_tip(self.weights))
+    def up_to_tip_of(self, robot: ForwardModel) -> Readout:
+        """Return the readout for the arcs up to the tip of a robot, from that for all arcs."""
+        return Readout(self.features, robot.up_to_tip(self.weights))
 
     def forward(self, q: Tensor) -> Tensor:
         """Return W phi(q), shape (..., C)."""
@@ -388,15 +390,15 @@ class Projected(ForwardModel):
         self.n_actuators = len(offset)
         self.n_outputs = model.n_outputs
 
-    def moved(self, q: Tensor) -> Tensor:
+    def inner(self, q: Tensor) -> Tensor:
         """Return the part of q (..., n) along the directions that the rows moved."""
         return q @ self.matrix.to(q) + self.offset.to(q)
 
     def forward(self, q: Tensor) -> Tensor:
         """Return the output of the model, shape (..., m)."""
-        return self.model(self.moved(q))
+        return self.model(self.inner(q))
 
     def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return the output of the model (..., m) and its derivative by q (..., m, n)."""
-        x, J = self.model.forward_and_jacobian(self.moved(q))
+        x, J = self.model.forward_and_jacobian(self.inner(q))
         return x, J @ self.matrix.to(q).mT

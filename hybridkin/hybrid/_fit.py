@@ -6,12 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from hybridkin._core.units import motion_message
 from hybridkin.calibration.choice import unmoved
 from hybridkin.calibration.measured import points
-from hybridkin.chains.chain import Chain
 from hybridkin.hybrid._guards import GroupDistance, Plane, fit_guard
 from hybridkin.hybrid._module import Hybrid, HybridModule, TipCorrection
 from hybridkin.hybrid._rows import Rows, rare_marker
@@ -22,7 +19,7 @@ from hybridkin.hybrid._spec import (
     Weighted,
     residuals,
 )
-from hybridkin.hybrid._wrapped import Stacked, WithPose, posed
+from hybridkin.hybrid._wrapped import Stacked, WithPose
 
 _NEVER = 1e-9  # part of an actuator in the moved directions, if it never moves
 _COUNTS = 1e12  # largest ratio of weights; a smaller weight is lost in a float64 sum
@@ -87,8 +84,8 @@ def _module(rows: Rows, spec: Spec, weighted: Weighted) -> HybridModule | WithPo
             groups = rows.groups
         tested = GroupDistance.of_log(rows.q, groups, directions, plane)
     if spec.output == "pose":
-        mechanical = posed(spec.mechanical)
-        return WithPose.of(mechanical, corrections, weights, tested, plane)
+        assert spec.mechanical is not None  # checked with the settings
+        return WithPose.of(spec.mechanical, corrections, weights, tested, plane)
     return HybridModule(spec.mechanical, corrections, weights, None, tested, plane)
 
 
@@ -133,19 +130,14 @@ def few_rows(rows: Rows, spec: Spec) -> list[str]:
     return messages
 
 
-def known_tips(chain: Chain, rows: Rows) -> tuple[Tensor, Tensor]:
-    """Return tips (N, m), measured (if missing: of the chain), and those of the chain [m]."""
-    predicted = chain(rows.q).detach()
-    tips = torch.from_numpy(rows.tips[:, : chain.n_outputs])
-    return torch.where(tips.isnan(), predicted, tips), predicted
-
-
 def fit_messages(spec: Spec, rows: Rows) -> tuple[str, ...]:
     """Return the warnings of a fit: of its calibration, or of rows for an uncalibrated chain."""
-    chain = spec.mechanical
-    if spec.calibration is not None or not isinstance(chain, Chain):
+    robot = spec.mechanical
+    if spec.calibration is not None or robot is None:
         return spec.messages
-    motion = motion_message("y", *known_tips(chain, rows), float(chain.reach))
-    messages = [*spec.messages, *chain.check_actuators(rows.q, "X")]
-    doubts = chain.contradiction(rows.q, "X"), motion
-    return (*messages, *(message for message in doubts if message is not None))
+    return (
+        *spec.messages,
+        *robot.check_actuators(rows.q, "X"),
+        *robot.contradictions(rows.q, "X"),
+        *robot.tip_messages(rows.q, torch.from_numpy(rows.tips), "y"),
+    )

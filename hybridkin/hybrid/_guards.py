@@ -18,8 +18,9 @@ from hybridkin._core.kernel_numbers import (
     HK_GROUP,
     HK_LONGEST,
 )
-from hybridkin._core.model import ForwardModel, PortableModule, reverse_jacobian
+from hybridkin._core.model import ForwardModel, reverse_jacobian
 from hybridkin._core.plan import Plan
+from hybridkin._core.portable import PortableModule
 from hybridkin._core.stored import Layout, Stored
 from hybridkin.calibration.choice import split_by_effect
 from hybridkin.hybrid._features import center_and_scale

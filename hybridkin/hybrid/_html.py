@@ -26,8 +26,10 @@ def fitted_rows(model: HybridPredictor) -> dict[str, object]:
         rows["structure"] = " ".join(words)
     if model.radius_ is not None:
         rows["estimated error radius"] = str(model.radius_)
-    if model.play_ is not None:
-        rows[model.play_.kind] = f"width {numbers(model.play_.width)} (unit of q)"
+    if model.hysteresis_:
+        rows[model.hysteresis_.kind] = (
+            f"width {numbers(model.hysteresis_.width)} (unit of q)"
+        )
     if model.module_ is not model.fitted_module_:
         rows["adapted"] = "after the fit; the errors are those of the fit"
     if model.calibration_ is not None:

@@ -10,9 +10,11 @@ import torch
 from torch import Tensor, nn
 from typing_extensions import Self
 
+from hybridkin._core.actuation import DIRECT, Actuation
 from hybridkin._core.blocks import in_blocks
-from hybridkin._core.model import ForwardModel, PortableModule
+from hybridkin._core.model import ForwardModel
 from hybridkin._core.plan import CHAINS, NoKernel, Plan
+from hybridkin._core.portable import PortableModule
 from hybridkin._core.stored import Layout, Stored
 from hybridkin.hybrid._guards import GroupDistance, Guard, LeverageGuard, Plane
 from hybridkin.learning.regressor_modules import AffineModule
@@ -180,6 +182,15 @@ class Hybrid(ForwardModel):
         """Return the same model with another drift; this model does not change."""
         raise NotImplementedError
 
+    def behind(self, hysteresis: Actuation) -> Self:
+        """Return the same model with another hysteresis; this model does not change."""
+        raise NotImplementedError
+
+    @property
+    def without_hysteresis(self) -> Self:
+        """The model of actuators that do what they are commanded."""
+        return self.behind(DIRECT)
+
     def error_part(self, q: Tensor) -> Tensor:
         """Return what was learned, corrections and drift, in the form of the residuals [m]."""
         raise NotImplementedError
@@ -258,6 +269,8 @@ class HybridModule(Hybrid):
         Distance up to which held-out groups have tested the corrections, if the rows have groups.
     log_plane : Plane or None
         The plane of q to keep to, if the rows lie in one.
+    hysteresis : Hysteresis
+        What is between commands and q. It is no part of the state: an estimator stores it.
     """
 
     layout = Layout(
@@ -275,6 +288,7 @@ class HybridModule(Hybrid):
         drift: AffineModule | None = None,
         tested: GroupDistance | None = None,
         log_plane: Plane | None = None,
+        hysteresis: Actuation = DIRECT,
     ) -> None:
         super().__init__()
         total = float(weights.sum())
@@ -294,6 +308,7 @@ class HybridModule(Hybrid):
         self.drift = drift
         self.tested = tested
         self.log_plane = log_plane
+        self._hysteresis = hysteresis
         sized = corrections[0].module if mechanical is None else mechanical
         self.n_actuators = sized.n_actuators
         self.n_outputs = sized.n_outputs
@@ -331,9 +346,21 @@ class HybridModule(Hybrid):
         longest = torch.as_tensor(self.longest_correction, device=x.device)
         return self.mechanical.misses(x, largest) - longest
 
+    @property
+    def hysteresis(self) -> Actuation:
+        """The hysteresis between commands and q."""
+        return self._hysteresis
+
     def with_drift(self, drift: AffineModule) -> Self:
         """Return the same model with another drift; this model does not change."""
-        arguments = self.weights, drift, self.tested, self.log_plane
+        return self._with(drift, self._hysteresis)
+
+    def behind(self, hysteresis: Actuation) -> Self:
+        """Return the same model with another hysteresis; this model does not change."""
+        return self._with(self.drift, hysteresis)
+
+    def _with(self, drift: AffineModule | None, hysteresis: Actuation) -> Self:
+        arguments = self.weights, drift, self.tested, self.log_plane, hysteresis
         return type(self)(self.mechanical, self._corrections, *arguments)
 
     def forward(self, q: Tensor) -> Tensor:

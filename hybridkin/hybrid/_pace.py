@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridkin._core.runs import RunOrder
-from hybridkin.chains.creep import CreepOperator
 from hybridkin.hybrid._range import TESTED, ranges_of_others
 from hybridkin.hybrid._rows import Rows
+from hybridkin.hysteresis.follow import followed
+from hybridkin.hysteresis.stages.creep import Creep
 
 _TOLERANCE = 1.1  # least factor by which a pace may be beyond those of the log
 _TINY = 1e-9  # pace that counts as rest, relative to the largest
@@ -90,8 +91,8 @@ def each_pace(
     before[order.first] = 0.0
     sums = np.cumsum(before, axis=0)
     for time_constant in time_constants:
-        creep = CreepOperator([0.5], [time_constant])
-        recent = new + 2.0 * (sums - creep.followed(sums, steps))
+        creep = Creep([0.5], [time_constant])
+        recent = new + 2.0 * (sums - followed([creep], sums, steps))
         duration = recent[:, :1]
         speeds = np.empty_like(rows)
         speeds[order.order] = recent[:, 1:] / np.where(duration > 0.0, duration, 1.0)

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.metrics import r2_score
 from sklearn.utils.validation import check_is_fitted
+from typing_extensions import Self
 
 from hybridkin._core.arrays import labels
 from hybridkin._core.commands import Commands
@@ -23,15 +24,11 @@ from hybridkin._core.distinct import targets_that_count
 from hybridkin._core.html import html_table
 from hybridkin._core.model import ForwardModel, as_forward_model
 from hybridkin._core.other_units import check_commands
-from hybridkin._core.plausible import PlausibleRows
-from hybridkin._core.units import motion_message
+from hybridkin._core.plausible import PlausibleRows, UnknownRows
 from hybridkin.calibration.calibrate import CalibrationResult
-from hybridkin.chains.chain import Chain
-from hybridkin.chains.hysteresis import HysteresisOperator
 from hybridkin.hybrid._adapt import Change
 from hybridkin.hybrid._drift import Drift
-from hybridkin.hybrid._fit import known_tips
-from hybridkin.hybrid._hysteresis import Past
+from hybridkin.hybrid._hysteresis import NO_PAST, Past
 from hybridkin.hybrid._module import Hybrid
 from hybridkin.hybrid._pace import each_pace
 from hybridkin.hybrid._radius import Radius
@@ -40,6 +37,8 @@ from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._wrapped import in_columns, pose_difference
 from hybridkin.hybrid.cv_results import CvResults
 from hybridkin.hybrid.log_fit import HybridFit
+from hybridkin.hybrid.model_description import ModelDescription
+from hybridkin.hysteresis.value import Hysteresis
 from hybridkin.learning.hidden_layer import check_inputs
 from hybridkin.native.library import evaluate
 
@@ -58,12 +57,13 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     module_: ForwardModel
     change_: Change
     mechanical_model_: ForwardModel | None
+    description_: ModelDescription
     _fit: HybridFit
-    _past: Past | None
+    _past: Past
     _drift: Drift
-    _plausible_rows: PlausibleRows | None = None
+    _plausible_rows: PlausibleRows = UnknownRows.of(0)
     # Those that need no other check, and do not change by hysteresis.
-    _plain_rows: PlausibleRows | None = None
+    _plain_rows: PlausibleRows = UnknownRows.of(0)
 
     @property
     def fitted_module_(self) -> Hybrid:
@@ -91,11 +91,6 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return self._fit.candidates
 
     @property
-    def play_(self) -> HysteresisOperator | None:
-        """The hysteresis."""
-        return self._fit.play
-
-    @property
     def radius_(self) -> Radius | None:
         """The estimated error radius."""
         return self._fit.radius
@@ -115,11 +110,12 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Parameters
         ----------
         X : array-like of shape (N, n) or Commands
-            Actuator vectors; with `play` in order of time, for several runs or times as `Commands`.
+            Actuator vectors; with `hysteresis` in order of time, as `Commands` for several runs or
+            times.
         return_radius : bool, default=False
             Whether to return the estimated error radius as well; requires `coverage`.
         groups : array-like of shape (N,), optional
-            Motion of every row, only used with `play`: as in a fit, each motion is a run.
+            Motion of every row, only used with `hysteresis`: as in a fit, each motion is a run.
 
         Returns
         -------
@@ -161,7 +157,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     ) -> float:
         """Return R^2 of `predict`, averaged over the columns of y, without missing markers.
 
-        Of rows of weight 0, y is ignored; with `play` they move the actuators.
+        Of rows of weight 0, y is ignored; with `hysteresis` they move the actuators.
         """
         x = self.predict(X)
         y = targets_that_count(y, sample_weight, "y")
@@ -197,10 +193,10 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         directions that no training row moved, the domain ends after a tenth of the range. The
         errors of rows outside the domain are not known, even where eps has its full weight.
 
-        With `play`, smooth friction and creep have states, which follow from the commands of a run.
-        A row is outside if its states are farther from those of the log than a tenth of the range,
-        and than groups of the log are from each other: for example in a run that begins where no
-        run of the log was, or after a long rest. With creep a row is outside as well if its run
+        Friction and creep have states, which follow from the commands of a run. A row is outside if
+        its states are farther from those of the log than a tenth of the range, and than groups of
+        the log are from each other: for example in a run that begins where no run of the log was,
+        or after a long rest. With creep a row is outside as well if its run
         moves faster or slower than the log did, over any time constant of creep.
 
         Parameters
@@ -216,8 +212,32 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         inside = self._evaluated(self._distances, X, warn=False)[0] <= 1.0
         return inside & self._are_states_seen(X)
 
+    def described(self, description: ModelDescription) -> Self:
+        """Return this estimator with another `description_`."""
+        self.description_ = description
+        return self
+
+    def was_fitted(self, X: object, y: ArrayLike) -> NDArray[np.bool_]:
+        """Return which rows are rows of the fit, to a micrometre, shape (N,).
+
+        Parameters
+        ----------
+        X : array-like of shape (N, n) or Commands
+            Actuator vectors, as for `fit`.
+        y : array-like of shape (N, m)
+            Measured tips [m].
+
+        Returns
+        -------
+        ndarray of bool of shape (N,)
+            All False for a nominal model, which no rows were fitted to.
+        """
+        check_is_fitted(self, "module_")
+        q = check_inputs(self, Commands.of(X).q)
+        return np.isin(row_digests(q, y), self._fit.fitted_rows)
+
     def effective(self, X: object) -> NDArray:
-        """Return what the actuators do for commands X [unit of q]; without `play`, X itself.
+        """Return what the actuators do for commands X [unit of q]; without `hysteresis`, X itself.
 
         Parameters
         ----------
@@ -237,9 +257,11 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         check_is_fitted(self, "module_")
         commands = Commands.of(X)
         rows = check_inputs(self, commands.q)
-        if self.play_ is None or not len(rows):
+        if not self.hysteresis_ or not len(rows):
             return rows
-        return self.play_.apply_by_group(rows, commands.run_of_rows, commands.time)
+        return self.hysteresis_.apply_by_group(
+            rows, commands.run_of_rows, commands.time
+        )
 
     def error_weight(self, X: object) -> NDArray:
         """Return the weight w(q) in [0, 1] of the error model at each row, shape (N,)."""
@@ -247,6 +269,11 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return self._evaluated(
             lambda q: evaluate(weight, q + self.change_.shift), X, warn=False
         )[0]
+
+    @property
+    def hysteresis_(self) -> Hysteresis:
+        """The hysteresis between the commands and what the actuators do; maybe none."""
+        return self._fit.hysteresis
 
     @property
     def training_range_(self) -> TrainingRange:
@@ -279,31 +306,25 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """Return names and values of what the fit found, which a notebook shows."""
 
     @property
-    def _chain(self) -> Chain | None:
-        """The mechanical model if it is a chain."""
-        if isinstance(self.mechanical_model_, Chain):
-            return self.mechanical_model_
-        return None
+    def _robot(self) -> ForwardModel:
+        """The mechanical model; without one the module, which knows no robot either."""
+        return (
+            self.module_ if self.mechanical_model_ is None else self.mechanical_model_
+        )
 
     def _check_commands(self, rows: Rows) -> None:
         """Raise if actuator vectors have another unit than those of the fit."""
-        chain = self._chain
-        turns = chain is not None and bool(
-            torch.as_tensor(chain.turns, device="cpu").all()
-        )
+        turns = torch.as_tensor(self._robot.turns, device="cpu")
         low, high = self.training_range_
-        check_commands(rows.X, low, high, turns)
+        check_commands(rows.X, low, high, bool(turns.all()))
 
     def _warn_of_units(self, rows: Rows) -> None:
         """Warn if measured tips span far more than the robot, so they cannot be in metres."""
-        chain = self._chain
-        if chain is None or not rows.counts.any():
+        if not rows.counts.any():
             return
-        measured, tips = known_tips(chain, rows.take(np.flatnonzero(rows.counts)))
-        message = motion_message(
-            "y", torch.cat([tips, measured]), tips, float(chain.reach)
-        )
-        if message is not None:
+        rows = rows.take(np.flatnonzero(rows.counts))
+        tips = torch.from_numpy(rows.tips)
+        for message in self._robot.tip_messages(rows.q, tips, "y", calibrated=True):
             warnings.warn(message, stacklevel=3)
 
     def _doubts(self, q: NDArray) -> list[str]:
@@ -311,20 +332,17 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
         Negative lengths are extrapolation, no error.
         """
-        chain = self._chain
-        plausible = self._plausible_rows
-        if chain is None or (plausible and plausible.hold(q)):
+        if self._plausible_rows.hold(q):
             return []
-        rows = torch.from_numpy(q)
-        messages = [*chain.unit_messages(rows, "X"), chain.contradiction(rows, "X")]
-        return [message for message in messages if message is not None]
+        robot = self._robot
+        rows = torch.tensor(q, device="cpu")
+        return [*robot.unit_messages(rows, "X"), *robot.contradictions(rows, "X")]
 
     def _distances(self, q: NDArray) -> tuple[NDArray]:
         """Return the distance from the domain of rows q (N, n): infinite without a shape."""
         (distance,) = self._tips(q, value=False, distance=True, enough=1.0)
-        plausible = self._plausible_rows
-        if self._chain is not None and not (plausible and plausible.hold(q)):
-            has_shape = self._chain.has_shape(torch.from_numpy(q))
+        if not self._plausible_rows.hold(q):
+            has_shape = self._robot.has_shape(torch.tensor(q, device="cpu"))
             distance = np.where(has_shape.numpy(), distance, np.inf)
         return (distance,)
 
@@ -332,17 +350,22 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """Return whether the log had the states inside of the hysteresis, and such a pace (N,)."""
         commands = Commands.of(X)
         states_of_log = self._fit.state_range
-        if self.play_ is None or states_of_log is None:
+        if not self.hysteresis_ or states_of_log is None:
             return np.ones(len(commands), dtype=bool)
         rows = check_inputs(self, commands.q)
         low, high = states_of_log.moved(-self.change_.shift)
         seen = np.ones(len(commands), dtype=bool)
-        states = self.play_.each_inner_state(rows, commands.run_of_rows, commands.time)
+        states = self.hysteresis_.each_inner_state(
+            rows, commands.run_of_rows, commands.time
+        )
         for k, state in enumerate(states):
             seen &= ((low[k] <= state) & (state <= high[k])).all(axis=1)
         if self._fit.pace is not None and commands.time is not None:
             paces = each_pace(
-                rows, commands.run_of_rows, commands.time, self.play_.time_constants
+                rows,
+                commands.run_of_rows,
+                commands.time,
+                self.hysteresis_.time_constants,
             )
             seen &= self._fit.pace.holds(paces, len(rows))
         return seen
@@ -352,8 +375,9 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self._fit = fit
         self.change_ = Change.none(self.n_features_in_)
         self._drift = fit.no_drift
-        self._past = None
+        self._past = NO_PAST
         self._follow_robot()
+        self.description_ = ModelDescription.of(self.module_, self.n_features_in_)
 
     def count_as_fitted(self, q: NDArray, x: NDArray) -> None:
         """Count rows q (N, n) with tips x (N, m) as fitted: those of a log that was thinned."""
@@ -371,11 +395,9 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if mechanical is not None:
             mechanical = self.change_.after(mechanical.without_errors)
         self.mechanical_model_ = mechanical
-        self._plausible_rows = None
-        self._plain_rows = None
-        if self._chain is not None:
-            self._plausible_rows = self._chain.plausible_rows()
-        if self.play_ is None and "feature_names_in_" not in vars(self):
+        self._plausible_rows = self._robot.plausible_rows()
+        self._plain_rows = UnknownRows.of(self.n_features_in_)
+        if not self.hysteresis_ and "feature_names_in_" not in vars(self):
             self._plain_rows = self._plausible_rows
 
     def _tips(
@@ -407,8 +429,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         warn: bool = True,
     ) -> list[NDArray]:
         """Return the results of a function of rows q for the rows of X, in the dtype of X."""
-        plain = self._plain_rows
-        if plain is not None and plain.hold_row(X):
+        if self._plain_rows.hold_row(X):
             rows = X
             q = X
         else:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
 from functools import cached_property, partial
-from math import ceil, inf, nan
+from math import inf, nan
 from typing import NamedTuple
 
 import numpy as np
@@ -15,16 +14,11 @@ from torch import Tensor
 
 from hybridkin._core.arrays import identity
 from hybridkin._core.model import ForwardModel
-from hybridkin._core.plan import Plan
-from hybridkin._core.stored import Stored
 from hybridkin.calibration.measured import points
-from hybridkin.chains.arc_chain import ArcChain
-from hybridkin.chains.structural import StructuralChain
 from hybridkin.hybrid import _linearised
 from hybridkin.hybrid._features import Features, Readout
 from hybridkin.hybrid._linearised import Linearised, Pair
 from hybridkin.hybrid._rows import Rows
-from hybridkin.native.library import Program, program_of
 
 _LARGEST = 1000  # most weights; of more features only the strongest directions are kept
 # Steps; the first ones, far from the optimum, and every tenth factorise.
@@ -56,42 +50,6 @@ class ReadoutFit(NamedTuple):
         inf  # variance of tips over that of actuators; infinity: tips only
     )
     rmse: float = nan  # weighted root mean square length of `residual` [m]
-
-
-Tips = Callable[[Tensor], tuple[Tensor, Tensor]]
-
-
-def tips_of(model: ForwardModel) -> Tips:
-    """Return `from_coordinates_and_jacobian`, for arcs from the compiled core if available."""
-    if isinstance(model, StructuralChain):
-        of_chain = tips_of(model.chain)
-        return lambda z: model.moved(*of_chain(z))
-    single = isinstance(model, ArcChain) and len(model.markers) == 1
-    if not single or program_of(model) is None:
-        return model.from_coordinates_and_jacobian
-    m = ceil(model.tip_at)
-    offsets = model.offsets[:m].numpy(force=True).copy()
-    offsets[-1] *= model.tip_at == m
-    arrays = {
-        "base": model.base.numpy(force=True),
-        "offsets": offsets,
-        "radii": np.ones(m),
-    }
-    # q are the arcs.
-    derived = {
-        "arc_matrix": np.eye(3 * m),
-        "arc_offset": np.zeros(3 * m),
-    }
-    markers = [[float(m), *model.markers[-1][1:]]]
-    settings = {"markers": markers, "stage": None}
-    plan = Plan(Stored("constant_curvature", settings, arrays, derived=derived))
-    program = Program(plan)
-
-    def tips(z: Tensor) -> tuple[Tensor, Tensor]:
-        x, J = program.evaluate(z.numpy(), jacobian=True)
-        return torch.from_numpy(x), torch.from_numpy(J)
-
-    return tips
 
 
 def _at_tip(z: Tensor) -> tuple[Tensor, Tensor]:
@@ -251,7 +209,7 @@ class _Problem:
         self.noise_ratio = inf
         self.whitening = None
         self._last = None
-        self._tips = tips_of(mechanical) if serial else _at_tip
+        self._tips = mechanical.tips_by_coordinates() if serial else _at_tip
         self.z = mechanical.coordinates(q)[0] if serial else mechanical(q)
         self.seen = ~x.isnan()
         self.rest, J = self._rest(self.z)

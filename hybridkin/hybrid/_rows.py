@@ -14,7 +14,7 @@ from typing_extensions import Self
 from hybridkin._core.digests import row_digests
 from hybridkin._core.directions import Directions, moved_directions
 from hybridkin._core.distinct import at_place, distinct_rows
-from hybridkin.chains.hysteresis import HysteresisOperator
+from hybridkin.hysteresis.value import Hysteresis
 
 
 @dataclass(frozen=True)
@@ -120,9 +120,9 @@ class Rows:
             columns.append(self.time)
         return self._merged(np.column_stack(columns), follow=True)
 
-    def effective(self, operator: HysteresisOperator) -> Self:
+    def effective(self, hysteresis: Hysteresis) -> Self:
         """Return the rows with what the actuators do in place of the commands."""
-        moved = operator.apply_by_group(self.X, self.run_of_rows, self.time)
+        moved = hysteresis.apply_by_group(self.X, self.run_of_rows, self.time)
         return replace(self, X=moved, runs=None, time=None)
 
     def _merged(self, columns: NDArray, follow: bool = False) -> Self:

@@ -15,11 +15,10 @@ from scipy.linalg import LinAlgWarning
 from sklearn.linear_model import LinearRegression
 from typing_extensions import Self
 
+from hybridkin._core.model import ForwardModel
 from hybridkin._core.turns import TURNS
 from hybridkin.calibration.choice import GeometryChoice
 from hybridkin.calibration.measured import distance, inner_and_outer
-from hybridkin.chains.arc_chain import ArcChain
-from hybridkin.chains.structural import StructuralChain
 from hybridkin.hybrid._error_models import (
     Blend,
     KernelModel,
@@ -109,13 +108,13 @@ class Auto(ErrorModel):
             candidates["linear"] = RegressorModel(LinearRegression())
         else:
             first = "mechanical"
-            if isinstance(spec.mechanical, StructuralChain):
+            if spec.mechanical.without_errors is not spec.mechanical:
                 first = "structural"
             candidates[first] = NoCorrection()
             candidates["serial linear"] = LinearModel("serial")
             candidates["serial quadratic"] = QuadraticModel("serial")
             at_tip = "parallel "
-            if isinstance(spec.mechanical.robot, ArcChain):
+            if spec.mechanical.robot.n_arcs:
                 candidates["serial pose"] = ShapeModel("serial")
                 candidates["parallel pose"] = ShapeModel("parallel")
             else:
@@ -312,13 +311,15 @@ def expected_with_new_choices(
     return table.expected_error * float(after / before)
 
 
-def _errors_of_structure(spec: Spec) -> StructuralChain | None:
+def _errors_of_structure(spec: Spec) -> ForwardModel | None:
     """Return the refined mechanical model, if it is refined."""
     model = spec.mechanical
-    return model if isinstance(model, StructuralChain) else None
+    if model is None or model.without_errors is model:
+        return None
+    return model
 
 
-def _structure_of(model: StructuralChain | None, rows: Rows) -> StructureFit | None:
+def _structure_of(model: ForwardModel | None, rows: Rows) -> StructureFit | None:
     """Return the fit of a refined mechanical model, if more rows could help."""
     if model is None or len(rows) > ENOUGH:
         return None

@@ -8,10 +8,10 @@ from sklearn.utils._param_validation import HasMethods, Interval, StrOptions
 from torch import nn
 
 from hybridkin.calibration.choice import GeometryChoice
-from hybridkin.chains.hysteresis import HysteresisOperator
 from hybridkin.hybrid._error_models import NAMED, ForeignModel, network_model
 from hybridkin.hybrid._selection import Auto
 from hybridkin.hybrid._spec import ErrorModel, Seed
+from hybridkin.hysteresis.value import Hysteresis
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.elm_cv import ELMRegressorCV
 
@@ -32,7 +32,7 @@ CONSTRAINTS = {
         None,
     ],
     "guard": [StrOptions({"leverage", "box"}), None],
-    "play": [StrOptions({"auto"}), Real, "array-like", HysteresisOperator, None],
+    "hysteresis": [StrOptions({"auto"}), Real, "array-like", Hysteresis],
     "coverage": [Interval(Real, 0, 1, closed="neither"), None],
     "output": [StrOptions({"position", "pose"})],
     "random_state": ["random_state"],

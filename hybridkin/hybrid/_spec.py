@@ -11,7 +11,7 @@ from typing import NamedTuple, cast
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from torch import Tensor
 from typing_extensions import Self
 
@@ -21,19 +21,18 @@ from hybridkin.calibration._search import Start
 from hybridkin.calibration.calibrate import CalibrationResult, fit_geometry, refitted
 from hybridkin.calibration.choice import GeometryChoice, choose_geometry
 from hybridkin.chains.chain import Chain
-from hybridkin.chains.hysteresis import HysteresisOperator
 from hybridkin.chains.structural import StructuralChain
 from hybridkin.hybrid._drift import too_far
 from hybridkin.hybrid._module import Hybrid, TipCorrection
 from hybridkin.hybrid._rows import Rows
-from hybridkin.hybrid._wrapped import pose_errors, posed
+from hybridkin.hybrid._wrapped import pose_errors
 from hybridkin.hybrid.cv_results import CvResults
 from hybridkin.hybrid.held_out import MEAN_LENGTH
 from hybridkin.hybrid.structure_fit import StructureFit
+from hybridkin.hysteresis.value import NO_HYSTERESIS, Hysteresis
 
 Starts = tuple[Start | None, ...]
 Seed = int | np.random.RandomState | None
-Play = ArrayLike | HysteresisOperator | str | None
 Weighted = list[tuple[float, TipCorrection]]  # weights and corrections, without guards
 
 
@@ -79,6 +78,29 @@ class ErrorModel(ABC):
         spec : Spec
             The calibrated mechanical model.
         """
+
+
+class HysteresisChoice:
+    """How a fit gets the hysteresis of the actuators: by default there is none."""
+
+    def __bool__(self) -> bool:
+        """Return whether there may be one."""
+        return False
+
+    def of(self, spec: Spec, rows: Rows) -> tuple[Hysteresis, list[str]]:
+        """Return the hysteresis, and warnings about it.
+
+        Parameters
+        ----------
+        spec : Spec
+            The mechanical model, and its parameters to calibrate first.
+        rows : Rows
+            The log, with the rows of each run in order of time.
+        """
+        return NO_HYSTERESIS, []
+
+
+NO_CHOICE = HysteresisChoice()
 
 
 @dataclass(frozen=True)
@@ -164,7 +186,7 @@ class Spec:
     calibrate: tuple[str, ...] | str = ()  # geometry to calibrate, or "auto"
     guard: str | None = "leverage"
     output: str = "position"
-    play: Play = None
+    hysteresis: HysteresisChoice = NO_CHOICE
     coverage: float | None = None
     starts: Starts = ()  # of the choice of what to calibrate
     geometry: GeometryChoice | None = None  # how `calibrate` was chosen
@@ -313,7 +335,7 @@ def residuals(
     if mechanical is None:
         return y
     if output == "pose":
-        return pose_errors(posed(mechanical), q, y)
+        return pose_errors(mechanical, q, y)
     with torch.no_grad():
         tips = mechanical(q).numpy()
     if not countable(tips).all():

@@ -11,7 +11,6 @@ import torch
 from hybridkin._core.model import ForwardModel
 from hybridkin.calibration.choice import GeometryChoice
 from hybridkin.calibration.measured import distance, folds
-from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.hybrid._error_models import named
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._spec import (
@@ -50,7 +49,7 @@ class Structure(Refinement):
     def refine(self, mechanical: ForwardModel, rows: Rows) -> ForwardModel:
         """Return the chain with the errors of its structure."""
         chain = mechanical.without_errors
-        if not isinstance(chain, ArcChain) or not chain.has_one_arc_per_segment:
+        if not chain.has_one_arc_per_segment:
             return mechanical
         return fit_structure(chain, rows.thinned(ENOUGH), left_out=False).model
 
@@ -69,7 +68,7 @@ def best_refinement(spec: Spec, geometry: GeometryChoice, rows: Rows) -> Refinem
     few rows: other parameters may have been chosen because they imitate a twist.
     """
     chain = geometry.chain
-    if not isinstance(chain, ArcChain) or not chain.has_one_arc_per_segment:
+    if not chain.has_one_arc_per_segment:
         return UNREFINED
     candidates = [RefinedGeometry(geometry, Structure())]
     for usual in geometry.usual[-1:]:
@@ -120,7 +119,7 @@ class StructuralModel(ErrorModel):
     def fit(self, rows: Rows, spec: Spec) -> FittedError:
         """Return the chain with the errors of its structure; there are no corrections of it."""
         chain = spec.mechanical
-        if not isinstance(chain, ArcChain) or not chain.has_one_arc_per_segment:
+        if chain is None or not chain.has_one_arc_per_segment:
             raise TypeError(
                 "`mechanical_model` must be a chain of arcs, one for each segment, with "
                 f"error_model='structural', got {type(chain).__name__}; use "

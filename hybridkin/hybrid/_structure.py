@@ -12,14 +12,13 @@ from torch import Tensor
 
 from hybridkin._core.arrays import identity
 from hybridkin._core.blocks import in_blocks
+from hybridkin._core.model import ForwardModel
 from hybridkin._core.rotations import cross_matrix, rotation
 from hybridkin.calibration.measured import points
 from hybridkin.calibration.natural_scales import STRUCTURE
-from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.structural import Loads, StructuralChain, Weights, change_of
 from hybridkin.hybrid._drift import too_far
 from hybridkin.hybrid._linearised import members_of
-from hybridkin.hybrid._readout_fit import tips_of
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid.structure_fit import StructureFit
 
@@ -124,7 +123,7 @@ class StructureDesign:
 
     Parameters
     ----------
-    chain : ArcChain
+    chain : ForwardModel
         The chain, with one arc for each segment.
     q : Tensor of shape (N, n)
         Rows of the log, which give the mean lengths and the noise of the actuators.
@@ -136,14 +135,14 @@ class StructureDesign:
 
     def __init__(
         self,
-        chain: ArcChain,
+        chain: ForwardModel,
         q: Tensor,
         factor: float = 1.0,
         scales: Mapping[str, float] = STRUCTURE,
     ) -> None:
         self.chain = chain
         self.factor = factor
-        lengths = chain.frames_and_moves(q).arcs[: chain.n_segments]
+        lengths = chain.frames_and_moves(q).arcs[: chain.n_arcs]
         self.reach = chain.reach.to(q)
         self.lengths = lengths.mean(1)
         varies = lengths.std(1, correction=0) > _MOVES * self.reach
@@ -151,7 +150,7 @@ class StructureDesign:
         turn = q.new_full((3,), factor * scales["base turn"])
         move = q.new_full((3,), factor * scales["base move"])
         self.base = torch.cat([turn, self.reach * move])
-        self.pivot = chain.base[:3, 3].to(q)
+        self.pivot = chain.origin.to(q)
         self.spread = _ACTUATOR_NOISE * q.std(0, correction=0)
 
     @property
@@ -228,7 +227,7 @@ class _Problem:
         self.x = torch.where(self.seen, x, 0.0)
         self.root = torch.from_numpy(rows.counts.astype(np.float64)).sqrt()
         self.z, self.fields = design.arcs(rows.q)
-        self.tips = tips_of(chain)
+        self.tips = chain.tips_by_coordinates()
         J = chain.forward_and_jacobian(rows.q)[1]
         self.noise = design.noise(rows.q, J * self.seen[..., None])
 
@@ -285,7 +284,7 @@ def _cost(rest: Tensor, theta: Tensor) -> float:
 
 
 def fit_structure(
-    chain: ArcChain,
+    chain: ForwardModel,
     rows: Rows,
     factor: float = 1.0,
     left_out: bool = True,
@@ -298,7 +297,7 @@ def fit_structure(
 
     Parameters
     ----------
-    chain : ArcChain
+    chain : ForwardModel
         The calibrated chain.
     rows : Rows
         Different rows; tips are NaN for missing markers, whose residual is zero.

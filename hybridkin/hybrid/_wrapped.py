@@ -10,230 +10,16 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from typing_extensions import Self
 
+from hybridkin._core.actuation import Actuation
 from hybridkin._core.arrays import as_array
-from hybridkin._core.blocks import check_vectors, in_blocks
+from hybridkin._core.blocks import in_blocks
 from hybridkin._core.model import ForwardModel, PoseModel
 from hybridkin._core.plan import CHAINS, NoKernel, Plan
 from hybridkin._core.rotations import rotation, rotation_vector
 from hybridkin._core.stored import Layout, Stored
-from hybridkin.chains.chain import Chain
-from hybridkin.chains.markers import MarkedChain
-from hybridkin.chains.structural import StructuralChain
 from hybridkin.hybrid._guards import GroupDistance, Plane
 from hybridkin.hybrid._module import Hybrid, HybridModule, TipCorrection
 from hybridkin.learning.regressor_modules import AffineModule
-
-# Entries of a chain's geometry that are zeros of its actuators.
-_ZEROS = ("actuator_zeros", "joint_zeros", "tendon_zeros")
-
-
-class Wrapped(PoseModel):
-    """A model that stands before or after another one, of positions or of poses.
-
-    Parameters
-    ----------
-    model : ForwardModel
-        The other model.
-    """
-
-    model: ForwardModel
-
-    def __init__(self, model: ForwardModel) -> None:
-        super().__init__()
-        self.model = model
-        self.n_actuators = model.n_actuators
-        self.n_outputs = model.n_outputs
-
-    @property
-    def has_pose(self) -> bool:
-        """Whether the other model has poses."""
-        return self.model.has_pose
-
-    @property
-    def robot(self) -> ForwardModel:
-        """The model with the geometry, changed like this one."""
-        robot = self.model.robot
-        return self if robot is self.model else self.around(robot)
-
-    @property
-    def tip_model(self) -> ForwardModel:
-        """The model of the tip alone, changed like this one."""
-        tip = self.model.tip_model
-        return self if tip is self.model else self.around(tip)
-
-    @property
-    def plane(self) -> tuple[Tensor, Tensor] | None:
-        """The plane of the log."""
-        return self.model.plane
-
-    def around(self, model: ForwardModel) -> ForwardModel:
-        """Return another model, changed like this one."""
-        raise NotImplementedError
-
-    def forward(self, q: Tensor) -> Tensor:
-        """Return the outputs of the other model for what it gets, shape (..., m) [m]."""
-        return self.model(self._inner(q))
-
-    def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        """Return x (..., m) and dx/dq (..., m, n)."""
-        return self.model.forward_and_jacobian(self._inner(q))
-
-    def pose_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        """Return `pose(q)` and `pose_jacobian(q)` in one pass."""
-        return posed(self.model).pose_and_jacobian(self._inner(q))
-
-    def domain_distance(self, q: Tensor) -> Tensor:
-        """Return the distance from the training rows of what the other model gets, (...)."""
-        return self.model.domain_distance(self._inner(q))
-
-    def has_shape(self, q: Tensor) -> Tensor:
-        """Return whether the other model has a shape, (...), bool."""
-        return self.model.has_shape(self._inner(q))
-
-    def _inner(self, q: Tensor) -> Tensor:
-        """Return what the other model gets for q."""
-        return q
-
-
-def _place_within(plan: Plan, stored: Stored, *before: str) -> int:
-    """Return the place of the model within; kernels know no model of the kinds `before` there."""
-    place = plan.node_of(stored.part("model"))
-    if plan.kind(place) in before:
-        raise NoKernel(f"a model {plan.kind(place)} within one {stored.kind}")
-    return place
-
-
-def _write_shifted(plan: Plan, stored: Stored) -> int:
-    model = _place_within(plan, stored, "shifted")
-    n, m = plan.lengths(model)
-    return plan.node("shifted", n, m, [stored.array("shift", (n,))], model)
-
-
-class Shifted(Wrapped):
-    """The model f(q + shift) of a robot whose actuator zeros have shifted.
-
-    Parameters
-    ----------
-    model : ForwardModel
-        f.
-    shift : Tensor of shape (n,)
-        Shift of the zeros [unit of q].
-    """
-
-    layout = Layout(
-        "shifted", {"shift": "n"}, parts=("model",), write_plan=_write_shifted
-    )
-
-    def __init__(self, model: ForwardModel, shift: Tensor) -> None:
-        super().__init__(model)
-        self.register_buffer("shift", shift)
-        self.n_actuators = len(shift)
-
-    @property
-    def plane(self) -> tuple[Tensor, Tensor] | None:
-        """The plane of the log, where it lies after the shift."""
-        plane = self.model.plane
-        return None if plane is None else (plane[0] - self.shift, plane[1])
-
-    def around(self, model: ForwardModel) -> ForwardModel:
-        """Return another model after the same shift."""
-        return shifted(model, self.shift)
-
-    def misses(self, x: Tensor, largest: Tensor) -> Tensor:
-        """Return by how much targets are out of reach of f, shape (...) [m]."""
-        return self.model.misses(x, largest + self.shift.abs().to(largest.device))
-
-    def _inner(self, q: Tensor) -> Tensor:
-        check_vectors(
-            q, len(self.shift), "q", f"this robot has {len(self.shift)} actuators"
-        )
-        return q + self.shift.to(q)
-
-
-def _write_moved(plan: Plan, stored: Stored) -> int:
-    model = _place_within(plan, stored, "shifted", "moved")
-    n, m = plan.lengths(model)
-    motion = stored.array("motion", (4, 4))
-    return plan.node("moved", n, m, [motion[:3, :3], motion[:3, 3]], model)
-
-
-class Moved(Wrapped):
-    """The model T f(q) of a robot whose base has moved.
-
-    Parameters
-    ----------
-    model : ForwardModel
-        f, whose outputs are one or several tips in space.
-    motion : Tensor of shape (4, 4)
-        T, the motion of the base in the measuring frame.
-    """
-
-    layout = Layout(
-        "moved", {"motion": "44"}, parts=("model",), write_plan=_write_moved
-    )
-
-    def __init__(self, model: ForwardModel, motion: Tensor) -> None:
-        super().__init__(model)
-        self.register_buffer("motion", motion)
-
-    def around(self, model: ForwardModel) -> ForwardModel:
-        """Return another model after the same motion."""
-        return moved(model, self.motion)
-
-    def forward(self, q: Tensor) -> Tensor:
-        """Return T f(q), shape (..., m) [m]."""
-        return moved_points(super().forward(q), self.motion)
-
-    def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        """Return T f(q) (..., m) and its derivative (..., m, n)."""
-        x, J = super().forward_and_jacobian(q)
-        return moved_points(x, self.motion), _turned(J.mT, self.motion).mT
-
-    def pose_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        """Return `pose(q)` and `pose_jacobian(q)` in one pass."""
-        T, J = super().pose_and_jacobian(q)
-        return self.motion.to(T) @ T, _turned(J.mT, self.motion).mT
-
-    def misses(self, x: Tensor, largest: Tensor) -> Tensor:
-        """Return by how much targets before T are out of reach of f, shape (...) [m]."""
-        before = moved_points(x, torch.linalg.inv(self.motion))
-        return self.model.misses(before, largest)
-
-
-def shifted(model: ForwardModel, shift: Tensor) -> ForwardModel:
-    """Return a model after a shift (n,) of its actuator zeros; a chain that has zeros stays one."""
-    if not shift.any():
-        return model
-    if not isinstance(model, Chain):
-        return Shifted(model, shift)
-    geometry = model.geometry()
-    zeros = {name: geometry[name] for name in _ZEROS if name in geometry}
-    if not zeros:
-        return Shifted(model, shift)
-    if "tendon_zeros" in zeros:
-        shift = geometry.get("gains", 1.0) * shift
-    changed = {name: value - shift.to(value) for name, value in zeros.items()}
-    return model.with_geometry(**changed)
-
-
-def moved(model: ForwardModel, motion: Tensor) -> ForwardModel:
-    """Return a model after a motion (4, 4) of its base; a chain stays one."""
-    at_rest = torch.eye(4, dtype=motion.dtype, device=motion.device)
-    if torch.equal(motion, at_rest):
-        return model
-    if isinstance(model, Chain):
-        return model.with_geometry(base=motion.to(model.base) @ model.base)
-    return Moved(model, motion)
-
-
-def moved_points(x: Tensor, motion: Tensor) -> Tensor:
-    """Return points (..., 3), or several of them in (..., m), moved by a motion (4, 4)."""
-    return _turned(x, motion) + motion[:3, 3].to(x).repeat(x.shape[-1] // 3)
-
-
-def _turned(v: Tensor, motion: Tensor) -> Tensor:
-    """Return vectors (..., 3), or several of them in (..., m), rotated by a motion (4, 4)."""
-    return (v.unflatten(-1, (-1, 3)) @ motion[:3, :3].to(v).mT).flatten(-2)
 
 
 def _write_stacked(plan: Plan, stored: Stored) -> int:
@@ -265,13 +51,12 @@ class Stacked(Hybrid):
         self.n_outputs = 3 * len(tips)
 
     @property
-    def mechanical(self) -> MarkedChain | StructuralChain | None:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def mechanical(self) -> ForwardModel | None:  # pyright: ignore[reportIncompatibleVariableOverride]
         """The chain of all markers, with the geometry of the tip's."""
         chain = self.tip_model.mechanical
-        if not isinstance(chain, (MarkedChain, StructuralChain)):
+        if chain is None:
             return None
-        chains = cast("list[MarkedChain]", [tip.mechanical for tip in self._tips()])
-        return chain._marked([chain.markers[-1] for chain in chains])
+        return chain.joined([tip.robot for tip in self._tips()])
 
     def stored(self) -> Stored:
         """Return the description of the model, with the chain of all markers."""
@@ -307,6 +92,16 @@ class Stacked(Hybrid):
             tip.misses(x, largest) for tip, x in zip(self._tips(), targets, strict=True)
         ]
         return torch.stack(missed).amax(0)
+
+    @property
+    def hysteresis(self) -> Actuation:
+        """The hysteresis between commands and q, which is that of the tip."""
+        return self.tip_model.hysteresis
+
+    def behind(self, hysteresis: Actuation) -> Self:
+        """Return the same model with another hysteresis; this model does not change."""
+        tips = [tip.behind(hysteresis) for tip in self._tips()]
+        return type(self)(self.mechanical, tips)
 
     def with_drift(self, drift: AffineModule) -> Self:
         """Return the same model with another drift; this model does not change."""
@@ -384,9 +179,9 @@ class WithPose(Hybrid, PoseModel):
     layout = Layout(
         "with_pose", {}, parts=("mechanical", "learned"), write_plan=_write_with_pose
     )
-    mechanical: PoseModel  # pyright: ignore[reportIncompatibleVariableOverride]
+    mechanical: ForwardModel  # pyright: ignore[reportIncompatibleVariableOverride]
 
-    def __init__(self, mechanical: PoseModel, learned: HybridModule) -> None:
+    def __init__(self, mechanical: ForwardModel, learned: HybridModule) -> None:
         super().__init__()
         self.mechanical = mechanical  # pyright: ignore[reportIncompatibleVariableOverride]
         self.learned = learned
@@ -395,7 +190,7 @@ class WithPose(Hybrid, PoseModel):
     @classmethod
     def of(
         cls,
-        mechanical: PoseModel,
+        mechanical: ForwardModel,
         corrections: Sequence[TipCorrection],
         weights: Tensor,
         tested: GroupDistance | None = None,
@@ -424,6 +219,15 @@ class WithPose(Hybrid, PoseModel):
         longest = torch.as_tensor(self.learned.longest_correction, device=x.device)
         return self.mechanical.misses(x, largest) - longest
 
+    @property
+    def hysteresis(self) -> Actuation:
+        """The hysteresis between commands and q."""
+        return self.learned.hysteresis
+
+    def behind(self, hysteresis: Actuation) -> Self:
+        """Return the same model with another hysteresis; this model does not change."""
+        return type(self)(self.mechanical, self.learned.behind(hysteresis))
+
     def with_drift(self, drift: AffineModule) -> Self:
         """Return the same model with another drift; this model does not change."""
         return type(self)(self.mechanical, self.learned.with_drift(drift))
@@ -431,7 +235,7 @@ class WithPose(Hybrid, PoseModel):
     def stored(self) -> Stored:
         """Return the description of the model, for kernels with the radians per metre of e_r."""
         stored = super().stored()
-        stored.derived["radians"] = as_array(1.0 / reach_of(self.mechanical))
+        stored.derived["radians"] = as_array(1.0 / self.mechanical.reach)
         return stored
 
     def forward(self, q: Tensor) -> Tensor:
@@ -471,13 +275,13 @@ class WithPose(Hybrid, PoseModel):
 
     def _pose(self, q: Tensor) -> tuple[Tensor]:
         error = self.learned(q)
-        turn = rotation(error[:, 3:] / reach_of(self.mechanical).to(error))[0]
+        turn = rotation(error[:, 3:] / self.mechanical.reach.to(error))[0]
         return (_displaced(self.mechanical.pose(q), error[:, :3], turn),)
 
     def _pose_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         T, J = self.mechanical.pose_and_jacobian(q)
         error, slope = self.learned.forward_and_jacobian(q)
-        reach = reach_of(self.mechanical).to(error)
+        reach = self.mechanical.reach.to(error)
         turn, left = rotation(error[:, 3:] / reach)
         # exp(phi) R_mech has the angular velocity J_l(phi) dphi/dq + exp(phi) omega_mech.
         angular = left @ (slope[:, 3:] / reach) + turn @ J[:, 3:]
@@ -499,7 +303,7 @@ class PoseRows(ForwardModel):
 
     n_outputs = 6
 
-    def __init__(self, model: PoseModel) -> None:
+    def __init__(self, model: ForwardModel) -> None:
         super().__init__()
         self.model = model
         self.n_actuators = model.n_actuators
@@ -525,17 +329,11 @@ class PoseRows(ForwardModel):
 def in_columns(model: ForwardModel, output: str) -> ForwardModel:
     """Return the model whose outputs are the columns of measured y, for this kind of `output`."""
     if output == "pose":
-        return PoseRows(posed(model))
+        return PoseRows(model)
     return model
 
 
-def posed(model: ForwardModel | None) -> PoseModel:
-    """Return a model that is known to have poses."""
-    assert isinstance(model, PoseModel)
-    return model
-
-
-def pose_errors(mechanical: PoseModel, q: Tensor, y: NDArray) -> NDArray:
+def pose_errors(mechanical: ForwardModel, q: Tensor, y: NDArray) -> NDArray:
     """Return the residuals (e_p, e_r) of poses y for a mechanical model, (N, 6) [m]."""
     if y.ndim != 2 or y.shape[1] != 6:
         raise ValueError(
@@ -545,7 +343,7 @@ def pose_errors(mechanical: PoseModel, q: Tensor, y: NDArray) -> NDArray:
     with torch.no_grad():
         rows = PoseRows(mechanical)(q)
     error = pose_difference(rows, torch.from_numpy(y))
-    error[:, 3:] *= reach_of(mechanical).to(error)
+    error[:, 3:] *= mechanical.reach.to(error)
     return error.numpy()
 
 
@@ -553,13 +351,6 @@ def pose_difference(before: Tensor, after: Tensor) -> Tensor:
     """Return translation [m] and rotation vector [rad] between poses as rows (N, 6)."""
     turn = rotation(after[:, 3:])[0] @ rotation(before[:, 3:])[0].mT
     return torch.cat([after[:, :3] - before[:, :3], rotation_vector(turn)], dim=-1)
-
-
-def reach_of(mechanical: PoseModel) -> Tensor:
-    """Return the length [m] that a radian of orientation error counts as, shape ()."""
-    if isinstance(mechanical, Chain):
-        return mechanical.reach
-    return torch.ones((), dtype=torch.float64, device="cpu")
 
 
 def _displaced(T: Tensor, way: Tensor, turn: Tensor) -> Tensor:

@@ -15,8 +15,6 @@ from hybridkin._core.arrays import identity, labels, shaped, whole
 from hybridkin._core.model import ForwardModel, as_forward_model
 from hybridkin._core.rotations import cross_matrix
 from hybridkin.calibration.measured import check_finite
-from hybridkin.chains.arc_chain import ArcChain
-from hybridkin.chains.chain import Chain
 from hybridkin.hybrid import _linearised
 from hybridkin.hybrid._features import PoseFeatures, QuadraticFeatures
 from hybridkin.hybrid._module import Hybrid
@@ -173,7 +171,7 @@ def _chosen(
 ) -> tuple[list[int], NDArray]:
     """Return n of the motions q (G, R, n), and the errors; `rows` set the units."""
     with torch.no_grad():
-        if isinstance(robot, ArcChain) and robot.has_one_arc_per_segment:
+        if robot.has_one_arc_per_segment:
             errors = _StructuralErrors(robot, model, rows)
         else:
             errors = _TipErrors(robot, rows)
@@ -197,9 +195,8 @@ def _actuators(robot: ForwardModel, value: ArrayLike, name: str) -> Tensor:
         raise ValueError(f"`{name}` must hold at least one row, got none.")
     check_finite(**{name: q})
     rows = torch.from_numpy(q)
-    if isinstance(robot, Chain):
-        for message in robot.check_actuators(rows, name):
-            warnings.warn(message, stacklevel=3)
+    for message in robot.check_actuators(rows, name):
+        warnings.warn(message, stacklevel=3)
     return rows
 
 
@@ -247,7 +244,7 @@ class _StructuralErrors(_Errors):
 
     Parameters
     ----------
-    chain : ArcChain
+    chain : ForwardModel
         The chain without these errors, one arc for each segment.
     model : ForwardModel
         Where it is linearised: the chain, or the chain with its learned errors.
@@ -255,7 +252,7 @@ class _StructuralErrors(_Errors):
         All rows, which give the mean lengths and the noise of the actuators.
     """
 
-    def __init__(self, chain: ArcChain, model: ForwardModel, q: Tensor) -> None:
+    def __init__(self, chain: ForwardModel, model: ForwardModel, q: Tensor) -> None:
         self.structure = StructureDesign(chain, q)
         self.model = model
         self.features = QuadraticFeatures.of_range(q)
@@ -309,7 +306,7 @@ class _TipErrors(_Errors):
 
     def __init__(self, robot: ForwardModel, q: Tensor) -> None:
         self.robot = robot
-        if isinstance(robot, ArcChain):
+        if robot.n_arcs:
             self.features = PoseFeatures.of_range(q, robot)
         else:
             self.features = QuadraticFeatures.of_range(q)
@@ -319,8 +316,8 @@ class _TipErrors(_Errors):
         self.center = tips.mean(0)
         size = (tips - tips.mean(0)).norm(dim=1).max()
         self.size = torch.where(size > 0.0, size, 1.0)
-        if isinstance(robot, Chain):
-            self.center = robot.base[:3, 3].to(q)
+        if robot.geometry():
+            self.center = robot.origin.to(q)
             self.size = robot.reach.to(q)
         n_linear = self.features.n_linear
         if len(self.units) * n_linear > _MOST:

@@ -45,8 +45,8 @@ def cross_fit(
     """Fit models to a log, and predict each part of it by fits to the others.
 
     Every model is fitted to all rows. Then it is fitted to all folds but one, which gives tips for
-    the rows of that fold. A model with error_model="auto" gets the weights of its candidates, and
-    the error to expect, from these tips, and a model with `coverage` its radius.
+    the rows of that fold. These tips give the error to expect of a model with error_model="auto"
+    and the radius of a model with `coverage`. The blend of "auto" is that of its `fit`.
 
     Parameters
     ----------
@@ -126,7 +126,11 @@ def cross_fit(
     for name, fit in fits.items():
         predicted = [of_fold[name] for of_fold in results]
         table = CrossFit.of(fit.names, measured, splits, predicted, fit.outer())
-        found = fit.decided(table).found()
+        if choices == "settled":
+            fit = fit.decided(table)
+        else:
+            fit = fit.with_settled_blend(table).with_radius(table)
+        found = fit.found()
         models[name].take_fit(found)
         for message in found.messages:
             warnings.warn(message, stacklevel=2)
@@ -163,7 +167,7 @@ class _WeightedLog(NamedTuple):
             )
         log = self.log
         weights = self.weights
-        if model.play is None:
+        if not model.follows_order:
             log = log.rows(self.counted)
             weights = weights[self.counted]
         return model.prepared(log.commands, log.x, weights, log.groups)

@@ -14,7 +14,8 @@ from sklearn.linear_model import LinearRegression
 
 from hybridkin._core.arrays import LARGEST
 from hybridkin._core.estimators import estimator_of, params_of, restore_columns
-from hybridkin._core.model import PortableModule, as_forward_model
+from hybridkin._core.model import ForwardModel, as_forward_model
+from hybridkin._core.portable import PortableModule
 from hybridkin._core.stored import (
     KINDS_OF_MODELS,
     Restore,
@@ -30,14 +31,9 @@ from hybridkin.chains import (  # noqa: F401
     rigid,
     structural,
 )
-from hybridkin.chains.creep import CreepOperator
-from hybridkin.chains.hysteresis import HysteresisOperator
-from hybridkin.chains.play import PlayOperator
-from hybridkin.chains.prandtl_ishlinskii import PrandtlIshlinskiiOperator
-from hybridkin.chains.series import HysteresisSeries
 from hybridkin.hybrid._adapt import Change
 from hybridkin.hybrid._drift import Drift
-from hybridkin.hybrid._module import Hybrid
+from hybridkin.hybrid._module import Hybrid, HybridModule
 from hybridkin.hybrid._pace import PaceRange
 from hybridkin.hybrid._radius import Radius
 from hybridkin.hybrid._range import TrainingRange
@@ -46,11 +42,18 @@ from hybridkin.hybrid._wrapped import WithPose, in_columns
 from hybridkin.hybrid.cv_results import CvResults
 from hybridkin.hybrid.estimator import HybridForwardModel
 from hybridkin.hybrid.log_fit import HybridFit
+from hybridkin.hysteresis.stage import Stage
+from hybridkin.hysteresis.stages.backlash import Backlash
+from hybridkin.hysteresis.stages.creep import Creep
+from hybridkin.hysteresis.stages.friction import Friction
+from hybridkin.hysteresis.value import Hysteresis
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.elm_cv import ELMRegressorCV
+from hybridkin.native.export import usual_range
 
 # Regressors that a file may name as the setting `error_model`.
-_OPERATOR = "operator"  # `play` was one: that of the fit
+# The setting `hysteresis` was a value, that of the fit; the last one is that of first files.
+_VALUES = ("value", "operator")
 _REGRESSORS = {
     cls.__name__: cls
     for cls in (ELMRegressor, ELMRegressorCV, KernelRidge, LinearRegression)
@@ -82,8 +85,8 @@ def stored_hybrid(model: HybridForwardModel) -> Stored:
     nominal = model.mechanical_model
     params = params_of(model)
     del params["mechanical_model"], params["error_model"]
-    if isinstance(model.play, HysteresisOperator):
-        params["play"] = _OPERATOR
+    if isinstance(model.hysteresis, Hysteresis):
+        params["hysteresis"] = _VALUES[0]
     return Stored.of(
         "hybrid",
         {
@@ -92,7 +95,6 @@ def stored_hybrid(model: HybridForwardModel) -> Stored:
             },
             **model.change_._asdict(),
             "training_range": fit.training_range,
-            **_stored_play(model.play_),
             "state_range": fit.state_range,
             **_stored_pace(model),
             "radius": model.radius_,
@@ -101,6 +103,7 @@ def stored_hybrid(model: HybridForwardModel) -> Stored:
         {
             "module": model.fitted_module_.stored(),
             "nominal": None if nominal is None else as_forward_model(nominal).stored(),
+            "hysteresis": model.hysteresis_.stored() if model.hysteresis_ else None,
         },
         params=params,
         error_model=_setting(model.error_model),
@@ -114,59 +117,56 @@ def stored_hybrid(model: HybridForwardModel) -> Stored:
     )
 
 
-def _stored_play(operator: HysteresisOperator | None) -> dict[str, NDArray]:
-    """Return the arrays of an operator, friction or creep or both in this order; or none."""
-    if operator is None:
-        return {}
-    if isinstance(operator, PlayOperator):
-        return {"play_width": operator.width}
-    if isinstance(operator, PrandtlIshlinskiiOperator):
-        widths = operator.widths[:, None]  # a matrix: not the widths of actuators
-        return {"play_width": widths, "play_slopes": operator.slopes}
-    if isinstance(operator, CreepOperator):
-        return {"creep_gains": operator.gains, "creep_times": operator.times}
-    if isinstance(operator, HysteresisSeries) and len(operator.operators) == 2:
-        friction, creep = operator.operators
-        frictions = PlayOperator, PrandtlIshlinskiiOperator
-        if isinstance(friction, frictions) and isinstance(creep, CreepOperator):
-            return _stored_play(friction) | _stored_play(creep)
-    raise TypeError(f"`play_` {operator!r:.80} could only be stored as code.")
+def _hysteresis_of(stored: Stored, n: int) -> Hysteresis:
+    """Return the hysteresis of n actuators; empty if the description has none."""
+    if "hysteresis" in stored.parts:
+        return Hysteresis.from_stored(stored.part("hysteresis"), n)
+    return _of_first_files(stored, n)
 
 
-def _play_of(stored: Stored, n: int) -> HysteresisOperator | None:
-    """Return the operator of n actuators from its arrays, see `_stored_play`."""
-    friction = _friction_of(stored, n)
-    if not {"creep_gains", "creep_times"} & {*stored.arrays}:
-        return friction
-    times = stored.array("creep_times", "J")
-    shape = (len(times), n)[: stored.array("creep_gains").ndim]
-    creep = CreepOperator(stored.array("creep_gains", shape), times)
-    return creep if friction is None else HysteresisSeries([friction, creep])
+def _of_first_files(stored: Stored, n: int) -> Hysteresis:
+    """Return the hysteresis of a first file of this format: friction before creep, as arrays."""
+    stages: list[Stage] = []
+    names = {*stored.arrays}
+    if names & {"play_width", "play_slopes"}:
+        stages.append(_first_friction(stored, n))
+    if names & {"creep_gains", "creep_times"}:
+        times = stored.array("creep_times", "J")
+        shape = (len(times), n)[: stored.array("creep_gains").ndim]
+        stages.append(Creep(stored.array("creep_gains", shape), times))
+    return Hysteresis(stages)
 
 
-def _friction_of(stored: Stored, n: int) -> HysteresisOperator | None:
-    if not {"play_width", "play_slopes"} & {*stored.arrays}:
-        return None
+def _first_friction(stored: Stored, n: int) -> Stage:
     n_dimensions = stored.array("play_width").ndim
     if n_dimensions < 2 and "play_slopes" in stored.arrays:
         raise ValueError("`play_slopes` need a `play_width` of several plays")
     if n_dimensions == 2:
         widths = stored.array("play_width", ("K", 1))[:, 0]
         shape = (len(widths) - 1, n)[: stored.array("play_slopes").ndim]
-        slopes = stored.array("play_slopes", shape)
-        return PrandtlIshlinskiiOperator(widths, slopes)
+        return Friction(widths, stored.array("play_slopes", shape))
     shape = () if n_dimensions == 0 else (n,)
-    return PlayOperator(stored.array("play_width", shape))
+    return Backlash(stored.array("play_width", shape))
+
+
+def _params_of(stored: Stored, hysteresis: Hysteresis) -> dict[str, Any]:
+    """Return the settings of a hybrid, with its hysteresis in the place of its name."""
+    params = {**stored.value("params", dict)}
+    if "play" in params:  # of a first file of this format
+        params["hysteresis"] = params.pop("play") or 0.0
+    if params.get("hysteresis") in _VALUES:
+        params["hysteresis"] = hysteresis
+    return params
 
 
 def hybrid_of(stored: Stored, training: object) -> HybridForwardModel:
     """Return the fitted hybrid from its description and the result of `training_of`."""
     n = stored.value("n_features_in", int)
-    model = estimator_of(HybridForwardModel, stored.value("params", dict))
+    hysteresis = _hysteresis_of(stored, n)
+    params = _params_of(stored, hysteresis)
+    model = estimator_of(HybridForwardModel, params)
     if isinstance(model.calibrate, list):
         model.calibrate = tuple(model.calibrate)
-    if model.play == _OPERATOR:
-        model.play = _play_of(stored, n)
     if "nominal" in stored.parts:
         model.mechanical_model = restorer()(stored.part("nominal"))
     model.error_model = stored.value("error_model", (str, dict, None))
@@ -202,6 +202,32 @@ def hybrid_of(stored: Stored, training: object) -> HybridForwardModel:
     return model
 
 
+def nominal_hybrid(mechanical: ForwardModel) -> HybridForwardModel:
+    """Return a model that no rows were fitted to as a fitted one, without a correction.
+
+    Its training range is unknown: from minus infinity to infinity.
+    """
+    n = mechanical.n_actuators
+    middle, half = usual_range(mechanical, n)
+    q = torch.from_numpy(np.stack([middle - half, middle + half]))
+    model = HybridForwardModel(mechanical, "drop")
+    model.n_features_in_ = n
+    error_model = model._checked_error_model()
+    module = HybridModule(mechanical, [], q.new_zeros(0))
+    model.take_fit(
+        HybridFit(
+            module=module,
+            error=FittedError(None, [], error_model),
+            kind=None,
+            fitted_rows=np.empty(0),
+            single_output=False,
+            training_range=TrainingRange(np.full(n, -inf), np.full(n, inf)),
+            no_drift=Drift.of_range(q, mechanical.n_outputs),
+        )
+    )
+    return model
+
+
 def _stored_pace(model: HybridForwardModel) -> dict[str, NDArray]:
     """Return the arrays of the range of paces; none without creep."""
     pace = model._fit.pace
@@ -219,18 +245,18 @@ def _restored_fit(
 ) -> HybridFit:
     """Return what the fit of a described hybrid found, without what files do not contain."""
     n = stored.value("n_features_in", int)
-    play = _play_of(stored, n)
+    hysteresis = _hysteresis_of(stored, n)
     states = None
     if "state_range" in stored.arrays:
-        if play is None:
+        if not hysteresis:
             raise ValueError("`state_range` needs the arrays of a hysteresis")
-        n_states = play.inner_states(np.zeros((1, n)), [0], [0.0]).shape[1]
+        n_states = hysteresis.inner_states(np.zeros((1, n)), [0], [0.0]).shape[1]
         states = TrainingRange(*stored.array("state_range", (2, n_states, n)))
     pace = None
     if "pace_high" in stored.arrays:
-        if play is None or not play.creeps:
+        if not hysteresis.needs_time:
             raise ValueError("`pace_high` needs the arrays of creep")
-        n_times = len(play.time_constants)
+        n_times = len(hysteresis.time_constants)
         low = stored.array("pace_low", (n_times,))
         pace = PaceRange(low, stored.array("pace_high", (n_times, n)))
     radius = None
@@ -258,14 +284,14 @@ def _restored_fit(
     noise = stored.value("noise", float)
     error = FittedError(None, [], error_model, noise, rejected, held_out, comparison)
     return HybridFit(
-        module=module,
+        module=module.behind(hysteresis),
         error=error,
         kind=kind,
         fitted_rows=stored.array("fitted_rows", "N"),
         single_output=stored.value("single_output", bool),
         training_range=TrainingRange(*stored.array("training_range", (2, n))),
         no_drift=no_drift,
-        play=play,
+        hysteresis=hysteresis,
         state_range=states,
         pace=pace,
         radius=radius,

@@ -12,13 +12,13 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.validation import check_is_fitted
-from torch import nn
+from torch import Tensor, nn
 
 from hybridkin._core.arrays import labels, number, table
 from hybridkin._core.clock import check_seconds
 from hybridkin._core.commands import Commands
 from hybridkin._core.distinct import targets_that_count
-from hybridkin._core.model import PoseModel, as_forward_model
+from hybridkin._core.model import ForwardModel, as_forward_model
 from hybridkin._core.other_units import check_tips
 from hybridkin.calibration.choice import GeometryChoice
 from hybridkin.calibration.measured import (
@@ -28,22 +28,19 @@ from hybridkin.calibration.measured import (
     check_unscaled,
     with_missing_markers,
 )
-from hybridkin.chains.chain import Chain
-from hybridkin.chains.hysteresis import HysteresisOperator, checked_times
-from hybridkin.chains.markers import MarkedChain
 from hybridkin.hybrid._adapt import (
     PARAMETERS,
     check_parameters,
     likeliest_change,
 )
-from hybridkin.hybrid._fit import known_tips
 from hybridkin.hybrid._html import fitted_rows
-from hybridkin.hybrid._hysteresis import continued
+from hybridkin.hybrid._hysteresis import NO_PAST, choice_of, continued
 from hybridkin.hybrid._predictor import HybridPredictor
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._settings import CONSTRAINTS, error_model_of
 from hybridkin.hybrid._spec import ErrorModel, Spec, residuals
 from hybridkin.hybrid.log_fit import fit_to_log
+from hybridkin.hysteresis.value import Hysteresis, checked_times
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.hidden_layer import check_rows
 
@@ -110,13 +107,12 @@ class HybridForwardModel(HybridPredictor):
         held-out group has tested the model. With a guard, f_hyb differs from f_mech by at most 1.5
         times the longest correction of a training row. f_mech has the errors of its structure, if
         these are learned; they have no guard.
-    play : float, array-like of shape (n,), HysteresisOperator or "auto", optional
+    hysteresis : float, array-like of shape (n,), Hysteresis or "auto", default=0.0
         Backlash (also called play) of the actuators [unit of q]. Rows are then commands in order of
         time, see `Commands`, and the model maps the motion of the actuators. "auto" chooses by the
-        error on held-out groups: nothing, a `PlayOperator`, a `PrandtlIshlinskiiOperator`, or
-        a `CreepOperator`, alone or after one of them (`HysteresisSeries`). Each run of the log
-        starts without hysteresis, see `fit`. An operator is taken as it is. Trackers send commands
-        that lead by it. Default: no backlash, rows in any order.
+        error on held-out groups: nothing, backlash, friction, or creep, alone or after one of them.
+        Each run of the log starts without hysteresis, see `fit`. A `Hysteresis` is taken as it is.
+        Trackers send commands that lead by it. Default: none, rows in any order.
     coverage : float, optional
         Share of tips, 0.9 for example, within the radius of ``predict(Q, return_radius=True)``, if
         new groups are like those of the log. It needs ``coverage / (1 - coverage)`` groups, 9 for
@@ -162,18 +158,20 @@ class HybridForwardModel(HybridPredictor):
         each of three folds.
     candidates_ : dict of str to nn.Module, or None
         For error_model="auto": every candidate of ``cv_results_``, fitted to all rows; a module
-        from q to x as ``module_``, with `play` from the motion of the actuators. `adapt` and
+        from q to x as ``module_``, with `hysteresis` from the motion of the actuators. `adapt` and
         `partial_fit` do not change them. A model from a file has none.
     calibration_ : CalibrationResult or None
         The result of the calibration.
-    play_ : HysteresisOperator or None
-        The hysteresis; None if there is none, or if "auto" found no significant gain.
+    hysteresis_ : Hysteresis
+        The hysteresis; empty and falsy if there is none, or if "auto" found no significant gain.
     radius_ : Radius or None
         With `coverage`: the radius ``inside`` the domain [m], infinite with too few groups.
         `adapt` and `partial_fit` do not change it.
+    description_ : ModelDescription
+        Robot, log and file of the model; of one from `open_model`, what these say.
     training_range_ : TrainingRange
-        ``low`` and ``high`` (n,), the least and the largest q of the fit [unit of q]; with `play`
-        of the motion of the actuators. `adapt` moves it with the actuator zeros.
+        ``low`` and ``high`` (n,), the least and the largest q of the fit [unit of q]; with
+        `hysteresis` of the motion of the actuators. `adapt` moves it with the actuator zeros.
     n_features_in_ : int
         Number of actuators n.
     feature_names_in_ : ndarray of shape (n,)
@@ -203,7 +201,7 @@ class HybridForwardModel(HybridPredictor):
         coupling: str = "parallel",
         calibrate: Iterable[str] | str | None = None,
         guard: str | None = "leverage",
-        play: ArrayLike | HysteresisOperator | str | None = None,
+        hysteresis: ArrayLike | Hysteresis | str = 0.0,
         coverage: float | None = None,
         output: str = "position",
         random_state: int | np.random.RandomState | None = None,
@@ -213,7 +211,7 @@ class HybridForwardModel(HybridPredictor):
         self.coupling = coupling
         self.calibrate = calibrate
         self.guard = guard
-        self.play = play
+        self.hysteresis = hysteresis
         self.coverage = coverage
         self.output = output
         self.random_state = random_state
@@ -238,13 +236,13 @@ class HybridForwardModel(HybridPredictor):
         ----------
         X : array-like of shape (N, n) or Commands
             Actuator vectors q [m]; for revolute joints [rad]. `Commands` have runs and times: with
-            `play`, hysteresis goes on within a run, also from group to group.
+            `hysteresis`, hysteresis goes on within a run, also from group to group.
         y : array-like of shape (N, m) or (N,)
             Measured tip positions x [m]; poses (N, 6); K markers (N, 3 K), NaN if missing.
         sample_weight : array-like of shape (N,), optional
             How many times each row counts: a weight of 2 is the same row twice, 0 leaves it out,
-            whatever y holds there, also NaN. With `play`, rows of weight 0 still move actuators.
-            Equal rows are held out together.
+            whatever y holds there, also NaN. With `hysteresis`, rows of weight 0
+            still move actuators. Equal rows are held out together.
         groups : array-like of shape (N,), optional
             Motion of every row. Whole motions are held out by the calibration
             (``calibration_.cv_rmse``), by error models that choose by groups, and for the radius.
@@ -294,7 +292,7 @@ class HybridForwardModel(HybridPredictor):
     ) -> HybridForwardModel:
         """Update the model with new measurements in order of time, after a payload or wear.
 
-        With `play`, hysteresis goes on from the last call; a new run of `Commands` starts anew.
+        Hysteresis goes on from the last call; a new run of `Commands` starts anew.
 
         The mechanical model and the error model do not change. The new residual is learned as an
         affine function of q in which old measurements fade: ``f_hyb(q) + B [1, q]``. This follows
@@ -308,7 +306,7 @@ class HybridForwardModel(HybridPredictor):
             Measured tips [m].
         sample_weight : array-like of shape (N,), optional
             How many times each row counts: a weight of 2 is the same row twice, 0 leaves it out,
-            whatever y holds there. With `play`, rows of weight 0 still move the actuators.
+            whatever y holds there. With `hysteresis`, rows of weight 0 still move the actuators.
         decay : float, default=0.98
             Factor in (0, 1] by which every new row multiplies the weights of all earlier rows. 0.98
             forgets within about fifty measurements.
@@ -329,8 +327,8 @@ class HybridForwardModel(HybridPredictor):
             _check_positive("alpha", alpha, np.inf)
         rows = self._checked_rows(X, y, sample_weight, reset=False)
         self._check_commands(rows)
-        if self.play_ is not None:
-            moved, self._past = continued(self.play_, rows, self._past)
+        if self.hysteresis_:
+            moved, self._past = continued(self.hysteresis_, rows, self._past)
             rows = replace(rows, X=moved)
         self._warn_of_units(rows)
         rows = self.change_.before(rows, self.output)
@@ -367,7 +365,7 @@ class HybridForwardModel(HybridPredictor):
         Parameters
         ----------
         X : array-like of shape (k, n) or Commands
-            New actuator vectors, one or more; with `play` in order of time, as for `fit`.
+            New actuator vectors, one or more; with `hysteresis` in order of time, as for `fit`.
         y : array-like of shape (k, m) or (k,)
             Measured tips [m]; poses (k, 6), see `output`.
         parameters : sequence of str, default=("base", "actuator_zeros")
@@ -406,16 +404,15 @@ class HybridForwardModel(HybridPredictor):
         check_is_fitted(self, "module_")
         rows = self._checked_rows(X, y, None, groups, reset=False, weighted=False)
         check_parameters(parameters, rows.tips.shape[1] % 3 == 0)
-        if self.play_ is not None:
-            rows = rows.effective(self.play_)
+        if self.hysteresis_:
+            rows = rows.effective(self.hysteresis_)
         self._check_commands(rows)
         with torch.no_grad():
             predicted = self.fitted_module_(rows.q).numpy()
         check_tips(rows.tips[:, : predicted.shape[1]], predicted, "y")
-        if self._chain is not None:  # wherever its base is
-            measured, _ = known_tips(self._chain, rows)
-            for message in self._chain.far_messages(measured, "y"):
-                warnings.warn(message, stacklevel=2)
+        measured = torch.from_numpy(rows.tips[:, : self._robot.n_outputs])
+        for message in self._robot.far_messages(measured, "y"):  # wherever its base is
+            warnings.warn(message, stacklevel=2)
         self.change_, message = likeliest_change(
             self.fitted_module_,
             rows,
@@ -426,7 +423,7 @@ class HybridForwardModel(HybridPredictor):
         if message is not None:
             warnings.warn(message, stacklevel=2)
         self._drift = self._fit.no_drift
-        self._past = None
+        self._past = NO_PAST
         self._follow_robot()
         return self
 
@@ -441,6 +438,11 @@ class HybridForwardModel(HybridPredictor):
         error_model = self._checked_error_model()
         log = self._checked_rows(X, y, sample_weight, groups)
         return self._spec(error_model, log), log
+
+    @property
+    def follows_order(self) -> bool:
+        """Whether the order of the rows of a fit counts: there may be a `hysteresis`."""
+        return bool(choice_of(self.hysteresis))
 
     def html_rows(self) -> dict[str, object]:
         """Return names and values of what the fit found, which a notebook shows."""
@@ -463,7 +465,7 @@ class HybridForwardModel(HybridPredictor):
         names = self.calibrate
         if names is None or isinstance(names, str):
             return error_model
-        if [*names] and not isinstance(mechanical, Chain):
+        if [*names] and not _geometry(mechanical):
             raise TypeError(
                 f"`mechanical_model` must be a chain to `calibrate` {self.calibrate!r}, got "
                 f"{type(mechanical).__name__}, which has no geometry."
@@ -471,7 +473,8 @@ class HybridForwardModel(HybridPredictor):
         return error_model
 
     def _check_pose_settings(self, error_model: ErrorModel) -> None:
-        if not isinstance(self.mechanical_model, PoseModel):
+        mechanical = self.mechanical_model
+        if mechanical is None or not as_forward_model(mechanical).has_pose:
             raise TypeError(
                 "`mechanical_model` must be a PoseModel with pose_and_jacobian(q) for "
                 f"output='pose'; all chains are. Got {type(self.mechanical_model).__name__}; for "
@@ -505,7 +508,7 @@ class HybridForwardModel(HybridPredictor):
         X = commands.q
         y = table(targets_that_count(y, weights, "y"), "y")
         advice = LEAVE_OUT
-        if weighted and self.play is not None:
+        if weighted and self.follows_order:
             advice = WEIGH_ZERO
         missing = self._missing_markers(y, advice)
         y = None if y is None else np.where(missing, 0.0, y)
@@ -520,7 +523,7 @@ class HybridForwardModel(HybridPredictor):
             groups = labels(groups, len(X))
         weights = cast("NDArray | None", weights)
         rows = Rows(X, y, weights, groups, commands.runs, commands.time)
-        if rows.time is not None and self.play is not None:
+        if rows.time is not None and self.follows_order:
             times = checked_times(rows.time, rows.run_of_rows)
             if reset:  # a fit may find creep, which depends on the unit of time
                 check_seconds(times, rows.run_of_rows)
@@ -529,7 +532,7 @@ class HybridForwardModel(HybridPredictor):
     def _missing_markers(self, y: Any, advice: str) -> NDArray[np.bool_]:
         """Return which entries of y (N, 3 K) are missing markers; each row must keep a marker."""
         mechanical = self.mechanical_model
-        allowed = mechanical is None or isinstance(mechanical, MarkedChain)
+        allowed = mechanical is None or as_forward_model(mechanical).markers
         if not allowed or self.output == "pose" or np.ndim(y) != 2 or y.shape[1] % 3:
             return np.zeros(np.shape(y), dtype=bool)
         return np.isnan(with_missing_markers(y, "y", advice))
@@ -537,38 +540,47 @@ class HybridForwardModel(HybridPredictor):
     def _spec(self, error_model: ErrorModel, rows: Rows) -> Spec:
         """Return the settings as a specification, with a copy of the mechanical model."""
         mechanical = self.mechanical_model
+        names = ()
+        geometry = None
         if mechanical is not None:
             mechanical = as_forward_model(copy.deepcopy(mechanical)).frozen()
             # A function does not tell how many, but its rows do.
             mechanical.n_actuators = mechanical.n_actuators or rows.X.shape[1]
-        names = ()
-        geometry = None
-        if isinstance(mechanical, Chain):
-            check_unscaled("X", rows.X, "actuator vectors [m or rad]")
-            check_unscaled("y", rows.tips[rows.counts > 0.0], "tip positions [m]")
-            mechanical.check_actuators(rows.q, "X")
-            names = self.calibrate
-            if names is None and error_model.chooses:
-                names = "auto"
-            elif names is None:
-                names = ()
-            elif names == "default":
-                names = mechanical.default_parameters
-            elif isinstance(names, GeometryChoice):
-                geometry = names
-                names = geometry.parameters
-            elif not isinstance(names, str):
-                names = tuple(names)
+            if mechanical.geometry():
+                check_unscaled("X", rows.X, "actuator vectors [m or rad]")
+                check_unscaled("y", rows.tips[rows.counts > 0.0], "tip positions [m]")
+                mechanical.check_actuators(rows.q, "X")
+                if isinstance(self.calibrate, GeometryChoice):
+                    geometry = self.calibrate
+                    names = geometry.parameters
+                else:
+                    names = self._names_to_calibrate(mechanical, error_model)
         return Spec(
             mechanical,
             error_model,
             names,
             self.guard,
             self.output,
-            self.play,
+            choice_of(self.hysteresis),
             self.coverage,
             geometry=geometry,
         )
+
+    def _names_to_calibrate(
+        self, mechanical: ForwardModel, error_model: ErrorModel
+    ) -> tuple[str, ...] | str:
+        """Return the parameters of a chain to calibrate, or "auto"."""
+        names = self.calibrate
+        if names is None:
+            return "auto" if error_model.chooses else ()
+        if names == "default":
+            return mechanical.default_parameters
+        return names if isinstance(names, str) else tuple(names)
+
+
+def _geometry(mechanical: object) -> dict[str, Tensor]:
+    """Return the geometry of a mechanical model; empty if there is none."""
+    return {} if mechanical is None else as_forward_model(mechanical).geometry()
 
 
 def _check_positive(name: str, value: object, high: float) -> None:

@@ -16,11 +16,11 @@ from typing_extensions import Self
 from hybridkin._core.simplest import simplest_within
 from hybridkin.calibration.choice import Errors, GeometryChoice
 from hybridkin.calibration.measured import distance, distances
-from hybridkin.chains.hysteresis import HysteresisOperator
 from hybridkin.hybrid._guards import GroupDistance
 from hybridkin.hybrid._radius import Radius, covering_distance
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid.cv_results import CvResults
+from hybridkin.hysteresis.value import NO_HYSTERESIS, Hysteresis
 
 MEAN_LENGTH = 1.596
 """Mean length of a standard normal vector with three coordinates."""
@@ -43,14 +43,14 @@ class FoldChoice(NamedTuple):
     ----------
     geometry : GeometryChoice or None
         The parameters to calibrate; None: not chosen.
-    play : HysteresisOperator or None
-        The hysteresis.
+    hysteresis : Hysteresis
+        The hysteresis; empty without one.
     error_model : object
         The fitted error model, as `HybridForwardModel.error_model_`.
     """
 
     geometry: GeometryChoice | None = None
-    play: HysteresisOperator | None = None
+    hysteresis: Hysteresis = NO_HYSTERESIS
     error_model: object = None
 
     @property

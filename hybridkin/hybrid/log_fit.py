@@ -15,10 +15,8 @@ from typing_extensions import Self
 from hybridkin.calibration.calibrate import CalibrationResult
 from hybridkin.calibration.choice import GeometryChoice
 from hybridkin.calibration.measured import folds
-from hybridkin.chains.hysteresis import HysteresisOperator
 from hybridkin.hybrid._drift import Drift, too_far
 from hybridkin.hybrid._fit import few_rows, fit_hybrid, fit_messages
-from hybridkin.hybrid._hysteresis import play_of
 from hybridkin.hybrid._module import Hybrid
 from hybridkin.hybrid._pace import Pace, PaceRange, each_pace, pace_range
 from hybridkin.hybrid._radius import Radius
@@ -32,6 +30,7 @@ from hybridkin.hybrid._selection import (
 from hybridkin.hybrid._spec import (
     FittedError,
     FittedHybrid,
+    HysteresisChoice,
     Spec,
     Starts,
 )
@@ -44,6 +43,7 @@ from hybridkin.hybrid.held_out import (
     Outer,
     Predictions,
 )
+from hybridkin.hysteresis.value import NO_HYSTERESIS, Hysteresis
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +66,7 @@ class HybridFit:
         How fast the commands moved, with creep.
     no_drift : Drift
         The drift before any measurement.
-    calibration, play, radius
+    calibration, hysteresis, radius
         The attributes of the model.
     geometry : GeometryChoice or None
         How the parameters to calibrate were chosen.
@@ -83,15 +83,21 @@ class HybridFit:
     no_drift: Drift
     calibration: CalibrationResult | None = None
     geometry: GeometryChoice | None = None
-    play: HysteresisOperator | None = None
+    hysteresis: Hysteresis = NO_HYSTERESIS
     state_range: TrainingRange | None = None
     pace: PaceRange | None = None
     radius: Radius | None = None
     messages: tuple[str, ...] = ()
 
-    def with_play(self, play: HysteresisOperator | None) -> Self:
+    def with_hysteresis(self, hysteresis: Hysteresis) -> Self:
         """Return the same with another hysteresis, whose states the log does not show."""
-        return replace(self, play=play, state_range=None, pace=None)
+        return replace(
+            self,
+            module=self.module.behind(hysteresis),
+            hysteresis=hysteresis,
+            state_range=None,
+            pace=None,
+        )
 
     @property
     def candidates(self) -> dict[str, Hybrid] | None:
@@ -110,8 +116,8 @@ class FitOnce:
         The settings, with the chosen geometry.
     log, rows : Rows
         The log, and its different rows with what the actuators do.
-    play : HysteresisOperator or None
-        The hysteresis.
+    hysteresis : Hysteresis
+        The hysteresis; empty without one.
     fitted : FittedHybrid
         The hybrid of these rows.
     messages : list of str
@@ -123,7 +129,7 @@ class FitOnce:
     spec: Spec
     log: Rows
     rows: Rows
-    play: HysteresisOperator | None
+    hysteresis: Hysteresis
     fitted: FittedHybrid
     messages: list[str]
     radius: Radius | None = None
@@ -137,9 +143,7 @@ class FitOnce:
 
     def effective(self, log: Rows) -> Tensor:
         """Return what the actuators do at the rows of a log (N, n)."""
-        if self.play is None:
-            return log.q
-        return log.effective(self.play).q
+        return log.effective(self.hysteresis).q
 
     @property
     def names(self) -> list[str]:
@@ -148,7 +152,7 @@ class FitOnce:
 
     def settled(self) -> Settled:
         """Return the models with their choices, for fits to some of the rows that count."""
-        moved = self.log if self.play is None else self.log.effective(self.play)
+        moved = self.log.effective(self.hysteresis)
         return Settled.of(self.fitted, moved.take(self.log.counted))
 
     def outer(self) -> Outer | None:
@@ -162,17 +166,29 @@ class FitOnce:
         return outer._replace(rows=first[outer.rows])
 
     def decided(self, table: CrossFit) -> Self:
-        """Return the fit with the blend of its candidates, and the radius, of a table."""
-        fitted = self.fitted
-        if fitted.error.candidates:
-            fitted = decided(fitted, self.rows, table)
-        radius = None
-        messages = self.messages
-        if self.spec.coverage is not None:
-            radius = table.radius(self.spec.coverage)
-            n_groups = len(np.unique(table.groups_inside))
-            messages = [*messages, *radius.doubts(n_groups)]
-        return replace(self, fitted=fitted, radius=radius, messages=messages)
+        """Return the fit with the blend of its candidates by the weights of a table."""
+        if not self.fitted.error.candidates:
+            return self
+        return replace(self, fitted=decided(self.fitted, self.rows, table))
+
+    def with_settled_blend(self, table: CrossFit) -> Self:
+        """Return the fit with a blend by settled choices, and the error of a table to expect.
+
+        The penalties of all rows are those of the model, so its weights are chosen with them.
+        """
+        if not self.fitted.error.candidates:
+            return self
+        settled = Settled.of(self.fitted, self.rows).table()
+        return self.decided(settled).expecting(table.expected_error)
+
+    def with_radius(self, table: CrossFit) -> Self:
+        """Return the fit with the radius of a table of new choices, if it is asked for."""
+        coverage = self.spec.coverage
+        if coverage is None:
+            return self
+        radius = table.radius(coverage)
+        doubts = radius.doubts(len(np.unique(table.groups_inside)))
+        return replace(self, radius=radius, messages=[*self.messages, *doubts])
 
     def expecting(self, distance: float) -> Self:
         """Return the fit with another mean distance to expect on new motions [m]."""
@@ -186,19 +202,19 @@ class FitOnce:
         """Return what a `HybridForwardModel` keeps of the fit."""
         log = self.log
         rows = self.rows
-        play = self.play
+        hysteresis = self.hysteresis
         fitted = self.fitted
         states = None
         pace = None
-        if play is not None:
+        if hysteresis:
             measured = log.take(log.counted)
             size = np.ptp(log.X, axis=0)
-            states = state_range(_states(play, log), measured, size)
-            pace = _pace(play, log, measured)
+            states = state_range(_states(hysteresis, log), measured, size)
+            pace = _pace(hysteresis, log, measured)
         fitted.take_low_rank(rows.q)
         messages = [*self.messages, *fit_messages(fitted.spec, rows)]
         return HybridFit(
-            module=fitted.module,
+            module=fitted.module.behind(hysteresis),
             error=fitted.error,
             kind=fitted.error.kind,
             fitted_rows=log.distinct().digests(),
@@ -207,7 +223,7 @@ class FitOnce:
             no_drift=Drift.of_range(rows.q, rows.tips.shape[1]),
             calibration=fitted.spec.calibration,
             geometry=self.spec.geometry,
-            play=play,
+            hysteresis=hysteresis,
             state_range=states,
             pace=pace,
             radius=self.radius,
@@ -219,12 +235,13 @@ def fit_once(spec: Spec, log: Rows) -> FitOnce:
     """Return the hybrid of a log, after the choices of its geometry and its hysteresis."""
     commands = log.distinct()
     chosen = spec.with_geometry_chosen(commands)
-    play, messages = play_of(chosen, log.in_runs())
+    hysteresis, messages = chosen.hysteresis.of(chosen, log.in_runs())
     rows = commands
-    if play is not None:
-        rows = log.effective(play).distinct()
+    if hysteresis:
+        rows = log.effective(hysteresis).distinct()
         rows = replace(rows, commanded=commands.directions)
-    return FitOnce(chosen, log, rows, play, fit_hybrid(chosen, rows), messages)
+    fitted = fit_hybrid(chosen, rows)
+    return FitOnce(chosen, log, rows, hysteresis, fitted, messages)
 
 
 class Anew(NamedTuple):
@@ -250,7 +267,7 @@ class Anew(NamedTuple):
                 inside.append(module.in_domain(q).numpy())
         if not np.isfinite(tips).all():
             raise too_far()
-        choice = FoldChoice(fit.spec.geometry, fit.play, fit.fitted.error.result)
+        choice = FoldChoice(fit.spec.geometry, fit.hysteresis, fit.fitted.error.result)
         return Predictions(np.array(tips), np.array(inside), choice)
 
 
@@ -267,12 +284,13 @@ def fit_to_log(spec: Spec, log: Rows) -> HybridFit:
     messages = few_rows(log.distinct(), spec)
     fit = fit_once(spec, log)
     if spec.coverage is not None:
-        fit = fit.decided(_table_anew(spec, fit))
+        table = _table_anew(spec, fit)
+        fit = fit.decided(table).with_radius(table)
     elif fit.fitted.error.candidates:
         table = Settled.of(fit.fitted, fit.rows).table()
         expected = expected_with_new_choices(fit.fitted, fit.rows, table)
         fit = fit.decided(table).expecting(expected)
-    by_motion = _by_motion(log, fit.rows, fit.play)
+    by_motion = _by_motion(log, fit.rows, fit.hysteresis)
     worse = worse_than_mechanical(fit.fitted, by_motion)
     found = fit.found()
     return replace(found, messages=(*messages, *found.messages, *worse))
@@ -280,8 +298,8 @@ def fit_to_log(spec: Spec, log: Rows) -> HybridFit:
 
 def _table_anew(spec: Spec, fit: FitOnce) -> CrossFit:
     """Return the predictions of five folds of a log, which make the choices of a fit anew."""
-    if fit.play is None:
-        spec = replace(spec, play=None)
+    if not fit.hysteresis:
+        spec = replace(spec, hysteresis=HysteresisChoice())
         fit = replace(fit, log=fit.log.distinct())
     log = fit.log
     if fit.fitted.error.candidates:
@@ -293,29 +311,28 @@ def _table_anew(spec: Spec, fit: FitOnce) -> CrossFit:
     return CrossFit.of(fit.names, measured, splits, held_out, fit.outer())
 
 
-def _states(play: HysteresisOperator, log: Rows) -> NDArray:
+def _states(hysteresis: Hysteresis, log: Rows) -> NDArray:
     """Return the inner states (K, R, n) of hysteresis after the rows that count."""
     states = [np.empty((len(log.counted), 0, log.X.shape[1]))]
-    for state in play.each_inner_state(log.X, log.run_of_rows, log.time):
+    for state in hysteresis.each_inner_state(log.X, log.run_of_rows, log.time):
         states.append(state[log.counted, None])
     return np.concatenate(states, axis=1)
 
 
-def _pace(play: HysteresisOperator, log: Rows, measured: Rows) -> PaceRange | None:
+def _pace(hysteresis: Hysteresis, log: Rows, measured: Rows) -> PaceRange | None:
     """Return the range of paces of the rows that count; None without creep."""
-    if log.time is None or not play.creeps:
+    if log.time is None or not hysteresis.needs_time:
         return None
     paces = []
-    for pace in each_pace(log.X, log.run_of_rows, log.time, play.time_constants):
+    times = hysteresis.time_constants
+    for pace in each_pace(log.X, log.run_of_rows, log.time, times):
         paces.append(Pace(pace.speeds[log.counted], pace.shown[log.counted]))
     return pace_range(paces, measured)
 
 
-def _by_motion(log: Rows, rows: Rows, play: HysteresisOperator | None) -> Rows:
+def _by_motion(log: Rows, rows: Rows, hysteresis: Hysteresis) -> Rows:
     """Return the rows of a fit with the groups to hold out: those of the log, else its runs."""
     if log.groups is not None or log.runs is None:
         return rows
     by_run = replace(log, groups=log.runs)
-    if play is not None:
-        by_run = by_run.effective(play)
-    return by_run.distinct()
+    return by_run.effective(hysteresis).distinct()

@@ -352,9 +352,7 @@ class Follower:
 
     @property
     def hysteresis(self) -> Any:
-        """State of the hysteresis, None without."""
-        if self.task.hysteresis is None:
-            return None
+        """State of the hysteresis; no rows without one."""
         return self._lead.copy()
 
     def start(self, q: Tensor, dq: Tensor | None, hysteresis: Any) -> None:
@@ -374,9 +372,8 @@ class Follower:
             parts["dq"][:] = as_array(dq[0])
             self._seen[IK_SINCE] = 0.0
         parts["q"][:] = as_array(q[0])
-        if self.task.hysteresis is not None:
-            q, end = self.task.hysteresis.apply(q, hysteresis, 0.0)
-            self._lead[:] = as_array(end)
+        q, end = self.task.hysteresis.apply(q, hysteresis, 0.0)
+        self._lead[:] = as_array(end)
         x, _ = self.core.settings.evaluate(q)
         parts["x"][:] = as_array(x).ravel()
         self.state[IK_LAST] = self._dt

@@ -8,11 +8,53 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from hybridkin._core.actuation import Actuation
 from hybridkin._core.kernel_numbers import IK_AT_REST_SHARE
 from hybridkin.ik._gram import apply_rows
 from hybridkin.ik._settings import Bounds, StepSettings, stopping
 from hybridkin.ik._step import StepRows
-from hybridkin.native.hysteresis import Hysteresis
+
+
+def lead_of(settings: StepSettings, command: Tensor, state: Any) -> Lead | Direct:
+    """Return the commands (1, n) of one robot from now on; the arguments are those of `Lead`."""
+    hysteresis = settings.task.hysteresis
+    if hysteresis:
+        return Lead(settings, hysteresis, command, state)
+    return Direct(command)
+
+
+class Direct:
+    """Commands of one robot whose actuators do what they are commanded.
+
+    Parameters
+    ----------
+    command : Tensor of shape (1, n)
+        The present command.
+
+    Attributes
+    ----------
+    command, effective : Tensor of shape (1, n)
+        The present command, and what the actuators do.
+    state : Tensor of shape (0, n)
+        No state.
+    """
+
+    def __init__(self, command: Tensor) -> None:
+        self.command = command
+        self.state = command[:0]
+
+    @property
+    def effective(self) -> Tensor:
+        """The command."""
+        return self.command
+
+    def step(
+        self, control: Callable[..., StepRows], J: Tensor, seconds: float, last: Tensor
+    ) -> StepRows:
+        """Send the next command, and return its step; see `Lead.step`."""
+        step = control()
+        self.command = self.command + step.dq
+        return step
 
 
 class Lead:
@@ -22,12 +64,12 @@ class Lead:
     ----------
     settings : StepSettings
         The limits, which are those of commands.
-    operator : Hysteresis
-        The hysteresis.
+    hysteresis : Actuation
+        What is between commands and the motion of the actuators.
     command : Tensor of shape (1, n)
         The present command.
-    state : array or Tensor of shape (R, n), or None
-        State of the hysteresis before it. None: without hysteresis.
+    state : array or Tensor of shape (R, n), optional
+        State of the hysteresis before it. Default: without hysteresis.
 
     Attributes
     ----------
@@ -38,16 +80,20 @@ class Lead:
     """
 
     def __init__(
-        self, settings: StepSettings, operator: Hysteresis, command: Tensor, state: Any
+        self,
+        settings: StepSettings,
+        hysteresis: Actuation,
+        command: Tensor,
+        state: Any,
     ) -> None:
         self._settings = settings
-        self._operator = operator
+        self._hysteresis = hysteresis
         self.command = command
-        self.effective, self.state = operator.apply(command, state, 0.0)
+        self.effective, self.state = hysteresis.apply(command, state, 0.0)
 
     def step(
         self,
-        control: Callable[[Bounds], StepRows],
+        control: Callable[..., StepRows],
         J: Tensor,
         seconds: float,
         last: Tensor,
@@ -90,7 +136,7 @@ class Lead:
         goal = tick.clip(torch.where(known, goal, command))
         wished = self.effective + step.dq
         self.command = goal
-        self.effective, self.state = self._operator.apply(goal, self.state, seconds)
+        self.effective, self.state = self._hysteresis.apply(goal, self.state, seconds)
         promised = step.promised + apply_rows(J, self.effective - wished)
         held = tick.held(goal)
         return step._replace(dq=goal - command, saturated=held, promised=promised)
@@ -118,7 +164,7 @@ class Lead:
         """Return what the actuators would do after a command; what is infinite has no limit."""
         finite = torch.isfinite(command)
         tried = torch.where(finite, command, self.command)
-        effective, _ = self._operator.apply(tried, self.state, seconds)
+        effective, _ = self._hysteresis.apply(tried, self.state, seconds)
         return torch.where(finite, effective, command)
 
     def _commanded(self, dq: Tensor, seconds: float) -> Tensor:
@@ -127,7 +173,7 @@ class Lead:
         One that would move far for almost nothing, such as through a backlash for rounding, stays.
         """
         goal = self.effective + dq
-        command, _ = self._operator.command(goal, self.state, seconds)
+        command, _ = self._hysteresis.command(goal, self.state, seconds)
         moved = (goal - self._after(self.command, seconds)).abs()
         stays = moved < IK_AT_REST_SHARE * (command - self.command).abs()
         return torch.where(stays, self.command, command)

@@ -32,9 +32,9 @@ from hybridkin._core.kernel_numbers import (
     IK_PULLS,
     IK_WEIGHTS,
 )
-from hybridkin._core.model import Portable
 from hybridkin._core.named_rows import without_warnings
 from hybridkin._core.plan import NoKernel, Plan
+from hybridkin._core.portable import Portable
 from hybridkin.ik._feedback import expected_innovation
 from hybridkin.ik._half_spaces import HalfSpaces
 from hybridkin.ik._posture import FixedPosture, Function, NoPosture, PostureFunction
@@ -47,7 +47,6 @@ from hybridkin.ik.tasks import (
     Task,
     Tolerance,
 )
-from hybridkin.native.hysteresis import stage_numbers
 
 Array: TypeAlias = Numbers | Transform  # what a caller may pass
 
@@ -348,11 +347,8 @@ class StepSettings(Portable):
         if n_spaces > 0:
             plan.limit("actuators", n_spaces)  # they share arrays of the kernels
             numbers += [as_array(part).T for part in self.tip_limits]
-        stages = [0, 0]
-        if self.task.hysteresis is not None:
-            described = stage_numbers(self.task.hysteresis.stages(n))
-            stages = described.code
-            numbers.append(described.numbers)
+        stages = self.task.hysteresis.stage_numbers(n)
+        numbers.append(stages.numbers)
 
         flags = IK_LIMITED * (self.limits == "saturate")
         flags |= IK_POSTURE * self.has_posture
@@ -361,7 +357,7 @@ class StepSettings(Portable):
         flags |= IK_PULLS * bool(self.pulls.any())
         flags |= IK_POSE * self.task.has_rotation
         flags |= IK_AXIS * isinstance(self.task, AxisTask)
-        entries = [model, flags, n_normals, n_spaces, *stages]
+        entries = [model, flags, n_normals, n_spaces, *stages.code]
         return plan.node("ik", n, len(scale), numbers, *entries)
 
     def kernel_rates(self) -> list[float]:

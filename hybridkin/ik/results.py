@@ -201,8 +201,8 @@ class Track(Generic[ArrayT]):
     t : array of shape (T,)
         Times [s].
     q : array of shape (T, n)
-        Commands to send. With `play_` of a model, ``play_.apply(q, state, dt)`` returns the state
-        of the hysteresis after them, for the next track.
+        Commands to send. ``model.hysteresis_.apply(q, state, dt)`` returns the state of the
+        hysteresis after them, for the next track.
     effective : array of shape (T, n)
         What the actuators do [unit of q]: `q` without hysteresis.
     x : array of shape (T, 3)

@@ -6,12 +6,13 @@ import copy
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Protocol, TypeAlias, TypeVar, cast, runtime_checkable
+from typing import TYPE_CHECKING, TypeAlias, TypeVar, cast
 
 import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
+from hybridkin._core.actuation import Actuation
 from hybridkin._core.arrays import (
     Numbers,
     as_array,
@@ -26,7 +27,6 @@ from hybridkin._core.blocks import in_blocks
 from hybridkin._core.kernel_numbers import IK_NO_AXIS
 from hybridkin._core.model import Fitted, ForwardModel, PoseModel, as_forward_model
 from hybridkin._core.rotations import least_turn, rotation, rotation_vector
-from hybridkin.native.hysteresis import Hysteresis
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -62,8 +62,6 @@ class Task:
         What a target is.
     n_free : int
         Number of directions of the m rows that the task leaves free: no motion changes them.
-    hysteresis : Hysteresis or None
-        The hysteresis of the actuators before the model, that of the estimator.
     """
 
     shape: tuple[int, ...]
@@ -76,7 +74,11 @@ class Task:
     of_poses = False
     about_target = "desired x now [m];"
     n_free = 0
-    hysteresis: Hysteresis | None = None
+
+    @property
+    def hysteresis(self) -> Actuation:
+        """The hysteresis of the actuators, which is that of the first model."""
+        return self.models[0].hysteresis
 
     def present(self) -> Self:
         """Return the task for the module that its estimator has now."""
@@ -97,7 +99,6 @@ class Task:
         if isinstance(model, Fitted) and not isinstance(model, nn.Module):
             self.estimator = model
             self.module = model.module_
-            self.hysteresis = getattr(model, "play_", None)
         self.models = (self._suitable(as_forward_model(model)),)
 
     def _suitable(self, model: ForwardModel) -> ForwardModel:
@@ -539,13 +540,6 @@ class AxisTask(_OfPoses):
             )
 
 
-@runtime_checkable
-class _WithPoints(Protocol):
-    """A chain whose tip can be moved to another point of its backbone."""
-
-    def with_tip(self, at: float) -> ForwardModel: ...
-
-
 class PointsTask(Task):
     """Task to bring several points of the backbone to target points: 3 P rows, targets (P, 3).
 
@@ -575,11 +569,8 @@ class PointsTask(Task):
     def __init__(
         self, chain: object, at: Sequence[float], weights: Sequence[float] | None = None
     ) -> None:
-        if not isinstance(chain, _WithPoints):
-            raise TypeError(
-                f"`chain` must have with_tip(at), e.g. a chain of arcs, got {type(chain).__name__}."
-            )
-        self.models = tuple(chain.with_tip(number(a, "at")) for a in at)
+        model = as_forward_model(chain)
+        self.models = tuple(model.with_tip(number(a, "at")) for a in at)
         n = len(at)
         if weights is None:
             weights = (1.0,) * n
@@ -691,7 +682,6 @@ class Stack(Task):
         self.n_free = sum(task.n_free for task in tasks)
         self.estimator = tasks[0].estimator
         self.module = tasks[0].module
-        self.hysteresis = tasks[0].hysteresis
 
     @property
     def angular(self) -> tuple[bool, ...]:

@@ -16,11 +16,11 @@ from torch import Tensor
 
 from hybridkin._core.arrays import as_array, as_tensor, is_numpy, number
 from hybridkin._core.kernel_numbers import IK_ON_TIME
-from hybridkin._core.model import Portable
+from hybridkin._core.portable import Portable
 from hybridkin.ik._compiled import Follower, Tick, core_of, why_torch
 from hybridkin.ik._feedback import MOST_PERIODS, Feedback, Readings
 from hybridkin.ik._gram import row_gram
-from hybridkin.ik._hysteresis import Lead
+from hybridkin.ik._hysteresis import lead_of
 from hybridkin.ik._rest import Rest
 from hybridkin.ik._settings import Array, StepSettings, require
 from hybridkin.ik._step import StepRows, control_step
@@ -48,12 +48,12 @@ class Tracker(Portable):
     believed, unless they are more than twice the reach away. (Without a chain the tips within the
     limits of q give the reach; where q has none either, all readings are used.)
 
-    With the hysteresis of a `HybridForwardModel` (`play_`) commands lead what the actuators do. All
+    With a `hysteresis` of the model commands lead what the actuators do. All
     limits are those of commands. After a reversal the command crosses the width of the hysteresis,
     with `dq_max` in several periods, in which the actuator moves little or not and the others do
     what they can. With `ddq_max` it brakes before it gets to where the actuator moves. A motion of
     less than 1e-6 of the way of its command is left out, as it may be rounding. A refit with
-    another operator starts without hysteresis at `q`.
+    another one starts without hysteresis at `q`.
 
     Attributes
     ----------
@@ -61,8 +61,8 @@ class Tracker(Portable):
         The present command: the result of the last `step`, or the argument of `reset`.
     effective : array of shape (n,)
         What the actuators do, where the model is evaluated [unit of q]: `q` without hysteresis.
-    state : array of shape (R, n) or None
-        State of the hysteresis after that command, for `reset` [unit of q]; None without.
+    state : array of shape (R, n)
+        State of the hysteresis after that command, for `reset` [unit of q]; no rows without one.
     x : array of shape (3,)
         The model's tip at the start of the last step [m], in the shape of the task.
     error : float
@@ -136,7 +136,7 @@ class Tracker(Portable):
 
     @property
     def state(self) -> Any:
-        """State of the hysteresis after the present command, as from `apply` of `play_`."""
+        """State of the hysteresis after the present command, as from its `apply`."""
         with self._lock:
             return self._robot.hysteresis
 
@@ -213,7 +213,7 @@ class Tracker(Portable):
             Command, in the unit of q. From outside the limits it returns at `dq_max`.
         state : array of shape (R, n), optional
             State of the hysteresis [unit of q]: `state` of a tracker, or as from `apply` of the
-            model's `play_` with the commands until now. Default: without hysteresis at q.
+            model's hysteresis with the commands until now. Default: without hysteresis at q.
         """
         self._reset(q, state)
         for message in self._settings.posture_messages(as_tensor(q, "q"), "q"):
@@ -227,6 +227,11 @@ class Tracker(Portable):
             right_shape and torch.isfinite(start).all(),
             f"`q` must be finite and of shape ({n or 'n'},), got {start.tolist()}; read it from "
             "the robot.",
+        )
+        known = bool(self._settings.present().task.hysteresis)
+        require(
+            known or state is None or not len(state),
+            "`state` is that of a hysteresis, but the model has none; leave it out.",
         )
         with self._lock:
             self._like = start.clone()
@@ -247,10 +252,6 @@ class Tracker(Portable):
         else:
             reason = "`q0` is no float64 array of NumPy"
             robot = _InTorch(settings, self._feedback, self._as_numpy, reason)
-        require(
-            hysteresis is None or task.hysteresis is not None,
-            "`state` is that of a hysteresis, but the model has none; leave it out.",
-        )
         robot.start(q[None], None if dq is None else dq[None], hysteresis)
         self._estimator = task.estimator
         self._module = task.module
@@ -301,7 +302,8 @@ class Tracker(Portable):
                 robot = self._robot
                 before = robot.task.hysteresis
                 state = robot.hysteresis
-                if getattr(estimator, "play_", None) is not before:
+                self._settings = self._settings.present()
+                if self._settings.task.hysteresis != before:
                     state = None
                 q = as_tensor(robot.command(), "q")
                 self._start(q, robot.last().step.dq[0], state)
@@ -435,13 +437,10 @@ class _InTorch:
         self.backend = f"torch: {reason}"
         self.task = settings.task.frozen()
         self._settings = replace(settings, task=self.task)
-        self._lead: Lead | None = None
 
     @property
     def hysteresis(self) -> Any:
-        """State of the hysteresis, None without."""
-        if self._lead is None:
-            return None
+        """State of the hysteresis; no rows without one."""
         return _given_back(self._lead.state[None], self._as_numpy)
 
     @torch.no_grad()
@@ -450,11 +449,8 @@ class _InTorch:
 
         Without a step the robot is at rest.
         """
-        self._command = q
-        if self.task.hysteresis is not None:
-            self._lead = Lead(self._settings, self.task.hysteresis, q, hysteresis)
-            q = self._lead.effective
-        self._q = q
+        self._lead = lead_of(self._settings, q, hysteresis)
+        q = self._lead.effective
         x, J = self._settings.evaluate(q)
         self._readings = Readings(self._settings, x, at_rest=dq is None)
         unknown = torch.full_like(self._readings.offset, math.nan)
@@ -488,7 +484,8 @@ class _InTorch:
         """
         settings = self._settings
         task = self.task
-        x, J = settings.evaluate(self._q)
+        effective = self._lead.effective
+        x, J = settings.evaluate(effective)
         readings = self._readings
         readings.record(x)
         shown = readings.take(tip, age, self._memory)
@@ -508,7 +505,7 @@ class _InTorch:
         control = partial(
             control_step,
             settings,
-            self._q,
+            effective,
             J,
             used,
             at,
@@ -517,16 +514,9 @@ class _InTorch:
             last,
             least=rest.least(used),
         )
-        effective = self._q
-        if self._lead is not None:
-            step = self._lead.step(control, J, seconds, last)
-            self._command = self._lead.command
-            self._q = self._lead.effective
-        else:
-            step = control()
-            self._command = self._q = effective + step.dq
+        step = self._lead.step(control, J, seconds, last)
         readings.passed(seconds)
-        moved = self._q - effective
+        moved = self._lead.effective - effective
         self._rest = rest.after(settings, moved, step.promised, used)
         self._last = Tick(effective, x, J, error, step, readings.rejected)
         self._period = seconds
@@ -538,11 +528,11 @@ class _InTorch:
 
     def command(self) -> NDArray | Tensor:
         """Return the present command (n,)."""
-        return _given_back(self._command, self._as_numpy)
+        return _given_back(self._lead.command, self._as_numpy)
 
     def effective(self) -> NDArray | Tensor:
         """Return what the actuators do (n,)."""
-        return _given_back(self._q, self._as_numpy)
+        return _given_back(self._lead.effective, self._as_numpy)
 
 
 def _given_back(rows: Tensor, as_numpy: bool) -> NDArray | Tensor:

@@ -28,6 +28,7 @@ from hybridkin._core.kernel_numbers import (
     IK_STAGES,
     IK_STATE_ROWS,
     c_header,
+    stages_header,
 )
 from hybridkin._core.model import ForwardModel, as_forward_model
 from hybridkin._core.named_rows import without_warnings
@@ -294,10 +295,11 @@ def _with_headers(path: Path) -> str:
     """Return the text of a file with the kernel headers inserted."""
     if path.name == "kinds.h":
         return c_header()
+    text = stages_header() if path.name == "stages.h" else path.read_text()
     return re.sub(
         r'(?m)^#include "(\w+\.h)"$',
         lambda match: _with_headers(_FOLDER / "src" / match[1]),
-        path.read_text(),
+        text,
     )
 
 

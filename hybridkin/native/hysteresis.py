@@ -1,96 +1,28 @@
-"""Hysteresis with the compiled core: what it needs of an operator, and rows through one."""
+"""Rows through the stages of a hysteresis in the compiled core."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol
-
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from hybridkin._core.kernel_numbers import HK_CREEP_ROUNDING
+from hybridkin._core.actuation import StageNumbers
 from hybridkin.native.library import address, opened_library
-
-DOUBLE_ROUNDING = HK_CREEP_ROUNDING * float(np.finfo(np.float64).eps)
-
-
-class Stage(NamedTuple):
-    """A part of an operator: a weighted sum of plays, or creep.
-
-    Attributes
-    ----------
-    size : int
-        Number of plays K; of creep -J, with J time constants.
-    numbers : tuple of ndarray
-        Half the widths and the slopes, each (K, n), the last slopes 1; or the gains (J, n) and the
-        time constants (J,).
-    """
-
-    size: int
-    numbers: tuple[NDArray, ...]
-
-
-class Hysteresis(Protocol):
-    """What the kernels and inverse kinematics need of an operator of hysteresis."""
-
-    def apply(
-        self, q: Any, state: Any = None, dt: ArrayLike | None = None
-    ) -> tuple[Any, Any]:
-        """Return the effective changes of commands (T, n), and the state at their end."""
-        ...
-
-    def command(
-        self, y: Any, state: Any = None, dt: ArrayLike | None = None
-    ) -> tuple[Any, Any]:
-        """Return the commands of effective changes (T, n), and the state at their end."""
-        ...
-
-    def stages(self, n: int) -> list[Stage]:
-        """Return the operator of n actuators as stages in series."""
-        ...
-
-
-class StageNumbers(NamedTuple):
-    """The description of stages as the kernels read it, see hysteresis.h.
-
-    Attributes
-    ----------
-    code : list of int
-        Number of stages and of rows of the state, then the counts.
-    numbers : ndarray
-        The numbers of all stages.
-    """
-
-    code: list[int]
-    numbers: NDArray
-
-    @property
-    def n_rows(self) -> int:
-        """Number of rows of the state."""
-        return self.code[1]
-
-
-def stage_numbers(stages: list[Stage]) -> StageNumbers:
-    """Return the description of stages in series."""
-    counts = [stage.size for stage in stages]
-    rows = 1 + sum(abs(count) + 1 for count in counts)
-    numbers = [a.ravel() for stage in stages for a in stage.numbers]
-    return StageNumbers([len(stages), rows, *counts], np.concatenate(numbers))
 
 
 def follow(
-    stages: list[Stage],
+    described: StageNumbers,
     rows: NDArray,
     steps: NDArray,
     state: NDArray,
     lead: bool,
-    rounding: float = DOUBLE_ROUNDING,
+    rounding: float,
 ) -> NDArray:
     """Return rows (T, n) after the hysteresis; the state becomes that after the last row.
 
     Parameters
     ----------
-    stages : list of Stage
-        The operator.
+    described : StageNumbers
+        The stages, at least one.
     rows : ndarray of shape (T, n)
         Commands, or effective changes if `lead`; contiguous float64, at most 1e75 in size.
     steps : ndarray of shape (T,)
@@ -101,9 +33,8 @@ def follow(
         Whether to return commands for effective changes instead of the reverse.
     rounding : float
         Rounding of the rows, relative to their size: smaller changes are no reversals of what is
-        before creep. Default: that of float64.
+        before creep.
     """
-    described = stage_numbers(stages)
     code = np.array(described.code, dtype=np.int32)
     results = np.empty_like(rows)
     seconds = np.array(steps)

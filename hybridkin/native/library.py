@@ -24,8 +24,9 @@ from hybridkin._core.kernel_numbers import (
     HK_J,
     checksum,
 )
-from hybridkin._core.model import ForwardModel, PortableModule
+from hybridkin._core.model import ForwardModel
 from hybridkin._core.plan import NoKernel, Plan
+from hybridkin._core.portable import PortableModule
 
 _FOLDER = Path(__file__).parent
 _SUFFIX = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")

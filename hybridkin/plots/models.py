@@ -11,12 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Required
 
 from hybridkin._core.commands import Commands
-from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.chain import Chain
 from hybridkin.plots._arrays import plain, positions, shaped
 
-_RIM = 1.15  # radius of a drawn disk over that of the actuator circle
-_CORNERS = 17  # points of a disk's rim
 _STEPS = 12  # to the tips that a model predicts
 _SINGULAR = 1e-3  # of a Jacobian: no steps along smaller singular values, relative to the largest
 _REACHED = 1e-6  # largest distance of a drawn tip from its place [m]
@@ -50,10 +47,10 @@ class Body(TypedDict, total=False):
     actuators: Required[list[NDArray]]
     frames: Required[NDArray]
     tips: Required[NDArray]
-    segments: list[int]
-    disks: NDArray
+    segments: Required[list[int]]
+    disks: Required[NDArray]
+    rigid: Required[bool]
     predicted: NDArray
-    rigid: bool
 
 
 Model: TypeAlias = Predictor | torch.nn.Module
@@ -75,6 +72,7 @@ def body_of(
     Where `tips` (K, 3) are given, or the model corrects its robot inside, the body ends there.
     """
     chain = getattr(model, "mechanical_model_", model)
+    # The public entry: whatever a caller draws; a body needs the geometry of a chain.
     if not isinstance(chain, Chain):
         raise TypeError(
             "`model` must be a chain, or a HybridForwardModel fitted on one, whose backbone can be "
@@ -103,25 +101,16 @@ def body_of(
     spread = partial(_spread, drawn)
     with torch.no_grad():
         tip = spread(chain.tip_model(rows))
-        frames = spread(chain.poses(rows))
-        if isinstance(chain, ArcChain):
-            arcs = _Arcs(chain, rows, n_points)
-            body: Body = {
-                "points": spread(chain.backbone(rows, n_points)),
-                "actuators": [*map(spread, arcs.actuators())],
-                "segments": arcs.segments,
-                "disks": spread(arcs.disks()),
-                "frames": frames,
-                "tips": tip,
-            }
-        else:
-            body = {
-                "points": spread(chain.backbone(rows)),
-                "actuators": [],
-                "frames": frames,
-                "tips": tip,
-                "rigid": True,
-            }
+        drawing = chain.body(rows, n_points)
+        body: Body = {
+            "points": spread(drawing.points),
+            "actuators": [*map(spread, drawing.actuators)],
+            "segments": drawing.segments,
+            "disks": spread(drawing.disks),
+            "frames": spread(chain.poses(rows)),
+            "tips": tip,
+            "rigid": drawing.is_rigid,
+        }
 
     # The learned correction is shown where the body does not end at the predicted tip.
     if predicted_tips is not None:
@@ -160,42 +149,3 @@ def _led_to(chain: Chain, q: torch.Tensor, tips: torch.Tensor) -> torch.Tensor:
         step = inverse @ (tips - x)[..., None]
         q = q + step[..., 0]
     return q.detach()
-
-
-class _Arcs:
-    """The segments of a chain in K configurations: points, and orientations along them."""
-
-    def __init__(self, chain: ArcChain, q: torch.Tensor, n_points: int) -> None:
-        self.chain = chain
-        self.radii = plain(chain.radii)
-        counts = chain.actuators_per_segment
-        self.segments = np.repeat(range(chain.n_segments), counts).tolist()
-        of_arc = max(2, n_points // chain.arcs_per_segment)
-        frames = plain(chain.frames(q, of_arc))  # (K, S, P, 4, 4)
-        self.centres = frames[..., :3, 3]
-        self.turns = frames[..., :3, :3]
-
-    def actuators(self) -> list[NDArray]:
-        """Return the points of every actuator, each (K, P_i, 3)."""
-        paths = []
-        for s, angle in zip(self.segments, plain(self.chain.angles), strict=True):
-            place = self.radii[s] * np.array([np.cos(angle), np.sin(angle), 0.0])
-            passed = slice(self.chain.starts[s], s + 1)
-            points = self.centres[:, passed] + self.turns[:, passed] @ place
-            paths.append(points.reshape(len(points), -1, 3))
-        return paths
-
-    def disks(self) -> NDArray:
-        """Return the rims of the disks (K, S + 1, C, 3): at the base and at every segment's end."""
-        disks = [self._disk(0, 0, self.radii[0])]
-        for s, radius in enumerate(self.radii):
-            if self.chain.routing == "base":
-                radius = self.radii[s:].max()
-            disks.append(self._disk(s, -1, radius))
-        return np.stack(disks, axis=1)
-
-    def _disk(self, s: int, point: int, radius: float) -> NDArray:
-        corner = np.linspace(0.0, 2.0 * np.pi, _CORNERS)
-        circle = np.stack([np.cos(corner), np.sin(corner), 0.0 * corner])
-        rim = self.turns[:, s, point] @ (_RIM * radius * circle)
-        return self.centres[:, s, point, None] + rim.swapaxes(-1, -2)

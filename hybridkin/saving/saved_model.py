@@ -16,10 +16,9 @@ import sklearn
 import torch
 
 from hybridkin._core.arrays import as_path
-from hybridkin._core.model import ForwardModel
+from hybridkin._core.model import ForwardModel, as_forward_model
 from hybridkin._core.stored import plain
 from hybridkin._core.version import __version__
-from hybridkin.chains.chain import Chain
 from hybridkin.hybrid.description import hybrid_of, restorer, stored_hybrid, training_of
 from hybridkin.hybrid.estimator import HybridForwardModel
 from hybridkin.learning.elm import ELMRegressor
@@ -94,13 +93,14 @@ def save_model(
     header: Header = {"versions": versions, "created": created}
     results: Header = {}
     if isinstance(model, HybridForwardModel):
+        _check_fitted_to_rows(model)
         stored = stored_hybrid(model)
         results = training_of(model)
-        header["units"] = _units(model.mechanical_model_, model.output)
+        header["units"] = _units(model.module_, model.output)
         header["domain"] = _domain(model)
     elif isinstance(model, Model):
         stored = model.stored()
-        header["units"] = _units(model)
+        header["units"] = _units(as_forward_model(model))
     else:
         raise TypeError(
             "`model` must be a ConstantCurvatureChain, an ElasticTendonChain, a RigidChain, a "
@@ -166,6 +166,14 @@ def load_model(path: str | Path, *, device: str | torch.device | None = None) ->
     return model
 
 
+def _check_fitted_to_rows(model: HybridForwardModel) -> None:
+    """Raise if no rows were fitted to a model."""
+    if "module_" in vars(model) and not np.isfinite(model.training_range_.low).all():
+        raise ValueError(
+            "`model` was not fitted to rows; save its `mechanical_model`, the chain."
+        )
+
+
 def _checked(training: Mapping[str, object] | None) -> Header:
     try:
         notes = plain(dict(training or {}))
@@ -176,12 +184,11 @@ def _checked(training: Mapping[str, object] | None) -> Header:
     return notes
 
 
-def _units(model: object, output: str = "position") -> dict[str, str | list[str]]:
-    if not isinstance(model, Chain):
-        return {"q": "as in training", "x": "as in training"}
+def _units(model: ForwardModel, output: str = "position") -> dict[str, str | list[str]]:
+    robot = model.robot
     if output == "position":
-        return {"q": model.units, "x": "m"}
-    return {"q": model.units, "x": ["m"] * 3 + ["rad"] * 3}
+        return {"q": robot.unit_of_q, "x": robot.unit_of_x}
+    return {"q": robot.unit_of_q, "x": [robot.unit_of_x] * 3 + ["rad"] * 3}
 
 
 def _check_domain(model: HybridForwardModel, domain: object) -> None:

@@ -82,8 +82,7 @@ def description(chain, q):
     numbers = {f"geometry of {name}": value for name, value in chain.geometry().items()}
     numbers |= {name: getattr(chain, name) for name in NUMBERS if hasattr(chain, name)}
     plausible = chain.plausible_rows()
-    if plausible is not None:
-        numbers["plausible_rows"] = plausible.rest, plausible.weights
+    numbers["plausible_rows"] = plausible.rest, plausible.weights
     for name in ("forward", "jacobian", "poses", "pose", "backbone", "pose_jacobian"):
         numbers[name] = getattr(chain, name)(q)
     return {name: getattr(chain, name, None) for name in SETTINGS}, numbers
@@ -135,7 +134,7 @@ def test_elastic_tendons_that_are_soft_and_taut_are_the_plain_chain(routing, mar
     soft = 1e-9 * plain.radii**2
     elastic = ElasticTendonChain.from_chain(plain, bending_stiffness=soft, axial_stiffness=1e9)
     assert elastic.in_metres == plain.in_metres
-    assert elastic.units == plain.units
+    assert elastic.unit_of_q == plain.unit_of_q
     for name in plain.geometry().keys() - {"actuator_zeros"}:
         assert_close(elastic.geometry()[name], plain.geometry()[name])
     bend = torch.linspace(-1.0, 1.0, 28, dtype=torch.float64).reshape(7, 4).sin()

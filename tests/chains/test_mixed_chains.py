@@ -249,6 +249,6 @@ def test_only_tendons_contradict_each_other():
     chain = ROBOTS["mixed"].chain
     q = torch.full((1, chain.n_actuators), 0.25, dtype=torch.float64)
     q[:, 3:6] = q[:, 8:] = 0.0
-    assert chain.contradiction(q) is None
+    assert chain.contradictions(q) == []
     q[:, 8:] = -0.01  # a common pull of a pair
-    assert "segment 4, 10 mm rms" in chain.contradiction(q)
+    assert "segment 4, 10 mm rms" in chain.contradictions(q)[0]

@@ -459,7 +459,7 @@ def test_joints_that_mimic_others_are_one_actuator(rng):
     k = 2 * q[:, 0] + 0.3
     joints = torch.stack([k, 0.1 - 0.5 * k, q[:, 1]], 1)
     assert arm.names == ("m", "n")
-    assert arm.units == ["rad", "rad"]
+    assert arm.unit_of_q == ["rad", "rad"]
     assert_close(arm.dq_max, torch.tensor([3.0, math.inf], dtype=torch.float64))
     assert_close(arm.q_min, torch.tensor([-1.0, -math.inf], dtype=torch.float64))
     assert_close(arm.poses(q), alone.poses(joints), rtol=0, atol=2e-15)

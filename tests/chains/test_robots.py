@@ -295,7 +295,7 @@ def test_tendon_forces(write):
     )
     forces = torch.tensor([[0.0, 0.0, 0.0], [3.0, 1.0, 0.0]], dtype=torch.float64)
     assert_close(robot.chain(forces), expected(forces))
-    assert robot.chain.units == "N"
+    assert robot.chain.unit_of_q == "N"
     assert robot.calibrate == "auto"
     assert robot.log.q_factor == 1.0
 

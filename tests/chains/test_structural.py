@@ -325,7 +325,7 @@ def test_hybrids_of_it(kind):
 
 def test_markers_stand_side_by_side():
     g, q = drawn("mixed", 3)
-    many = g._marked([(0.5, 0.0, 0.0, 0.0), (2.0, 0.0, 0.0, 0.01), (3.0, 0.0, 0.0, 0.0)])
+    many = g._around(g.chain.with_markers([(0, 0.5), (1, 1.0, (0.0, 0.0, 0.01)), (2, 1.0)]))
     x, J = many.forward_and_jacobian(q)
     for k, tip in enumerate(many.each_tip()):
         at = slice(3 * k, 3 * k + 3)
@@ -340,7 +340,7 @@ def test_markers_stand_side_by_side():
     if native.available():
         check_core(many, q)
         check_core(stacked, q)
-    beside = g._marked([(3.0, 0.01, 0.0, 0.0)])
+    beside = g._around(g.chain.with_markers([(2, 1.0, (0.01, 0.0, 0.0))]))
     assert_close(beside.jacobian(q), jacobian(lambda rows: beside(rows), q), rtol=0, atol=1e-11)
     with pytest.raises(NoKernel, match="beside the backbone"):
         Plan(beside.stored())

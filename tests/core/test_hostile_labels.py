@@ -21,11 +21,10 @@ from hybridkin import (
     ConstantCurvatureChain,
     ELMRegressorCV,
     HybridForwardModel,
-    PlayOperator,
+    Hysteresis,
     calibrate,
     choose_rows,
     datasets,
-    fit_play,
     plots,
 )
 from hybridkin._core.arrays import labels
@@ -34,7 +33,7 @@ CHAIN = ConstantCurvatureChain([0.05])
 N = 12
 Q = 0.2 + 0.05 * np.random.default_rng(0).random((N, 3))
 X = CHAIN(torch.from_numpy(Q)).numpy()
-MODEL = HybridForwardModel(CHAIN, "drop", play=0.002).fit(Q, X)
+MODEL = HybridForwardModel(CHAIN, "drop", hysteresis=0.002).fit(Q, X)
 MISSING = [None, np.nan, pd.NaT, pd.NA, decimal.Decimal("nan"), np.inf]
 DAYS = [datetime.date(2026, 1, 1 + k) for k in range(3)]
 
@@ -114,9 +113,8 @@ def refusals(missing):
     yield "groups", lambda: MODEL.adapt(Q, X, groups=missing)
     yield "groups", lambda: ELMRegressorCV().fit(Q, X, groups=missing)
     yield "groups", lambda: calibrate(CHAIN, Q, X, groups=missing)
-    yield "groups", lambda: fit_play(CHAIN, Q, X, missing)
     yield "groups", lambda: choose_rows(CHAIN, Q, 2, groups=missing)
-    yield "groups", lambda: PlayOperator(0.01).apply_by_group(Q, missing)
+    yield "groups", lambda: Hysteresis.backlash(0.01).apply_by_group(Q, missing)
     curve = plots.LearningCurveDisplay.from_estimator
     yield "groups", lambda: curve(Ridge(), Q, X, groups=missing)
 

@@ -8,8 +8,8 @@ import pytest
 
 import hybridkin
 from hybridkin._core import kernel_numbers
-from hybridkin._core.model import PortableModule
 from hybridkin._core.plan import MOST, NoKernel, Plan
+from hybridkin._core.portable import PortableModule
 from hybridkin._core.stored import KINDS_OF_MODELS, Layout, Stored
 
 SOURCES = Path(hybridkin.__file__).parent / "native" / "src"

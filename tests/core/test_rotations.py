@@ -4,7 +4,8 @@ import numpy as np
 import torch
 from numpy.testing import assert_allclose
 
-from hybridkin._core.rotations import nearest_rotation, nearest_turn
+from hybridkin._core.rotations import nearest_rotation
+from hybridkin.app.checks.rotations import nearest_turn
 
 
 def test_the_nearest_turn_of_an_array_is_that_of_a_tensor():

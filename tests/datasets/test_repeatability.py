@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hybridkin import PlayOperator
+from hybridkin import Hysteresis
 from hybridkin.datasets import repeatability
 
 MEAN_LENGTH = np.sqrt(8.0 / np.pi)  # of a normal vector in space with unit deviations
@@ -74,7 +74,7 @@ def test_hysteresis_counts_where_the_past_differs():
         [np.arange(800), np.arange(800, 1600).reshape(20, 40)[:, ::-1].ravel()]
     )
     q = q[reverse]
-    play = PlayOperator(0.2)
+    play = Hysteresis.backlash(0.2)
     y = play.apply_by_group(q, motions)
     noise = 1e-4 * np.random.default_rng(0).standard_normal((len(q), 3))
     floor = repeatability(q, tips(y) + noise, motions)

@@ -108,7 +108,7 @@ def test_creep_is_not_fitted_to_times_that_cannot_be_seconds():
     q = 0.25 + 0.02 * rng.standard_normal((40, 3))
     x = rng.standard_normal((40, 3))
     runs = np.repeat([0, 1], 20)
-    model = HybridForwardModel(chain, "drop", play=0.01)
+    model = HybridForwardModel(chain, "drop", hysteresis=0.01)
     for time in (1e9 * (START + 0.01 * np.arange(40)), 1e7 * np.arange(40)):
         with pytest.raises(ValueError, match=r"`time` must be in seconds.*time_unit"):
             model.fit(Commands(q, runs, time), x, groups=runs)

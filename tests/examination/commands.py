@@ -1,6 +1,6 @@
-"""Commands of operators of hysteresis, each path of computation against `apply` and each other.
+"""Commands of hysteresis of any kind, each path of computation against `apply` and each other.
 
-The motions, the operators and what rounding allows are those of tests/chains/test_hostile_commands.
+The motions, the values and what rounding allows are those of test_hostile_commands.
 """
 
 from __future__ import annotations
@@ -20,10 +20,11 @@ from _line import Line
 from numpy.typing import NDArray
 
 import hybridkin
-from hybridkin._core.kernel_numbers import c_header
-from hybridkin.native.hysteresis import Stage, stage_numbers
+from hybridkin._core.kernel_numbers import write_headers
+from hybridkin.hysteresis.follow import stage_numbers
+from hybridkin.hysteresis.stage import Stage
 
-sys.path.append(str(Path(__file__).parents[1] / "chains"))
+sys.path.append(str(Path(__file__).parents[1] / "hysteresis"))
 from test_hostile_commands import examined, paths
 
 SOURCES = Path(hybridkin.__file__).parent / "native" / "src"
@@ -84,7 +85,7 @@ def exported(home: Path) -> dict[str, tuple[type, Callable[..., NDArray]]]:
     compiler = shutil.which("cc")
     if compiler is None:
         return {}
-    (home / "kinds.h").write_text(c_header())
+    write_headers(home)
     (home / "rows.c").write_text(SHIM)
     made = {}
     for name, dtype, flag in (("double", np.float64, []), ("float", np.float32, ["-DHK_FLOAT"])):
@@ -119,8 +120,8 @@ def in_c(
     lead: bool,
     rounding: float,
 ) -> NDArray:
-    """Return rows after the hysteresis as `native.hysteresis.follow`, in C of a precision."""
-    described = stage_numbers(stages)
+    """Return rows after the hysteresis as `follow.follow_in_core`, in C of a precision."""
+    described = stage_numbers(stages, rows.shape[1])
     code = np.array(described.code, np.int32)
     arrays = [np.array(a, dtype) for a in (described.numbers, steps, rows, state, rows)]
     places = [ctypes.c_void_p(a.ctypes.data) for a in (code, *arrays)]

@@ -4,8 +4,14 @@ import numpy as np
 import pytest
 import torch
 
-from hybridkin import Commands, ConstantCurvatureChain, HybridForwardModel, InverseKinematics, tasks
-from hybridkin.chains.play import PlayOperator
+from hybridkin import (
+    Commands,
+    ConstantCurvatureChain,
+    HybridForwardModel,
+    Hysteresis,
+    InverseKinematics,
+    tasks,
+)
 
 CHAIN = ConstantCurvatureChain([0.01, 0.01], lengths=[0.1, 0.1])
 WIDTH = 4e-4  # of the backlash [m]
@@ -24,7 +30,7 @@ def balanced_log(n=400):
         q[:, 3 * segment + 1] = -0.5 * first + 0.5 * second
         q[:, 3 * segment + 2] = -0.5 * first - 0.5 * second
     motions = np.arange(n) * 10 // n
-    moved = PlayOperator(WIDTH).apply_by_group(q, motions)
+    moved = Hysteresis.backlash(WIDTH).apply_by_group(q, motions)
     pull = moved @ NORMALS  # shortens the robot, which its kinematics do not know
     x = CHAIN(torch.from_numpy(moved)).numpy()
     x[:, 2] += 0.5 * pull.sum(axis=1)
@@ -34,7 +40,7 @@ def balanced_log(n=400):
 @pytest.mark.parametrize("error_model", ["quadratic", "elm"])
 def test_commands_stay_as_balanced_as_those_of_the_log(error_model):
     q, x, motions = balanced_log()
-    model = HybridForwardModel(CHAIN, error_model, play=WIDTH, random_state=0)
+    model = HybridForwardModel(CHAIN, error_model, hysteresis=WIDTH, random_state=0)
     model.fit(q, x, groups=motions)
     plane = model.module_.plane
     assert plane is not None

@@ -12,7 +12,7 @@ from hybridkin import (
     ELMRegressor,
     ELMRegressorCV,
     HybridForwardModel,
-    PlayOperator,
+    Hysteresis,
     calibrate,
 )
 from hybridkin.calibration.choice import choose_geometry
@@ -27,7 +27,7 @@ def log(seed):
     rng = np.random.default_rng(seed)
     wave = np.sin(np.arange(N)[:, None] / 3.0 + rng.uniform(0.0, 6.0, 3))
     q = 0.25 + 0.05 * wave
-    moved = PlayOperator(0.01).apply(q)[0]
+    moved = Hysteresis.backlash(0.01).apply(q)[0]
     x = CHAIN(torch.from_numpy(moved)).numpy() + 0.002 * np.sin(20.0 * q)
     weights = rng.integers(0, 3, N).astype(float)
     hostile = x.copy()
@@ -56,12 +56,12 @@ KINDS = {
 }
 
 
-@pytest.mark.parametrize("play", [None, 0.01])
+@pytest.mark.parametrize("width", [0.0, 0.01])
 @pytest.mark.parametrize("kind", KINDS)
-def test_no_answer_depends_on_tips_of_weight_zero(kind, play):
+def test_no_answer_depends_on_tips_of_weight_zero(kind, width):
     for seed in range(2):
         commands, x, weights, hostile = log(seed)
-        options = {"mechanical_model": CHAIN, "random_state": 0, "play": play, **KINDS[kind]}
+        options = {"mechanical_model": CHAIN, "random_state": 0, "hysteresis": width, **KINDS[kind]}
         usual = answers(HybridForwardModel(**options), commands, x, weights)
         found = answers(HybridForwardModel(**options), commands, hostile, weights)
         for one, other in zip(usual, found, strict=True):
@@ -71,7 +71,7 @@ def test_no_answer_depends_on_tips_of_weight_zero(kind, play):
 @pytest.mark.slow
 def test_the_hysteresis_that_is_found_does_not_depend_on_them():
     commands, x, weights, hostile = log(5)
-    model = HybridForwardModel(CHAIN, "drop", play="auto")
+    model = HybridForwardModel(CHAIN, "drop", hysteresis="auto")
     usual = answers(model, commands, x, weights)
     for one, other in zip(usual, answers(model, commands, hostile, weights), strict=True):
         np.testing.assert_array_equal(one, other)
@@ -101,7 +101,7 @@ def test_networks_and_calibrations_do_not_depend_on_them():
 def test_a_row_without_a_tip_moves_the_actuators_alone():
     """One command after the other, as in a loop; in some periods the camera sees nothing."""
     commands, x, weights, hostile = log(0)
-    model = HybridForwardModel(CHAIN, "linear", play=0.01)
+    model = HybridForwardModel(CHAIN, "linear", hysteresis=0.01)
     model.fit(commands, x)
     at_once = model.predict(commands)
     model.partial_fit(commands, hostile, weights)
@@ -116,10 +116,10 @@ def test_the_advice_is_true():
     commands, x, _, _ = log(0)
     x[7, 1] = np.nan
     with pytest.raises(ValueError, match=r"first: row 7\); give these rows the weight 0"):
-        HybridForwardModel(CHAIN, "drop", play=0.01).fit(commands, x)
+        HybridForwardModel(CHAIN, "drop", hysteresis=0.01).fit(commands, x)
     weights = np.ones(N)
     weights[7] = 0.0
-    HybridForwardModel(CHAIN, "drop", play=0.01).fit(commands, x, weights)
+    HybridForwardModel(CHAIN, "drop", hysteresis=0.01).fit(commands, x, weights)
     with pytest.raises(ValueError, match="leave these rows out"):
         HybridForwardModel(CHAIN, "drop").fit(commands, x)
     with pytest.raises(ValueError, match="`X` must be finite"):

@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 from hybridkin import (
     Commands,
     HybridForwardModel,
-    PlayOperator,
-    PrandtlIshlinskiiOperator,
+    Hysteresis,
     as_forward_model,
     load_model,
     robots,
@@ -35,7 +34,7 @@ def smooth_friction(q, groups):
     """Return the sum of 25 plays of all widths up to 8 cm."""
     half = np.linspace(0.0, 0.04, 25)
     density = np.exp(-half / 0.012)
-    parts = [PlayOperator(2.0 * r).apply_by_group(q, groups) for r in half]
+    parts = [Hysteresis.backlash(2.0 * r).apply_by_group(q, groups) for r in half]
     return np.tensordot(density / density.sum(), parts, 1)
 
 
@@ -50,7 +49,7 @@ def fitted():
     q, groups = motions(16, seed=0)
     x = tips(smooth_friction(q, groups))
     x += 5e-4 * np.random.default_rng(1).standard_normal(x.shape)
-    model = HybridForwardModel(CHAIN, "quadratic", coupling="serial", play="auto")
+    model = HybridForwardModel(CHAIN, "quadratic", coupling="serial", hysteresis="auto")
     return model.fit(q, x, groups=groups)
 
 
@@ -58,10 +57,10 @@ def fitted():
 def test_smooth_loops_take_more_than_one_play(fitted):
     q, groups = motions(6, seed=2)
     x = tips(smooth_friction(q, groups))
-    assert isinstance(fitted.play_, PrandtlIshlinskiiOperator)
+    assert fitted.hysteresis_.kind == "friction"
     error = np.linalg.norm(fitted.predict(Commands(q, groups)) - x, axis=1).mean()
     train, train_groups = motions(16, seed=0)
-    single = HybridForwardModel(CHAIN, "quadratic", coupling="serial", play=0.02)
+    single = HybridForwardModel(CHAIN, "quadratic", coupling="serial", hysteresis=0.02)
     single.fit(train, tips(smooth_friction(train, train_groups)), groups=train_groups)
     before = np.linalg.norm(single.predict(Commands(q, groups)) - x, axis=1).mean()
     assert error < 0.25 * before
@@ -70,8 +69,8 @@ def test_smooth_loops_take_more_than_one_play(fitted):
 @pytest.mark.slow
 def test_commands_of_the_fitted_operator(fitted):
     y, _ = motions(1, seed=3)
-    q, _ = fitted.play_.command(y)
-    assert_allclose(fitted.play_.apply(q)[0], y, rtol=0.0, atol=1e-9)
+    q, _ = fitted.hysteresis_.command(y)
+    assert_allclose(fitted.hysteresis_.apply(q)[0], y, rtol=0.0, atol=1e-9)
     reached = [tips(smooth_friction(sent, np.zeros(len(y)))) for sent in (q, y)]
     with torch.no_grad():
         promised = fitted.module_(torch.from_numpy(y)).numpy()
@@ -80,12 +79,11 @@ def test_commands_of_the_fitted_operator(fitted):
 
 
 @pytest.mark.slow
-def test_a_file_holds_the_operator(fitted, tmp_path):
+def test_a_file_holds_the_value(fitted, tmp_path):
     q, groups = motions(2, seed=4)
     save_model(fitted, tmp_path / "model.safetensors")
     loaded = load_model(tmp_path / "model.safetensors")
-    assert_array_equal(loaded.play_.slopes, fitted.play_.slopes)
-    assert_array_equal(loaded.play_.widths, fitted.play_.widths)
+    assert loaded.hysteresis_ == fitted.hysteresis_
     expected = fitted.predict(Commands(q, groups))
     assert_array_equal(loaded.predict(Commands(q, groups)), expected)
 
@@ -122,18 +120,18 @@ def test_every_kind_of_model_can_have_it(kind):
         options = {"output": "pose"}
     if kind == "function":
         chain = as_forward_model(lambda q: CHAIN(q))
-    model = HybridForwardModel(chain, "drop", play="auto", **options).fit(q, x, groups=groups)
-    assert isinstance(model.play_, PrandtlIshlinskiiOperator)
+    model = HybridForwardModel(chain, "drop", hysteresis="auto", **options).fit(q, x, groups=groups)
+    assert model.hysteresis_.kind == "friction"
     assert np.nanmax(np.abs(model.predict(Commands(q, groups)) - x)) < 0.1
 
 
 @pytest.mark.slow
 def test_a_backlash_stays_one_backlash():
     q, groups = motions(12, seed=0)
-    x = tips(PlayOperator(0.02).apply_by_group(q, groups))
+    x = tips(Hysteresis.backlash(0.02).apply_by_group(q, groups))
     x += 5e-4 * np.random.default_rng(1).standard_normal(x.shape)
-    model = HybridForwardModel(CHAIN, "linear", coupling="serial", play="auto")
+    model = HybridForwardModel(CHAIN, "linear", coupling="serial", hysteresis="auto")
     error = np.linalg.norm(model.fit(q, x, groups=groups).predict(Commands(q, groups)) - x, axis=1)
-    given = HybridForwardModel(CHAIN, "linear", coupling="serial", play=0.02)
+    given = HybridForwardModel(CHAIN, "linear", coupling="serial", hysteresis=0.02)
     least = np.linalg.norm(given.fit(q, x, groups=groups).predict(Commands(q, groups)) - x, axis=1)
     assert error.mean() < 1.05 * least.mean()

@@ -70,7 +70,7 @@ def test_a_fit_is_finite_or_its_rows_are_refused(data, log):
         data.draw(st.sampled_from(INSIDE if serial else ERROR_MODELS)),
         coupling="serial" if serial else "parallel",
         guard=data.draw(st.sampled_from(["leverage", "box", None])),
-        play=data.draw(st.sampled_from([None, None, 0.001, 0.0, [0.0, 0.01, 5e-324], 1e300])),
+        hysteresis=data.draw(st.sampled_from([None, None, 0.001, 0.0, [0.0, 0.01, 5e-324], 1e300])),
         coverage=data.draw(st.sampled_from([None, None, 0.5])),
         calibrate=data.draw(st.sampled_from([None, None, ["radii"], ["base"]])),
     )

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.testing import assert_array_equal
 
-from hybridkin import PlayOperator
+from hybridkin import Hysteresis
 from hybridkin.hybrid._rows import Rows
 
 Q = np.array([0.0, 1.0, 1.0, 0.0, 1.0, 0.0])[:, None]
@@ -38,7 +38,7 @@ def test_rows_in_runs_merge_only_with_the_row_before():
 
 def test_what_the_actuators_do_follows_each_run():
     rows = Rows(Q, 2.0 * Q, WEIGHTS, groups=np.zeros(6), runs=RUNS, time=TIME)
-    moved = rows.effective(PlayOperator(0.5)).X[:, 0]
+    moved = rows.effective(Hysteresis.backlash(0.5)).X[:, 0]
     assert_array_equal(moved, [0.0, 0.75, 0.75, 0.25, 1.0, 0.25])
     some = rows.take(np.array([4, 1]))
     assert_array_equal(some.runs, ["a", "b"])

@@ -11,27 +11,24 @@ from numpy.testing import assert_allclose, assert_array_equal
 from hybridkin import (
     Commands,
     ConstantCurvatureChain,
-    CreepOperator,
     ELMRegressorCV,
     HybridForwardModel,
-    HysteresisSeries,
-    PlayOperator,
-    PrandtlIshlinskiiOperator,
+    Hysteresis,
     calibrate,
 )
 from hybridkin.hybrid import _hysteresis
 from hybridkin.hybrid._error_models import NoCorrection
-from hybridkin.hybrid._hysteresis import choose_hysteresis, play_of
+from hybridkin.hybrid._hysteresis import FoundHysteresis, choose_hysteresis
 from hybridkin.hybrid._range import state_range
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._spec import Spec
 from hybridkin.hybrid.log_fit import Anew
 
 CHAIN = ConstantCurvatureChain([0.05])
-PLAY = PlayOperator(0.02)
-FRICTION = PrandtlIshlinskiiOperator([0.0, 0.01, 0.02, 0.1], [0.5, 0.7, 0.8])
-CREEP = CreepOperator([0.15, 0.25], [3.0, 40.0])
-SLIDE = HysteresisSeries([PLAY, CREEP])
+PLAY = Hysteresis.backlash(0.02)
+FRICTION = Hysteresis.friction([0.0, 0.01, 0.02, 0.1], [0.5, 0.7, 0.8])
+CREEP = Hysteresis.creep([0.15, 0.25], [3.0, 40.0])
+SLIDE = PLAY | CREEP
 
 
 def tips(y, noise=2e-4):
@@ -59,10 +56,10 @@ def test_rows_that_are_merged_do_not_change_what_the_actuators_do(operator):
     x = tips(log.q, 0.0).round(3)
     weights = np.random.default_rng(2).integers(0, 3, len(keep)).astype(float)
     groups = log.runs // 2  # two runs each
-    clock = log.time if operator.creeps else None
+    clock = log.time if operator.needs_time else None
     rows = Rows(log.q, x, weights, groups, log.runs, clock)
     merged = rows.in_runs()
-    assert len(merged) == len(rows) - (1 if operator.creeps else 4)
+    assert len(merged) == len(rows) - (1 if operator.needs_time else 4)
     assert_array_equal(merged.X[merged.place], rows.X)
     assert merged.counts.sum() == weights.sum()
     moved = merged.effective(operator).X[merged.place]
@@ -107,7 +104,7 @@ def test_names_of_runs_and_the_start_of_the_clock_do_not_matter(operator):
     x = tips(operator.apply_by_group(q, runs, time)) + 0.02 * np.sin(20 * q)
     commands = Commands(q, runs, time)
     others, order = renamed(commands)
-    one, other = (HybridForwardModel(CHAIN, "linear", play=operator) for _ in range(2))
+    one, other = (HybridForwardModel(CHAIN, "linear", hysteresis=operator) for _ in range(2))
     one.fit(commands, x, groups=runs)
     other.fit(others, x[order], groups=others.runs)
     new = Commands(*motions(6, 20, seed=3))
@@ -134,8 +131,8 @@ def test_names_of_runs_and_the_start_of_the_clock_do_not_matter(operator):
 
 
 def chosen(rows, calibrate=()):
-    spec = Spec(CHAIN, NoCorrection(), calibrate, play="auto")
-    return play_of(spec, rows.in_runs())[0]
+    spec = Spec(CHAIN, NoCorrection(), calibrate, hysteresis=FoundHysteresis())
+    return spec.hysteresis.of(spec, rows.in_runs())[0]
 
 
 @pytest.mark.slow
@@ -154,8 +151,8 @@ def test_the_chosen_hysteresis_knows_no_names_and_no_clock():
 def test_the_chosen_hysteresis_counts_rows_by_their_weights():
     """Half of the motions are those of a wider backlash; repetitions differ by a nanometre."""
     q, runs, _ = motions(8)
-    wide = PlayOperator(0.03).apply_by_group(q, runs)
-    narrow = PlayOperator(0.01).apply_by_group(q, runs)
+    wide = Hysteresis.backlash(0.03).apply_by_group(q, runs)
+    narrow = Hysteresis.backlash(0.01).apply_by_group(q, runs)
     x = tips(np.where(runs[:, None] % 2, narrow, wide)) + np.array([0.0, 0.0, 0.01])
     weights = np.where(runs % 2, 1.0, 4.0)
     many = np.repeat(np.arange(len(q)), weights.astype(int))
@@ -176,7 +173,7 @@ def test_what_is_held_out_has_no_say_in_the_hysteresis():
     measured = np.flatnonzero(weights)
     is_held_out = runs[measured] == 1
     train, test = np.flatnonzero(~is_held_out), np.flatnonzero(is_held_out)
-    spec = Spec(CHAIN, NoCorrection(), play="auto")
+    spec = Spec(CHAIN, NoCorrection(), hysteresis=FoundHysteresis())
     found = []
     for wrong in (0.0, 0.1):
         y = log.y.copy()
@@ -186,7 +183,7 @@ def test_what_is_held_out_has_no_say_in_the_hysteresis():
     assert_array_equal(found[1].tips, found[0].tips)
     moved = PLAY.apply_by_group(q, runs)[measured[test]]
     assert_allclose(found[0].tips[0], tips(moved), rtol=0, atol=1e-3)
-    assert found[0].choice.play is not None
+    assert found[0].choice.hysteresis
 
 
 @pytest.mark.parametrize("mechanical", [CHAIN, None])
@@ -218,12 +215,14 @@ def test_the_search_gets_the_rows_as_they_are(mechanical, monkeypatch):
 
 
 def test_the_chain_of_the_search_is_calibrated_with_the_weights(monkeypatch):
-    monkeypatch.setattr(_hysteresis, "find_hysteresis", lambda log: log)
-    monkeypatch.setattr(_hysteresis, "coarse_in_words", lambda operator, rows: [])
+    logs = []
+    found = Hysteresis()
+    monkeypatch.setattr(_hysteresis, "find_hysteresis", lambda log: logs.append(log) or found)
     q, runs, _ = motions()
     weights = np.random.default_rng(0).integers(0, 4, len(q)).astype(float)
     x = tips(q) + 0.02 * np.sin(20 * q)
-    found = chosen(Rows(q, x, weights, runs), ("base",)).model
+    assert chosen(Rows(q, x, weights, runs), ("base",)) == found
+    found = logs[0].model
     expected, plain = (
         calibrate(CHAIN, q, x, parameters=("base",), sample_weight=counts).chain
         for counts in (weights, None)
@@ -236,7 +235,7 @@ def test_a_single_motion_that_counts_tells_nothing_of_hysteresis():
     """There is none to hold out beside those of weight zero."""
     q, runs, _ = motions()
     x = tips(PLAY.apply_by_group(q, runs))
-    assert chosen(Rows(q, x, (runs == 2).astype(float), runs)) is None
+    assert chosen(Rows(q, x, (runs == 2).astype(float), runs)) == Hysteresis()
 
 
 def test_the_range_of_states_is_tested_by_other_groups():
@@ -268,7 +267,7 @@ def test_rows_of_weight_zero_have_no_say_in_a_model_with_hysteresis():
     results = []
     for wrong in (0.0, 0.1):
         y = x + wrong * (weights == 0.0)[:, None]
-        model = HybridForwardModel(CHAIN, "linear", play=FRICTION, coverage=0.6)
+        model = HybridForwardModel(CHAIN, "linear", hysteresis=FRICTION, coverage=0.6)
         model.fit(q, y, weights, groups=runs)
         model = copy.deepcopy(model).partial_fit(Commands(q, runs), y + 0.01, weights)
         results.append((model.predict(Commands(new, new_runs)), model.radius_))

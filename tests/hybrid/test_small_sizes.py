@@ -46,12 +46,12 @@ def log_of(n, m, n_rows=50):
         (1, 1, {"guard": "box"}),
         (3, 1, {"guard": "box"}),
         (1, 3, {"guard": "box"}),
-        pytest.param(3, 1, {"play": 0.01, "coverage": 0.8}, **SLOW),
+        pytest.param(3, 1, {"hysteresis": 0.01, "coverage": 0.8}, **SLOW),
     ],
 )
 def test_a_single_coordinate_or_output(coupling, name, n, m, options):
     q, x = log_of(n, m)
-    y = x[:, 0] if m == 1 and "play" in options else x  # one-dimensional targets too
+    y = x[:, 0] if m == 1 and "hysteresis" in options else x  # one-dimensional targets too
     model = HybridForwardModel(Bent(n, m), MODELS[name], coupling=coupling, **options).fit(q, y)
     mechanical = Bent(n, m)(torch.from_numpy(q)).numpy().reshape(y.shape)
     if name != "drop":

@@ -7,11 +7,8 @@ from numpy.testing import assert_array_equal
 
 from hybridkin import (
     Commands,
-    CreepOperator,
     HybridForwardModel,
-    HysteresisSeries,
-    PlayOperator,
-    PrandtlIshlinskiiOperator,
+    Hysteresis,
     load_model,
     robots,
     save_model,
@@ -19,8 +16,8 @@ from hybridkin import (
 from hybridkin.hybrid._pace import each_pace
 
 CHAIN = robots.bionic_handling_assistant()
-FRICTION = PrandtlIshlinskiiOperator([0.0, 0.01, 0.02, 0.2], [0.5, 0.7, 0.8])
-CREEP = CreepOperator([0.1, 0.2], [4.0, 400.0])
+FRICTION = Hysteresis.friction([0.0, 0.01, 0.02, 0.2], [0.5, 0.7, 0.8])
+CREEP = Hysteresis.creep([0.1, 0.2], [4.0, 400.0])
 ROWS = 40
 
 
@@ -41,7 +38,7 @@ def many_plays(commands):
     """Return the sum of 25 plays of widths up to 8 cm, none of them those of a fit."""
     half = np.linspace(0.0, 0.04, 25)
     density = np.exp(-half / 0.012)
-    plays = [PlayOperator(2.0 * r).apply_by_group(commands.q, commands.runs) for r in half]
+    plays = [Hysteresis.backlash(2.0 * r).apply_by_group(commands.q, commands.runs) for r in half]
     return np.tensordot(density / density.sum(), plays, 1)
 
 
@@ -59,7 +56,7 @@ def distances(model, commands, x):
 def fitted(operator, **settings):
     commands = motions(16, seed=0)
     x = tips(operator.apply_by_group(commands.q, commands.runs, commands.time))
-    model = HybridForwardModel(CHAIN, "linear", play=operator, **settings)
+    model = HybridForwardModel(CHAIN, "linear", hysteresis=operator, **settings)
     return model.fit(commands, x, groups=commands.runs)
 
 
@@ -155,13 +152,13 @@ def test_the_pace_is_a_mean_speed_in_which_the_past_fades(seed):
     np.testing.assert_allclose(pace.speeds[1:], np.tile([0.3, 0.6], (59, 1)))
 
 
-@pytest.mark.parametrize("operator", [FRICTION, CREEP, HysteresisSeries([FRICTION, CREEP])])
+@pytest.mark.parametrize("operator", [FRICTION, CREEP, FRICTION | CREEP, CREEP | FRICTION])
 def test_inner_states_are_those_of_single_steps(operator):
     commands = motions(3, seed=0)
     order = np.argsort(np.arange(120) % ROWS, kind="stable")  # motions by turns
     commands = commands[order]
     states = operator.inner_states(commands.q, commands.runs, commands.time)
-    ends = np.cumsum([abs(stage.size) + 1 for stage in operator.stages(9)])
+    ends = np.cumsum([stage.n_inside + 1 for stage in operator.stages])
     for run in range(3):
         state = None
         rows = np.flatnonzero(commands.runs == run)
@@ -169,14 +166,16 @@ def test_inner_states_are_those_of_single_steps(operator):
             _, state = operator.apply(commands.q[row : row + 1], state, [step])
             inside = np.delete(state, [0, *ends], axis=0)
             np.testing.assert_allclose(states[row], inside, atol=1e-14)
-    assert PlayOperator(0.01).inner_states(commands.q, commands.runs).shape == (120, 0, 9)
+    assert Hysteresis.backlash(0.01).inner_states(commands.q, commands.runs).shape == (120, 0, 9)
 
 
 @pytest.mark.slow
 def test_the_radius_covers_new_motions_with_hysteresis():
     commands = motions(24, seed=0)
     x = tips(many_plays(commands), 5e-4)
-    model = HybridForwardModel(CHAIN, "quadratic", coupling="serial", play="auto", coverage=0.9)
+    model = HybridForwardModel(
+        CHAIN, "quadratic", coupling="serial", hysteresis="auto", coverage=0.9
+    )
     model.fit(commands, x, groups=commands.runs)
     new = motions(48, seed=1)
     error = distances(model, new, tips(many_plays(new), 5e-4))

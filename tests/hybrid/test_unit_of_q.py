@@ -70,12 +70,12 @@ def test_serial_coupling_and_play(log):
     plain, counted, rows = both(log, **options)
     assert_allclose(counted.predict(counts(rows)), plain.predict(rows), atol=1e-8)
     q, x, groups = log
-    plain = HybridForwardModel(PLAIN, play="auto", random_state=0).fit(q, x, groups=groups)
-    counted = HybridForwardModel(COUNTED, play="auto", random_state=0)
+    plain = HybridForwardModel(PLAIN, hysteresis="auto", random_state=0).fit(q, x, groups=groups)
+    counted = HybridForwardModel(COUNTED, hysteresis="auto", random_state=0)
     counted.fit(counts(q), x, groups=groups)
-    assert (plain.play_ is None) == (counted.play_ is None)
+    assert (not plain.hysteresis_) == (not counted.hysteresis_)
     found = [
-        HybridForwardModel(chain, play=width, random_state=0).fit(rows, x, groups=groups)
+        HybridForwardModel(chain, hysteresis=width, random_state=0).fit(rows, x, groups=groups)
         for chain, width, rows in ((PLAIN, 5e-4, q), (COUNTED, 5e-4 / GAIN, counts(q)))
     ]
     x, y = (m.predict(Commands(r, groups)) for m, r in zip(found, (q, counts(q)), strict=True))

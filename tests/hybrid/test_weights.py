@@ -19,7 +19,7 @@ from hybridkin import (
     ELMRegressor,
     ELMRegressorCV,
     HybridForwardModel,
-    PlayOperator,
+    Hysteresis,
     calibrate,
 )
 from hybridkin.calibration.choice import choose_geometry
@@ -263,8 +263,8 @@ def test_a_calibration_before_the_error_model_is_weighted(log):
 def test_a_row_of_weight_zero_still_moves_the_actuators(log):
     q, x, weights, _, new = log
     kept = weights > 0
-    effective = PlayOperator(0.02).apply_by_group(q, np.zeros(len(q)))
-    weighed = hybrid("linear", play=0.02).fit(q, x, kept)
+    effective = Hysteresis.backlash(0.02).apply_by_group(q, np.zeros(len(q)))
+    weighed = hybrid("linear", hysteresis=0.02).fit(q, x, kept)
     plain = hybrid("linear").fit(effective[kept], x[kept])
     assert_allclose(
         weighed.module_(torch.from_numpy(new)).numpy(), plain.predict(new), rtol=0, atol=1e-10

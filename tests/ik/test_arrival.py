@@ -6,7 +6,7 @@ import torch
 from torch.testing import assert_close
 
 from hybridkin import ElasticTendonChain, HybridForwardModel, InverseKinematics
-from hybridkin.hybrid._wrapped import Shifted
+from hybridkin._core.model import Shifted
 from hybridkin.ik.results import IKStatus
 
 LIMITS = {"q_min": -0.01, "q_max": 0.01, "dt": 0.02}

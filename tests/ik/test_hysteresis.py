@@ -8,12 +8,7 @@ import rounding
 import torch
 from operators import operators, with_hysteresis
 
-from hybridkin import (
-    HybridForwardModel,
-    InverseKinematics,
-    PlayOperator,
-    robots,
-)
+from hybridkin import HybridForwardModel, Hysteresis, InverseKinematics, robots
 from hybridkin.ik.results import IKStatus
 
 CHAIN = robots.bionic_handling_assistant()
@@ -81,8 +76,8 @@ def put_where(reference, core):
     """Put a tracker in torch where one of the core is: differences can grow in closed loops."""
     robot, compiled = reference._robot, core._robot
     robot._lead.state = compiled.hysteresis
-    robot._lead.command = robot._command = torch.from_numpy(core.q)[None]
-    robot._lead.effective = robot._q = torch.from_numpy(core.effective)[None]
+    robot._lead.command = torch.from_numpy(core.q)[None]
+    robot._lead.effective = torch.from_numpy(core.effective)[None]
     step = robot._last.step._replace(dq=compiled.last().step.dq)
     robot._last = robot._last._replace(step=step)
 
@@ -136,7 +131,7 @@ def test_without_limits_of_speed_the_tip_is_where_it_would_be_without_hysteresis
 
 
 def test_a_command_crosses_the_backlash_in_several_periods():
-    tracker = ik_of(PlayOperator(2e-3), dq_max=0.05, q_pref=HOME, beta=0.0).tracker(HOME)
+    tracker = ik_of(Hysteresis.backlash(2e-3), dq_max=0.05, q_pref=HOME, beta=0.0).tracker(HOME)
     up = tracker.x + np.array([0.0, 0.0, 0.01])
     for _ in range(60):
         tracker.step(up)
@@ -188,7 +183,7 @@ def test_a_tracker_goes_on_from_a_state(kind):
         np.testing.assert_allclose(again.step(target), q, rtol=0, atol=1e-12)
         np.testing.assert_array_equal(copied.step(target), q)
         np.testing.assert_allclose(read.step(target), q, rtol=0, atol=1e-12)
-    assert ik_of(None).tracker(HOME).state is None
+    assert ik_of(None).tracker(HOME).state.shape == (0, 9)
     with pytest.raises(ValueError, match="has none"):
         ik_of(None).tracker(HOME).reset(HOME, state)
 
@@ -222,7 +217,7 @@ def test_a_refit_keeps_the_state_of_its_hysteresis():
     rng = np.random.default_rng(0)
     q = 0.25 + 0.05 * rng.uniform(-1.0, 1.0, (60, 9))
     x = CHAIN(torch.from_numpy(q)).numpy() + 0.002
-    model = HybridForwardModel(CHAIN, "linear", play=1e-3).fit(q, x)
+    model = HybridForwardModel(CHAIN, "linear", hysteresis=1e-3).fit(q, x)
     ik = InverseKinematics(model, q_min=0.15, q_max=0.35, dt=DT)
     for start in (HOME, torch.from_numpy(HOME)):
         tracker = ik.tracker(start)
@@ -234,7 +229,8 @@ def test_a_refit_keeps_the_state_of_its_hysteresis():
         tracker.step([np.nan] * 3)
         np.testing.assert_array_equal(tracker.q, command)
         np.testing.assert_allclose(tracker.effective, effective, rtol=0, atol=1e-15)
-        model.fit(q, x)
+        model.set_params(hysteresis=2e-3).fit(q, x)
         tracker.step([np.nan] * 3)
         np.testing.assert_array_equal(tracker.q, command)
         np.testing.assert_array_equal(tracker.effective, command)
+        model.set_params(hysteresis=1e-3).fit(q, x)

@@ -15,11 +15,9 @@ from operators import operators, with_hysteresis
 
 from hybridkin import (
     ConstantCurvatureChain,
-    CreepOperator,
     ElasticTendonChain,
-    HysteresisSeries,
+    Hysteresis,
     InverseKinematics,
-    PlayOperator,
     RigidChain,
 )
 from hybridkin.ik.results import IKStatus
@@ -166,7 +164,9 @@ def test_a_track_is_the_same_in_another_unit_of_q(name, limits, width, kind):
     """With unequal periods; widths of backlash are in the unit of q, too."""
     span = ROBOTS[name][3] - ROBOTS[name][2]
     operator = (
-        None if width is None else (lambda unit: PlayOperator(width * span * unit * np.ones(6)))
+        None
+        if width is None
+        else (lambda unit: Hysteresis.backlash(width * span * unit * np.ones(6)))
     )
     ours, theirs, convert = in_both_units(name, limits, operator)
     model = ours.settings.task.models[0]
@@ -274,8 +274,8 @@ def test_commands_that_lead_do_not_depend_on_the_unit_of_time(operator, kind):
     model = operators(6, 2e-3)
     slower = operators(6, 2e-3)[operator]
     if operator == "plays, creep":
-        plays = slower.parts[0]
-        slower = HysteresisSeries([plays, CreepOperator([0.1, 0.05], [0.5 / TICK, 5.0 / TICK])])
+        plays = Hysteresis(slower.stages[:1])
+        slower = plays | Hysteresis.creep([0.1, 0.05], [0.5 / TICK, 5.0 / TICK])
     ours, _ = clocks("acceleration", model[operator])
     _, theirs = clocks("acceleration", slower)
     start = np.full(6, 0.25)
@@ -327,7 +327,9 @@ def test_a_posture_is_approached_by_beta_times_each_period(kind):
 
 
 @ON_BOTH
-@pytest.mark.parametrize("operator", [None, PlayOperator(1e-9)], ids=["static", "hysteresis"])
+@pytest.mark.parametrize(
+    "operator", [None, Hysteresis.backlash(1e-9)], ids=["static", "hysteresis"]
+)
 def test_the_speed_grows_by_the_acceleration_times_each_period(operator, kind):
     """Full thrust towards a target far away; backlash is crossed in the first period."""
     model = sliding(np.eye(3))

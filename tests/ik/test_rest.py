@@ -8,8 +8,8 @@ import torch
 from hybridkin import (
     ConstantCurvatureChain,
     ElasticTendonChain,
+    Hysteresis,
     InverseKinematics,
-    PlayOperator,
     RigidChain,
     robots,
 )
@@ -125,7 +125,7 @@ def test_it_rests_in_single_precision():
 def test_hysteresis_rests_too():
     from operators import with_hysteresis
 
-    model = with_hysteresis(TENDONS, PlayOperator(1e-4))
+    model = with_hysteresis(TENDONS, Hysteresis.backlash(1e-4))
     ik = InverseKinematics(model, q_min=-0.02, q_max=0.02)
     for q, x in zip(*beyond("tendons", 3, 0.005), strict=True):
         tracker = ik.tracker(q)

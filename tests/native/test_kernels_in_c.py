@@ -9,7 +9,7 @@ import torch
 
 import hybridkin
 from hybridkin import as_forward_model, load_model
-from hybridkin._core.kernel_numbers import c_header
+from hybridkin._core.kernel_numbers import write_headers
 from hybridkin.native.library import program_of
 
 pytestmark = [pytest.mark.slow, pytest.mark.needs_core]
@@ -53,7 +53,7 @@ def test_kernels_stay_within_their_arrays(tmp_path, compiled, lanes):
     compiler, tester, plan = shutil.which("cc"), tmp_path / "test", tmp_path / "plan"
     if compiler is None:
         pytest.skip("needs a C compiler")
-    Path(tmp_path, "kinds.h").write_text(c_header())
+    write_headers(tmp_path)
     source = [
         f"-I{SOURCES}",
         f"-I{tmp_path}",

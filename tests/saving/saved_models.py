@@ -13,19 +13,21 @@ from sklearn.linear_model import LinearRegression
 from hybridkin import (
     Commands,
     ConstantCurvatureChain,
-    CreepOperator,
     ElasticTendonChain,
     ELMRegressor,
     ELMRegressorCV,
     HybridForwardModel,
-    HysteresisSeries,
-    PrandtlIshlinskiiOperator,
+    Hysteresis,
     RigidChain,
     save_model,
 )
 from hybridkin.chains.structural import StructuralChain
 
 FOLDER = Path(__file__).parent / "models"
+FRICTION = Hysteresis.friction([0.0, 0.01, 0.02], [[0.2, 0.3, 0.4], [0.7, 0.8, 1.1]])
+CREEP = Hysteresis.backlash(0.02) | Hysteresis.creep(
+    [[0.1, 0.2, 0.3], [0.2, 0.1, 0.0]], [2.0, 30.0]
+)
 
 
 def tendon_chain(**options):
@@ -109,7 +111,7 @@ def _hybrid(error_model: Any = None, chain: Any = None, **settings: Any) -> Any:
         x = np.hstack([x, 5 * (q - 0.25)])
     chain = trunk() if chain is None else chain
     model = HybridForwardModel(chain, error_model, random_state=0, **settings)
-    return model.fit(q, x, groups=groups), q
+    return model.fit(Commands(q, time=np.arange(len(q))), x, groups=groups), q
 
 
 def _blend():
@@ -136,19 +138,6 @@ def _elastic_hybrid():
 def _drifting():
     model, q = _hybrid(ELMRegressor(4, random_state=0), coverage=0.8)
     return model.partial_fit(q[:5], trunk_log()[1][:5] + 0.01), q
-
-
-def _with_smooth_hysteresis(model, q):
-    model._fit = model._fit.with_play(
-        PrandtlIshlinskiiOperator([0.0, 0.01, 0.02], [[0.2, 0.3, 0.4], [0.7, 0.8, 1.1]])
-    )
-    return model, q
-
-
-def _with_creep(model, q):
-    creep = CreepOperator([[0.1, 0.2, 0.3], [0.2, 0.1, 0.0]], [2.0, 30.0])
-    model._fit = model._fit.with_play(HysteresisSeries([model.play_, creep]))
-    return model, q
 
 
 def _adapted(model, q):
@@ -196,9 +185,9 @@ def models() -> dict[str, tuple[Any, Any]]:
             trunk_log()[0],
         ),
         "blend": _blend(),
-        "play": _hybrid("linear", play=[0.01, 0.02, 0.0]),
-        "smooth_hysteresis": _with_smooth_hysteresis(*_hybrid("linear", play=0.02)),
-        "creep": _with_creep(*_hybrid("linear", play=0.02)),
+        "play": _hybrid("linear", hysteresis=[0.01, 0.02, 0.0]),
+        "smooth_hysteresis": _hybrid("linear", hysteresis=FRICTION),
+        "creep": _hybrid("linear", hysteresis=CREEP),
         "tested_by_groups": _hybrid("linear", coupling="serial", guard="box"),
         "drift_and_radius": _drifting(),
         "adapted": _adapted(*_hybrid("quadratic", coupling="serial")),
@@ -214,7 +203,7 @@ def predictions(model: Any, q: Any) -> dict[str, Any]:
         chain: Any = model
         x, J = (part.numpy() for part in chain.forward_and_jacobian(torch.from_numpy(q)))
         return {"x": x, "J": J}
-    if isinstance(model, HybridForwardModel) and model.play_ is not None:
+    if isinstance(model, HybridForwardModel) and model.hysteresis_:
         q = Commands(q, time=np.arange(float(len(q))))
     x, J = model.predict_and_jacobian(q)
     said = {"x": x, "J": J}

@@ -71,7 +71,7 @@ def test_hysteresis_must_be_whole(tmp_path):
         fewer = {key: value for key, value in header["arrays"].items() if key != name}
         write(tmp_path / "part", {**header, "arrays": fewer}, arrays)
         if name == "play_width":  # creep alone is an operator too
-            assert load_model(tmp_path / "part").play_.kind == "creep"
+            assert load_model(tmp_path / "part").hysteresis_.kind == "creep"
             continue
         with pytest.raises(ValueError, match=f"part is damaged: .*{name}"):
             load_model(tmp_path / "part")

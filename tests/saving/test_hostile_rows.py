@@ -28,7 +28,7 @@ def loaded(name):
 
 def outcome(model, entry, q):
     rows = q
-    if getattr(getattr(model, "play_", None), "creeps", False):
+    if as_forward_model(model).hysteresis.needs_time:
         rows = Commands(q, time=np.arange(len(q), dtype=float))
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "`X` (reaches|has no tip: compressed)")

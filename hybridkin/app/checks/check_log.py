@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridkin import ForwardModel, LengthDrivenChain
 from hybridkin.app.checks.columns import COLUMN_CHECKS, LogRows
 from hybridkin.app.checks.encoders import encoder_findings
 from hybridkin.app.checks.geometry import geometry_findings
@@ -23,16 +23,13 @@ from hybridkin.app.checks.residual import residual_findings
 from hybridkin.datasets import Log
 from hybridkin.formats import named_places
 
-if TYPE_CHECKING:
-    from hybridkin import ArcChain
-
 _LARGEST = 1e75  # fourth powers of larger numbers overflow
 
 
 def check_log(
     log: Log,
     *,
-    chain: ArcChain | None = None,
+    chain: ForwardModel | None = None,
     base_is_free: bool = True,
     drop_invalid: bool = True,
 ) -> LogReport:
@@ -53,10 +50,10 @@ def check_log(
     ----------
     log : Log
         As from `load_log`; from arrays ``Log(q, x, groups)``.
-    chain : ConstantCurvatureChain, ElasticTendonChain or ForceTendonChain, optional
+    chain : Chain, optional
         Nominal kinematics, or a calibrated chain (``calibrate(...).chain``), which distinguishes
-        orders of the columns better. None, or forces as q: units,
-        order, signs and axes are not checked.
+        orders of the columns better. None, or one whose q are no lengths (forces, joint angles):
+        units, order, signs and axes are not checked.
     base_is_free : bool, default=True
         Whether the pose of the base will be fitted. For tendons on a backbone of fixed length, a
         wrong sign of q then looks like a half turn of the base. It is reported if the base must
@@ -110,7 +107,8 @@ def check_log(
             findings += check(rows)
         if of_encoders:
             chain = None  # readings that are turns off look like wrong orders, signs and units
-        if chain is not None and chain.takes_lengths:
+        # Its checks compare radii, paths and lengths of arcs, which no other chain has.
+        if isinstance(chain, LengthDrivenChain):
             findings += geometry_findings(rows.log, chain, base_is_free)
         if not any(finding.kind in (*MISREAD, "encoder") for finding in findings):
             residual = [*residual_findings(rows.log, chain, rows.same_motion)]

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybridkin.app.checks.report import LogFinding
-from hybridkin.chains.reversals import Coarseness
 from hybridkin.datasets import Log
 from hybridkin.formats import FRAMES, duration_in_words, in_terms, named_places
+from hybridkin.hysteresis.reversals import Coarseness
 
 _FROZEN_ROWS = 3  # fewer rows may be chance
 _FROZEN_WAY = 0.1  # part of an actuator's range over which the tip must have moved
@@ -259,7 +259,7 @@ def same_commands(rows: LogRows) -> Iterator[LogFinding]:
     )
     advice = (
         "this is noise, or backlash (also called play) if the robot came from another side, "
-        "which --play auto (play=) can fit; other models cannot have a smaller error."
+        "which --hysteresis auto (hysteresis=) can fit; other models cannot have a smaller error."
     )
     yield rows.finding("same command", message, advice, different[repeated], "note")
 

@@ -44,7 +44,7 @@ from hybridkin.datasets import Log
 from hybridkin.formats import METRES, in_terms
 
 if TYPE_CHECKING:
-    from hybridkin import ArcChain, robots
+    from hybridkin import LengthDrivenChain, robots
 
 _FACTORS = (1e-3, 1e-2, 1e-1, 10.0, 100.0, 1000.0)
 _ROWS = 500  # enough to distinguish a robot from its mirror image
@@ -98,7 +98,7 @@ _ADVICE = {
 
 
 def geometry_findings(
-    log: Log, chain: ArcChain, base_is_free: bool
+    log: Log, chain: LengthDrivenChain, base_is_free: bool
 ) -> list[LogFinding]:
     """Return contradictions to the chain: those of the first check that finds any."""
     findings = [*_negated_zeros(log, chain)]
@@ -120,7 +120,7 @@ def geometry_findings(
     return findings
 
 
-def _in_metres(log: Log, chain: ArcChain) -> tuple[Log, ArcChain]:
+def _in_metres(log: Log, chain: LengthDrivenChain) -> tuple[Log, LengthDrivenChain]:
     """Return the log and the chain with q in metres."""
     if chain.in_metres:
         return log, chain
@@ -142,7 +142,7 @@ class _Comparison:
     def __init__(
         self,
         log: Log,
-        chain: ArcChain,
+        chain: LengthDrivenChain,
         layout: robots.ActuatorLayout,
         base_is_free: bool,
     ) -> None:
@@ -266,7 +266,7 @@ def _explained(error: float) -> str:
     return f"{100 * max(1 - error**2, 0.0):.0f} %"
 
 
-def _negated_zeros(log: Log, chain: ArcChain) -> Iterator[LogFinding]:
+def _negated_zeros(log: Log, chain: LengthDrivenChain) -> Iterator[LogFinding]:
     """Yield a finding if no row is near the zeros of tendons, but rows are near their negatives."""
     tendons = (~chain.absolute & (chain.rest != 0.0)).cpu().numpy()
     rest = chain.rest.detach().cpu().numpy()[tendons]

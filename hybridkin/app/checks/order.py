@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from hybridkin.app.checks.rotations import nearest_turn
 
 if TYPE_CHECKING:
-    from hybridkin import ArcChain
+    from hybridkin import LengthDrivenChain
 
 _ROWS = 60  # rows of the search; enough to distinguish two orders
 _MANY = 5  # for more actuators in a segment, or more segments, only pairs of columns are swapped
@@ -91,7 +91,9 @@ def _segments_listed(counts: Sequence[int], listed: Sequence[int]) -> list[int]:
     return order
 
 
-def misses(chain: ArcChain, qs: NDArray, x: NDArray, base_is_free: bool) -> NDArray:
+def misses(
+    chain: LengthDrivenChain, qs: NDArray, x: NDArray, base_is_free: bool
+) -> NDArray:
     """Return for each q (N, n) of qs (K, N, n) the relative error of the chain's tips.
 
     This is the rms distance of the tips x (N, 3) from those of the chain, after the best shift (for
@@ -107,7 +109,7 @@ def misses(chain: ArcChain, qs: NDArray, x: NDArray, base_is_free: bool) -> NDAr
     return np.sqrt(squared_error / squared_size)
 
 
-def base_turn(chain: ArcChain, q: NDArray, x: NDArray) -> tuple[float, float]:
+def base_turn(chain: LengthDrivenChain, q: NDArray, x: NDArray) -> tuple[float, float]:
     """Return the rotation of the base about its axis that fits the tips, and its tilt [deg]."""
     tips, measured = _centred(chain, q[None], x)
     base = chain.base[:3, :3].numpy(force=True).astype(float)
@@ -120,7 +122,9 @@ def base_turn(chain: ArcChain, q: NDArray, x: NDArray) -> tuple[float, float]:
     return float(np.degrees(twist)), float(np.degrees(tilt))
 
 
-def _centred(chain: ArcChain, qs: NDArray, x: NDArray) -> tuple[NDArray, NDArray]:
+def _centred(
+    chain: LengthDrivenChain, qs: NDArray, x: NDArray
+) -> tuple[NDArray, NDArray]:
     """Return the tips (K, N, 3) of the chain and the measured ones, each minus their mean."""
     rows = torch.from_numpy(np.ascontiguousarray(qs, dtype=np.float64))
     with torch.no_grad():
@@ -129,7 +133,7 @@ def _centred(chain: ArcChain, qs: NDArray, x: NDArray) -> tuple[NDArray, NDArray
 
 
 def better_way(
-    chain: ArcChain, q: NDArray, x: NDArray, base_is_free: bool
+    chain: LengthDrivenChain, q: NDArray, x: NDArray, base_is_free: bool
 ) -> tuple[NDArray, float]:
     """Return the best found way to read the columns, and its relative error (see `misses`).
 

@@ -14,7 +14,7 @@ from hybridkin.app.checks.report import LogFinding
 from hybridkin.datasets import Log
 
 if TYPE_CHECKING:
-    from hybridkin import ArcChain
+    from hybridkin import ForwardModel
 
 _LAGS = 10  # largest lag of the tip in rows, in both directions
 # Limits of the rms residual of a model with a drift, and with a lag, relative to that without. For
@@ -25,7 +25,7 @@ _MOST = 50_000  # rows of a fit
 
 
 def residual_findings(
-    log: Log, chain: ArcChain | None, same: NDArray
+    log: Log, chain: ForwardModel | None, same: NDArray
 ) -> Iterator[LogFinding]:
     """Yield findings on a drift of the tip and on lags.
 
@@ -74,7 +74,7 @@ def residual_findings(
         yield LogFinding("lag", "warning", message, advice)
 
 
-def _features(q: NDArray, chain: ArcChain | None) -> NDArray:
+def _features(q: NDArray, chain: ForwardModel | None) -> NDArray:
     """Return the features of a rough linear model of the tip: q, squares and the chain's tips."""
     spans = np.ptp(q, axis=0)
     z = (q - q.mean(axis=0)) / np.where(spans > 0, spans, 1.0)

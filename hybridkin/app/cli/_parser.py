@@ -20,10 +20,10 @@ from hybridkin.app.cli._terminal import write
 from hybridkin.app.cli._values import (
     between,
     count,
+    hysteresis,
     names,
     not_negative,
     numbers,
-    play,
     positive,
     share,
     signs,
@@ -274,7 +274,7 @@ def _fit(command: argparse.ArgumentParser) -> None:
     The fit looks for backlash (also called play), smooth friction and creep: the tip then depends
     on where the tendons came from. They are kept only if they lower the errors on held-out motions.
     Motions must have names, and their rows must be in the order of time; creep also needs --time.
-    --play 0: none of these.
+    --hysteresis 0: none of these.
     """
     add = command.add_argument
     add("log", type=Path, metavar="LOG", help="CSV, npz or parquet file")
@@ -301,12 +301,13 @@ def _fit(command: argparse.ArgumentParser) -> None:
     fast = 'without the hybrid that chooses its error model itself ("auto"); fast; saves the best'
     add("--no-auto", action="store_false", dest="auto", help=fast)
     add(
-        "--play",
-        type=play,
+        "--hysteresis",
+        type=hysteresis,
         default="detect",
         metavar="auto|WIDTH",
-        help='backlash (play) of the actuators in the "auto" hybrid: its total width in the unit '
-        "of q; auto: backlash, friction and creep, found in every fold (auto if the log shows any)",
+        help='hysteresis of the actuators in the "auto" hybrid: the total width of backlash, in '
+        "the unit of q; auto: backlash, friction and creep, found in every fold (auto if the "
+        "log shows any)",
     )
     few = "use the tips of at most N rows, spread over motions; 0: of all rows (2000)"
     number = between(-1, float("inf"), int)

@@ -52,7 +52,7 @@ def names(text: str) -> Sequence[str]:
     return tuple(part.strip() for part in text.split(","))
 
 
-def play(text: str) -> float | str:
+def hysteresis(text: str) -> float | str:
     """Return a width of backlash, "auto" or "detect"."""
     if text in ("auto", "detect"):
         return text

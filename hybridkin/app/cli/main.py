@@ -171,15 +171,15 @@ def _merge(arguments: argparse.Namespace, stages: Stages) -> _Result:
 def _fit(arguments: argparse.Namespace, stages: Stages) -> _Result:
     robot = hybridkin.robots.read_description(arguments.robot)
     log_format = _log_format(arguments, robot.log, arguments.robot)
-    play = arguments.play
-    if isinstance(play, float):
-        play = abs(log_format.q_factor * play).tolist()
+    hysteresis = arguments.hysteresis
+    if isinstance(hysteresis, float):
+        hysteresis = abs(log_format.q_factor * hysteresis).tolist()
     settings = hybridkin.app.workflow.FitSettings(
         loss=arguments.loss,
         coverage=arguments.coverage,
         n_folds=arguments.n_folds,
         auto=arguments.auto,
-        play=play,
+        hysteresis=hysteresis,
         max_rows=arguments.max_rows or None,
     )
     replaced = _replaced_model(arguments)

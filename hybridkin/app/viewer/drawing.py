@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from hybridkin import ArcChain, Chain, Commands, ElasticTendonChain, ForwardModel
+from hybridkin import Chain, Commands, ForwardModel
 from hybridkin.app.viewer.steered import SteeredRobot
 from hybridkin.datasets import Log
 from hybridkin.plots import BackboneDisplay
@@ -35,8 +35,8 @@ class Body:
         self._chain = robot.loaded.chain
         body = _body_of(model, robot)
         self._thick = 0.015 * robot.size
-        if isinstance(self._chain, ArcChain):
-            self._thick = min(self._thick, 0.4 * float(self._chain.radii.min()))
+        least = robot.loaded.module.robot.least_radius
+        self._thick = min(self._thick, 0.4 * least)
         self._backbone = scene.add_spline_catmull_rom(
             "/robot/backbone",
             body.points[0],
@@ -95,14 +95,13 @@ class Body:
 
     def _tensions(self, robot: SteeredRobot) -> tuple[NDArray, NDArray]:
         """Return colours (n, 3) of the actuators, and which are slack (n,)."""
-        chain = self._chain
-        if isinstance(chain, ElasticTendonChain):
-            with torch.no_grad():
-                tension = chain.tensions(torch.from_numpy(robot.q)).numpy()
-            fraction = tension / max(float(tension.max()), 1e-300)
-            return between(BLUE, RED, fraction), tension <= 0.0
-        fraction = (robot.q - robot.limits.q_min) / robot.span
-        return between(RED, BLUE, fraction), np.zeros(len(fraction), dtype=bool)
+        model = robot.loaded.module.robot
+        q = torch.from_numpy(robot.q)
+        low = torch.from_numpy(robot.limits.q_min)
+        with torch.no_grad():
+            pulled = model.pulled(q, low, low + torch.from_numpy(robot.span))
+            slack = model.slack(q)
+        return between(BLUE, RED, pulled.numpy()), slack.numpy()
 
 
 def _body_of(model: Any, robot: SteeredRobot) -> BackboneDisplay:

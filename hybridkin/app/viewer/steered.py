@@ -80,7 +80,7 @@ class SteeredRobot:
         self._close = _CLOSE * self.size
         self._largest_step = speed / RATE
         self._tracker = InverseKinematics(
-            loaded.module,
+            loaded.module.without_hysteresis,
             q_min=limits.q_min,
             q_max=limits.q_max,
             dq_max=speed,

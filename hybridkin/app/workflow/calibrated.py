@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hybridkin import ArcChain, CalibrationResult, Chain
+from hybridkin import CalibrationResult, Chain
 from hybridkin.app.workflow.report import Report, millimetres
 from hybridkin.formats import LogUnit
 
@@ -127,25 +127,18 @@ def _before_and_after(
 
 def _start_value(start: Chain, name: str) -> NDArray:
     """Return the start value of a parameter of `calibrate`."""
-    geometry = {key: value.numpy(force=True) for key, value in start.geometry().items()}
-    if name == "turns" and isinstance(start, ArcChain):
-        counts = np.array(start.actuators_per_segment)
-        first = np.cumsum(counts) - counts
-        return geometry["angles"][first]  # of the first actuator of each ring
-    if name == "tool" and name not in geometry:
-        return geometry["offsets"][-1:]
-    if name == "gain":
-        return geometry["gains"][:1]
-    return geometry[name]
+    part = start.part_of(name)
+    entry = start.geometry()[part.entry].numpy(force=True)
+    if name == "base":
+        return entry
+    return entry.ravel()[part.shown]
 
 
 def _unit(start: Chain, name: str, k: int, q_unit: LogUnit) -> _Unit:
     """Return the unit of the k-th number of a parameter."""
     if name == "base" and k < 3:
         return _DEGREES
-    if name == "actuator_zeros" and isinstance(start, ArcChain) and start.in_metres:
-        return _MILLIMETRES
-    unit = start.unit_of(name)
+    unit = start.unit_of(start.part_of(name).entry)
     if unit.endswith(_PER_UNIT):
         of_what = unit.removesuffix(_PER_UNIT)
         scale, symbol = _SHOWN.get(of_what, (1.0, of_what))
@@ -242,10 +235,9 @@ def deviations(
             "`spool_radius` or `routing` may be wrong, the marker is not at the tip, or tendons "
             "are slack."
         )
-    if not isinstance(start, ArcChain) or not isinstance(result.chain, ArcChain):
-        return
     if "turns" in result.values or "angles" in result.values:
-        change = (result.chain.angles - start.angles).detach().cpu().numpy()
+        before = start.geometry()["angles"].numpy(force=True)
+        change = result.chain.geometry()["angles"].numpy(force=True) - before
         turned = (change - change[0] + np.pi) % (2.0 * np.pi) - np.pi
         most = np.degrees(np.abs(turned).max())
         if most > _TURN:
@@ -256,7 +248,7 @@ def deviations(
             )
     cosine = float(start.base[:3, 2] @ result.chain.base[:3, 2])
     tilt = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
-    if tilt > _TILT and not start.absolute.all():
+    if tilt > _TILT and start.actuator_layout.tendons.any():
         yield (
             f"the calibrated base is tilted by {tilt:.0f} degrees from the description: a wrong "
             "sign of all tendons, which turns the base by 180 degrees about its axis, is then not "

@@ -7,9 +7,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from hybridkin import CrossFit, ELMRegressorCV, HybridForwardModel
+from hybridkin import CrossFit, ELMRegressorCV, HybridForwardModel, Hysteresis
 from hybridkin.app.workflow.report import millimetres
-from hybridkin.chains.hysteresis import HysteresisOperator
 from hybridkin.formats import LogUnit
 
 
@@ -20,7 +19,7 @@ def choice_in_words(model: HybridForwardModel, unit: LogUnit) -> str:
         parameters = ""
         if len(results["mechanical_model"]) > 1:
             parameters = results["parameters"]
-        return _blend_in_words(results["weights"], parameters, model.play_, unit)
+        return _blend_in_words(results["weights"], parameters, model.hysteresis_, unit)
     network = model.error_model_
     if isinstance(network, ELMRegressorCV):
         return network_in_words(network)
@@ -49,7 +48,7 @@ def choices_by_fold(compared: CrossFit, unit: LogUnit) -> list[dict[str, str]]:
             elif len(table.names) > 1:
                 by_name = dict(zip(table.names, weights.tolist(), strict=True))
                 of_fold[name] = _blend_in_words(
-                    by_name, choice.parameters, choice.play, unit
+                    by_name, choice.parameters, choice.hysteresis, unit
                 )
     return words
 
@@ -63,7 +62,7 @@ def _chosen(weights: Mapping[str, float]) -> dict[str, float]:
 def _blend_in_words(
     weights: Mapping[str, float],
     parameters: str,
-    play: HysteresisOperator | None,
+    hysteresis: Hysteresis,
     unit: LogUnit,
 ) -> str:
     """Return the parts, the calibrated parameters and the hysteresis that "auto" chose."""
@@ -74,8 +73,8 @@ def _blend_in_words(
         words = f"blend of {', '.join(parts)}"
     if parameters:
         words += f" on {parameters}"
-    if play is not None:
-        words += f", {play.in_words(unit)}"
+    if hysteresis:
+        words += f", {hysteresis.in_words(unit)}"
     return words
 
 
@@ -104,14 +103,13 @@ def auto_in_words(model: HybridForwardModel, unit: LogUnit) -> list[str]:
         f"{', '.join(listed)}.",
         f"Expected on new motions like these: {expected}.",
     ]
-    if model.play_ is not None:
+    if model.hysteresis_:
         sentences.append(
-            f"The actuators have {model.play_.in_words(unit)}. Predictions depend on the order of "
-            "the rows in a motion, with creep on their times."
+            f"The actuators have {model.hysteresis_.in_words(unit)}. Predictions depend on the "
+            "order of the rows in a motion, with creep on their times."
         )
-    elif model.play is not None:
+    elif model.follows_order:
         sentences.append(
-            "Auto looked for backlash (play), other hysteresis and creep, but none lowered the "
-            "errors."
+            "Auto looked for backlash (play), friction and creep, but none lowered the errors."
         )
     return sentences

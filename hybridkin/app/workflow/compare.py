@@ -9,6 +9,7 @@ from functools import partial
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from sklearn.linear_model import LinearRegression
 from sklearn.pipeline import Pipeline, make_pipeline
 from sklearn.preprocessing import MinMaxScaler, PolynomialFeatures
@@ -19,6 +20,7 @@ from hybridkin import (
     CrossFit,
     ForwardModel,
     HybridForwardModel,
+    Hysteresis,
     cross_fit,
     robots,
 )
@@ -58,10 +60,10 @@ class FitSettings:
     auto : bool
         Whether to compare and save ``error_model="auto"``; it takes most of the time. Without it,
         the comparison has fewer hybrids, and the best of them or the calibrated model is saved.
-    play : float, "auto", "detect" or None
-        Backlash (also called play) of the actuators [m] in that hybrid, see `HybridForwardModel`.
-        It requires `auto`, and named motions in order of time. "detect": "auto" if the log allows
-        it and backlash lowers the held-out errors of a network, else None.
+    hysteresis : float, Hysteresis, "auto" or "detect"
+        Hysteresis of the actuators in that hybrid, see `HybridForwardModel`. It requires `auto`,
+        and named motions in order of time. "detect": "auto" if the log allows it and shows some,
+        else none.
     max_rows : int or None
         Largest number of rows whose measurements count; of a longer log some motions are used, and
         some rows of each. All rows of these motions move the actuators. None: all rows count.
@@ -71,7 +73,7 @@ class FitSettings:
     coverage: float | None = None
     n_folds: int = 5
     auto: bool = True
-    play: float | str | None = "detect"
+    hysteresis: ArrayLike | Hysteresis | str = "detect"
     max_rows: int | None = 2000
 
     def __post_init__(self) -> None:
@@ -81,6 +83,11 @@ class FitSettings:
             whole(self.max_rows, "max_rows", 2)
         if not isinstance(self.auto, bool):
             raise ValueError(f"`auto` must be True or False, got {self.auto!r:.80}.")
+
+    @property
+    def follows_order(self) -> bool:
+        """Whether the order of the rows counts for the hybrid: there may be a hysteresis."""
+        return HybridForwardModel(hysteresis=self.hysteresis).follows_order
 
 
 DEFAULTS = FitSettings()
@@ -225,26 +232,26 @@ def _auto(
         chain,
         "auto",
         calibrate=calibrate,
-        play=settings.play,
+        hysteresis=settings.hysteresis,
         random_state=0,
     )
 
 
-def with_play_detected(
+def with_hysteresis_detected(
     settings: FitSettings, rows: MeasuredLog, mechanical: Mechanical
 ) -> FitSettings:
-    """Return settings whose `play` is not "detect"."""
-    if settings.play != "detect":
+    """Return settings whose `hysteresis` is not "detect"."""
+    if settings.hysteresis != "detect":
         return settings
-    play = None
+    hysteresis = 0.0
     in_order = rows.named and not rows.n_late
     if mechanical.start is not None and settings.auto and in_order:
-        model = HybridForwardModel(mechanical.model, "drop", play="auto")
+        model = HybridForwardModel(mechanical.model, "drop", hysteresis="auto")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             model.fit(rows.commands, rows.x, rows.counts, rows.motions)
-        play = None if model.play_ is None else "auto"
-    return replace(settings, play=play)
+        hysteresis = "auto" if model.hysteresis_ else 0.0
+    return replace(settings, hysteresis=hysteresis)
 
 
 def compare(
@@ -269,7 +276,7 @@ def compare(
     robot : robots.RobotDescription
         Nominal kinematics, and the parameters to calibrate.
     settings : FitSettings
-        Loss, folds and models, see `with_play_detected`.
+        Loss, folds and models, see `with_hysteresis_detected`.
     mechanical : Mechanical
         That of all rows.
     n_jobs, progress
@@ -299,7 +306,7 @@ def compare(
         for name, of_candidate in zip(candidates.names, candidates.tips, strict=True):
             tips[_in_table(name)] = of_candidate
         tips[AUTO] = tips.pop(AUTO)
-    if settings.play is None:  # it is the calibrated model
+    if not settings.follows_order:  # it is the calibrated model
         tips.pop(BACKLASH, None)
     names = sorted(tips, key=lambda name: _KINDS.index(name.partition(",")[0]))
     return replace(

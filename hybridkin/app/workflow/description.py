@@ -34,7 +34,7 @@ class Description:
         That of its chain, see ``Chain.geometry``.
     auto : dict or None
         The choices of "auto", see ``HybridForwardModel.cv_results_``.
-    play : list of float or None
+    hysteresis : list of float or None
         Widths of the hysteresis of one or all actuators, in the unit of the robot's logs.
     domain : Limits or None
         Training range.
@@ -54,7 +54,7 @@ class Description:
     n_actuators: int
     geometry: Mapping[str, Tensor]
     auto: Mapping[str, Any] | None
-    play: list[float] | None
+    hysteresis: list[float] | None
     domain: robots.Limits | None
     log_format: robots.LogFormat
     limits: robots.Limits | None
@@ -86,7 +86,7 @@ def describe(loaded: LoadedModel) -> Report[Description]:
         n_actuators=loaded.n_actuators,
         geometry={} if loaded.chain is None else loaded.chain.geometry(),
         auto=None if hybrid is None else hybrid.cv_results_,
-        play=loaded.play_widths,
+        hysteresis=loaded.hysteresis_widths,
         domain=loaded.trained_range,
         log_format=loaded.log_format(),
         limits=None if robot is None else robot.limits,
@@ -101,8 +101,10 @@ def describe(loaded: LoadedModel) -> Report[Description]:
     else:
         rows = hybrid.html_rows()
     report.verbatim(_in_lines(rows))
-    if loaded.play is not None:
-        report.text(f"The actuators have {loaded.play.in_words(loaded.log_unit)}.")
+    if loaded.hysteresis:
+        report.text(
+            f"The actuators have {loaded.hysteresis.in_words(loaded.log_unit)}."
+        )
     log = record.log_format
     for name, limits in {
         "Training range": record.domain,

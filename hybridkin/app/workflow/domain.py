@@ -6,17 +6,15 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike, NDArray
 
-from hybridkin import ArcChain, ConstantCurvatureChain, InverseKinematics, robots
+from hybridkin import InverseKinematics, robots
 from hybridkin.app.workflow.model import LoadedModel
 from hybridkin.arguments import real_array
 
 _WALKERS = 256
 _STEPS = 60
 _STEP = 0.12  # length of a step, as a share of the range
-_PLANAR = 1e-9  # relative cut-off of singular values, for tendons in one plane
 _NAMES = ("q_min", "q_max", "dq_max", "ddq_max")
 
 
@@ -94,8 +92,8 @@ def path_limits(
     trained = robots.Limits()
     if within_fit or not _has_ends(described):
         trained = loaded.trained_range or trained
-    limits = dict(vars(described.narrowed(loaded.half_play).intersect(trained)))
-    given = vars(robots.Limits(**overrides).narrowed(loaded.half_play))
+    limits = dict(vars(described.narrowed(loaded.half_width).intersect(trained)))
+    given = vars(robots.Limits(**overrides).narrowed(loaded.half_width))
     for name in overrides:
         limit = given[name]
         # Of one given end, scaled to actuators of both signs, some entries are open.
@@ -158,7 +156,7 @@ class Domain:
         middle = 0.5 * (np.asarray(spanned.q_min) + np.asarray(spanned.q_max))
         middle = self._bent(middle)
         candidates = [middle]
-        if self.tendons is not None:
+        if self.all_tendons:
             candidates.append(self.rest)
             if trained is None:
                 candidates.reverse()
@@ -177,21 +175,21 @@ class Domain:
         """Return a configuration (n,) without a common pull of the tendons."""
         return self.rest + (q - self.rest) @ self.bending
 
+    @cached_property
+    def _actuators(self) -> robots.ActuatorLayout:
+        return self.loaded.module.robot.actuator_layout
+
     @property
-    def tendons(self) -> ArcChain | None:
-        """The chain if all its actuators are tendons of given lengths, else None."""
-        chain = self.loaded.chain
-        if isinstance(chain, ArcChain) and chain.takes_lengths:
-            return None if any(chain.extensible) else chain
-        return None
+    def all_tendons(self) -> bool:
+        """Whether all actuators are tendons of given length."""
+        return bool(self._actuators.tendons.all())
 
     @property
     def rest(self) -> NDArray:
         """The command (n,) at which no tendon is pulled; for other robots zero."""
-        chain = self.tendons
-        if chain is None:
-            return np.zeros(self.loaded.n_actuators)
-        return chain.rest.numpy(force=True)
+        if self.all_tendons:
+            return self._actuators.rest
+        return np.zeros(self.loaded.n_actuators)
 
     @cached_property
     def sample(self) -> tuple[NDArray, NDArray]:
@@ -249,7 +247,7 @@ class Domain:
     @property
     def of_commands(self) -> tuple[NDArray, NDArray]:
         """Limits of commands, which lead what the actuators do by up to half the width."""
-        half = self.loaded.half_play
+        half = self.loaded.half_width
         return self.limits.q_min - half, self.limits.q_max + half
 
     def postures(self, n: int) -> NDArray:
@@ -261,38 +259,9 @@ class Domain:
         low = self.limits.q_min
         high = self.limits.q_max
         q = np.random.default_rng(0).uniform(low, high, (n, len(low)))
-        chain = self.tendons
-        if chain is None:
-            return q
-        rest = self.rest
-        gains = chain.gains.numpy(force=True)  # balanced in metres
-        low, high = np.sort([gains * (low - rest), gains * (high - rest)], axis=0)
-        pulled = gains * (q - rest)
-        angles = chain.angles.numpy(force=True)
-        first = 0
-        for count in chain.actuators_per_segment:
-            ring = slice(first, first + count)
-            first += count
-            axes = np.stack([np.cos(angles[ring]), np.sin(angles[ring])], axis=1)
-            balanced = pulled[:, ring] @ axes @ np.linalg.pinv(axes, rcond=_PLANAR)
-            excess = (balanced - high[ring]).max(axis=1, keepdims=True)
-            pulled[:, ring] = balanced - excess.clip(min=0.0)
-        within = ((pulled >= low) & (pulled <= high)).all(axis=1)
-        return rest + pulled[within] / gains
+        return self.loaded.module.robot.balanced(q, low, high)
 
     @cached_property
     def bending(self) -> NDArray:
-        """The projector (n, n) of rows q on those that bend a plain tendon chain, else identity.
-
-        The bendings of such a chain are linear in q and do not depend on the common pull of its
-        tendons, which is one in metres.
-        """
-        chain = self.loaded.chain
-        if not isinstance(chain, ConstantCurvatureChain) or any(chain.extensible):
-            return np.eye(self.loaded.n_actuators)
-        zero = torch.from_numpy(np.zeros(chain.n_actuators))
-        slopes = torch.func.jacrev(lambda row: chain.arcs(row)[1].ravel())(zero)
-        gains = chain.gains.numpy(force=True)
-        slopes = slopes.numpy(force=True) / gains
-        of_metres = np.linalg.pinv(slopes, rcond=_PLANAR) @ slopes
-        return gains[:, None] * of_metres / gains
+        """The projector (n, n) of rows q on those that bend a plain tendon chain, else identity."""
+        return self.loaded.module.robot.effective_directions()

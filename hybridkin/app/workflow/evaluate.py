@@ -138,8 +138,8 @@ def evaluate_log(
     loaded.check_columns(log.q)
     measured = checked(log, None, base_is_free=False)
     measured.check(force)
-    if loaded.play is not None:
-        measured.check_order("A model with backlash (play)")
+    if loaded.hysteresis:
+        measured.check_order("A model with hysteresis")
     predicted = loaded.predict(measured.commands)
     markers = marker_distances(predicted, log.x)
     errors = _row_errors(loaded, measured.commands, markers)

@@ -30,20 +30,21 @@ def explained_in_words(
     """
     static = {}
     for name, errors in held_out.items():
-        if model.play is None or name.startswith("data-driven") or name == CALIBRATED:
+        of_q = name.startswith("data-driven") or name == CALIBRATED
+        if of_q or not model.follows_order:
             static[name] = errors.mean
     best = min(static, key=static.__getitem__)
     words = (
         f"Of the errors on held-out motions, the best function of q ({best}) leaves "
         f"{millimetres(static[best])}"
     )
-    if model.play_ is not None:
+    if model.hysteresis_:
         words += f", and {AUTO}, with hysteresis, {millimetres(held_out[AUTO].mean)}"
     log = rows.measured
     x = log.x[:, -3:]
     measured = np.isfinite(x).all(axis=1)
     inputs = {"functions of q": log.q}
-    if model.play_ is not None:
+    if model.hysteresis_:
         moved = model.effective(rows.commands)[rows.counted]
         inputs["those of what the actuators do"] = moved
     for name, q in inputs.items():

@@ -90,9 +90,9 @@ def _about_q(loaded: LoadedModel) -> str:
         terms.append(f"q[{i}] = {factors[i]:g} * {name}")
     unit = "" if log.q_unit == "1" else f" in {log.q_unit}"
     about_q = f"q from the columns of the log{unit}: {', '.join(terms)}."
-    if loaded.play is None:
+    if not loaded.hysteresis:
         return about_q
     return (
-        f"{about_q} The actuators have {loaded.play.in_words(loaded.log_unit)}: x(q) is that of "
-        "what the actuators do; steps return commands for it."
+        f"{about_q} The actuators have {loaded.hysteresis.in_words(loaded.log_unit)}: x(q) is "
+        "that of what the actuators do; steps return commands for it."
     )

@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 
 import hybridkin
-from hybridkin import ArcChain, Commands
+from hybridkin import Commands
 from hybridkin.app.workflow.model import LoadedModel
 from hybridkin.app.workflow.report import Progress, Report, quiet
 from hybridkin.app.workflow.track import LEAD_IN, TARGET, read_track
@@ -72,7 +72,7 @@ def animate_track(
         t=log.time,
         tips=loaded.tips(q),
         expected=None if promised is None else promised.mean,
-        names=loaded.log_format().q if isinstance(loaded.chain, ArcChain) else (),
+        names=loaded.log_format().q if loaded.chain.rings else (),
         n_frames=n_frames,
     )
     try:

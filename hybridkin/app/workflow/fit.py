@@ -25,7 +25,7 @@ from hybridkin.app.workflow.compare import (
     FitSettings,
     Mechanical,
     compare,
-    with_play_detected,
+    with_hysteresis_detected,
 )
 from hybridkin.app.workflow.counts import Counts
 from hybridkin.app.workflow.errors import HeldOutErrors, Promise, marker_distances
@@ -104,8 +104,8 @@ def fit_log(
     messages = [*mechanical.messages, *_suspicions(measured, mechanical)]
     for message in messages:
         warnings.warn(message, stacklevel=2)
-    settings = with_play_detected(settings, rows, mechanical)
-    if settings.play is None:
+    settings = with_hysteresis_detected(settings, rows, mechanical)
+    if not settings.follows_order:
         rows = measured
     compared = compare(
         rows, robot, settings, mechanical, n_jobs=n_jobs, progress=progress
@@ -173,14 +173,14 @@ def _check(
             "`groups` must name at least 3 motions, one to hold out and two to choose by, but the "
             f"log has {n_motions}; name another column: --groups COLUMN."
         )
-    if settings.play in (None, "detect"):
+    if settings.hysteresis == "detect" or not settings.follows_order:
         return
     if robot.chain is None or not settings.auto or not log.named:
         raise ValueError(
-            "`play` requires a robot with segments, `auto=True` (no --no-auto), and motions that a "
-            "column names (--groups COLUMN, or groups = in [log])."
+            "`hysteresis` requires a robot with segments, `auto=True` (no --no-auto), and motions "
+            "that a column names (--groups COLUMN, or groups = in [log])."
         )
-    log.check_order("`play`")
+    log.check_order("`hysteresis`")
 
 
 def _suspicions(log: MeasuredLog, mechanical: Mechanical) -> list[str]:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Self
 
-from hybridkin import ArcChain, Chain, Commands, robots
+from hybridkin import Chain, Commands, robots
 from hybridkin.app import LogReport, check_log
 from hybridkin.app.workflow.report import Report
 from hybridkin.datasets import Log, load_log
@@ -260,9 +260,8 @@ def checked(log: Log, chain: Chain | None, base_is_free: bool) -> MeasuredLog:
 def _check(
     log: Log, chain: Chain | None, base_is_free: bool = True, drop_invalid: bool = True
 ) -> LogReport:
-    arcs = chain if isinstance(chain, ArcChain) else None
     return check_log(
-        log, chain=arcs, base_is_free=base_is_free, drop_invalid=drop_invalid
+        log, chain=chain, base_is_free=base_is_free, drop_invalid=drop_invalid
     )
 
 

@@ -11,7 +11,14 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 import hybridkin
-from hybridkin import ArcChain, Chain, Commands, ForwardModel, as_forward_model, robots
+from hybridkin import (
+    Chain,
+    Commands,
+    ForwardModel,
+    Hysteresis,
+    as_forward_model,
+    robots,
+)
 from hybridkin._core.digests import row_digests
 from hybridkin.app.workflow.errors import ExpectedErrors, HeldOutErrors, Promise
 from hybridkin.arguments import as_path, shaped
@@ -21,7 +28,6 @@ from hybridkin.saving.header import model_header
 
 if TYPE_CHECKING:
     from hybridkin import ELMRegressor, HybridForwardModel
-    from hybridkin.chains.hysteresis import HysteresisOperator
 
 LOG_SUFFIXES = (".csv", ".tsv", ".txt", ".npz", ".parquet", ".pq")
 """Endings of files that are treated as logs."""
@@ -99,18 +105,16 @@ class LoadedModel:
         return robots.Limits(*self.hybrid.training_range_)
 
     @property
-    def play(self) -> HysteresisOperator | None:
-        """The hysteresis of the actuators, None without."""
+    def hysteresis(self) -> Hysteresis:
+        """The hysteresis of the actuators, maybe none."""
         if self.hybrid is None:
-            return None
-        return self.hybrid.play_
+            return Hysteresis()
+        return self.hybrid.hysteresis_
 
     @property
-    def half_play(self) -> NDArray | float:
-        """Half the width of the backlash, in the unit of q; 0 without."""
-        if self.play is None:
-            return 0.0
-        return 0.5 * self.play.width
+    def half_width(self) -> NDArray:
+        """Half the width of the hysteresis, in the unit of q; 0 without."""
+        return 0.5 * self.hysteresis.width
 
     @property
     def log_unit(self) -> LogUnit:
@@ -118,12 +122,12 @@ class LoadedModel:
         return LogUnit.of(self.log_format().q_unit)
 
     @property
-    def play_widths(self) -> list[float] | None:
+    def hysteresis_widths(self) -> list[float] | None:
         """Widths of the hysteresis of one or all actuators, in the unit of logs; None without."""
-        if self.play is None:
+        if not self.hysteresis:
             return None
         size = UNITS.get(self.log_format().q_unit, 1.0)
-        return np.ravel(self.play.width / size).tolist()
+        return np.ravel(self.hysteresis.width / size).tolist()
 
     def effective(self, commands: ArrayLike | Commands) -> NDArray:
         """Return what the actuators do for commands (N, n)."""
@@ -137,10 +141,8 @@ class LoadedModel:
 
         The times (N,) of the rows matter with creep [s]; without them the robot rests at each row.
         """
-        if self.play is None:
-            return q
         steps = _LONG if time is None else np.diff(time, prepend=time[:1])
-        commands, _ = self.play.command(q, dt=steps)
+        commands, _ = self.hysteresis.command(q, dt=steps)
         return commands
 
     def predict(self, commands: ArrayLike | Commands) -> NDArray:
@@ -264,9 +266,7 @@ class LoadedModel:
         if self.description is not None and self.description.log is not None:
             return self.description.log
         names = tuple(f"q{i + 1}" for i in range(self.n_actuators))
-        unit = "m"
-        if isinstance(self.chain, ArcChain) and not self.chain.in_metres:
-            unit = "1"
+        unit = "m" if self.module.robot.in_metres else "1"
         return robots.LogFormat(names, ("x", "y", "z"), unit)
 
 

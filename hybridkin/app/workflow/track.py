@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import hybridkin
-from hybridkin import ArcChain, IKStatus, Track, robots, trajectories
+from hybridkin import IKStatus, Track, robots, trajectories
 from hybridkin.app.workflow.counts import Counts
 from hybridkin.app.workflow.domain import Domain, PathLimits, path_limits
 from hybridkin.app.workflow.errors import Errors
@@ -74,7 +74,7 @@ class TrackRecord:
         "before" and "after": mean error of the solver before and after commands were rounded [m].
     backend : str
         What computed the steps: "compiled", or "torch: " and the reason.
-    play : list of float or None
+    hysteresis : list of float or None
         Widths of the hysteresis of one or all actuators, in the unit of the robot's logs.
     lead_in : int
         Number of rows that lead from the robot's configuration to the path.
@@ -99,7 +99,7 @@ class TrackRecord:
     expected_inside: Mapping[str, float]
     rounded: Mapping[str, float] | None
     backend: str
-    play: list[float] | None
+    hysteresis: list[float] | None
     lead_in: int
     limits: PathLimits
     delay: float = 0.0
@@ -130,11 +130,11 @@ def _write(report: Report[TrackRecord], loaded: LoadedModel, better: str) -> Non
         f"Period: {duration_in_words(record.period)} from row to row. Send the commands at these "
         "times: lag and creep are those of this pace."
     )
-    if loaded.play is not None:
+    if loaded.hysteresis:
         report.text(
-            f"The actuators have {loaded.play.in_words(loaded.log_unit)}: a command crosses the "
-            "width when its actuator reverses, and leads where they creep. Send q; effective_... "
-            "is the motion of the actuators."
+            f"The actuators have {loaded.hysteresis.in_words(loaded.log_unit)}: a command crosses "
+            "the width when its actuator reverses, and leads where they creep. Send q; "
+            "effective_... is the motion of the actuators."
         )
     if loaded.plane_in_words():
         report.text("{plane}", plane=loaded.plane_in_words())
@@ -254,7 +254,7 @@ def track_path(
     stands = _start(domain, start)
     check_reach(domain, path, tol, out_of_reach, progress)
     attempts = Attempts(progress)
-    if loaded.play is None or stands is None:
+    if not loaded.hysteresis or stands is None:
         track = best_track(domain, path, tol, attempts)
         lead_in = _lead_in(track, stands, domain)
     else:
@@ -299,7 +299,7 @@ def track_path(
         expected_inside=_expected(loaded, track, track.status == IKStatus.CONVERGED),
         rounded=rounded,
         backend=domain.solver().tracker(track.q[0]).backend,
-        play=loaded.play_widths,
+        hysteresis=loaded.hysteresis_widths,
         lead_in=n_lead,
         limits=domain.limits,
         delay=delay,
@@ -308,7 +308,7 @@ def track_path(
     report = Report(f"{loaded.name}: a path of {len(path)} points", record)
     _write(report, loaded, better)
     commands = {"command": whole.q}
-    if loaded.play is not None:
+    if loaded.hysteresis:
         commands["actuator"] = whole.effective
     _add_path(report, loaded, track)
     _add_commands(report, domain, whole.t, commands, n_lead)
@@ -344,7 +344,7 @@ def _start(domain: Domain, start: ArrayLike | str) -> NDArray | None:
         if start == "path":
             return None
         if start == "rest":
-            if domain.tendons or ((low <= 0) & (high >= 0)).all():
+            if domain.all_tendons or ((low <= 0) & (high >= 0)).all():
                 return domain.rest
             return domain.preferred
         raise ValueError(f'`start` must be "rest", "path" or numbers, got {start!r}.')
@@ -367,10 +367,10 @@ def _lead_in(track: Track, start: NDArray | None, domain: Domain) -> NDArray:
         return track.q[:1]
     limits = domain.limits
     end = track.effective[0]
-    play = domain.loaded.play
-    if play is not None:
+    hysteresis = domain.loaded.hysteresis
+    if hysteresis:
         # With creep only a start: the track then begins with the state after these commands.
-        led, _ = play.command(np.stack([start, end]), dt=1.0)
+        led, _ = hysteresis.command(np.stack([start, end]), dt=1.0)
         end = led[1].clip(*domain.of_commands)
     way = end - start
     dt = _period(track)
@@ -398,8 +398,8 @@ def _with_lead_in(track: Track, lead_in: NDArray, loaded: LoadedModel) -> Track:
     n = len(lead_in)
     dt = _period(track)
     effective = lead_in
-    if loaded.play is not None and n > 0:
-        effective, _ = loaded.play.apply(lead_in, None, dt)
+    if loaded.hysteresis and n > 0:
+        effective, _ = loaded.hysteresis.apply(lead_in, None, dt)
     x = loaded.tips(effective)
     return replace(
         track,
@@ -446,9 +446,9 @@ def best_track(
     """
     commands, tips = domain.sample
     state = None
-    if lead_in is not None and domain.loaded.play is not None:
+    if lead_in is not None and domain.loaded.hysteresis:
         commands = lead_in[-1]
-        _, state = domain.loaded.play.apply(lead_in, None, _period(path))
+        _, state = domain.loaded.hysteresis.apply(lead_in, None, _period(path))
     way = np.linalg.norm(np.diff(path.x, axis=0), axis=1).max(initial=0.0)
     extent = np.linalg.norm(np.ptp(tips, axis=0))
     least = max(1, math.ceil(way / (_STEP * extent)))
@@ -489,11 +489,11 @@ def _alone(track: Track, domain: Domain, tol: float, state: Any) -> Track:
     With hysteresis other commands can do the same at the points: what an actuator does between
     them, such as a reversal, depends on all commands. The better ones of both are kept.
     """
-    play = domain.loaded.play
-    if play is None:
+    hysteresis = domain.loaded.hysteresis
+    if not hysteresis:
         return track
     commands = [track.q]
-    exact, _ = play.command(track.effective, state, _steps(track))
+    exact, _ = hysteresis.command(track.effective, state, _steps(track))
     exact = _within_speeds(exact.clip(*domain.of_commands), track, domain)
     if exact is not None:
         commands.append(exact)
@@ -531,8 +531,8 @@ def _with_commands(
     """Return a track with commands q (N, n) that are sent alone, and what they do."""
     loaded = domain.loaded
     effective = q
-    if loaded.play is not None:
-        effective, _ = loaded.play.apply(q, state, _steps(track))
+    if loaded.hysteresis:
+        effective, _ = loaded.hysteresis.apply(q, state, _steps(track))
     x = loaded.tips(effective)
     sent = replace(track, q=q, effective=effective, x=x)
     return domain.solver().judged(sent, tol=tol)
@@ -547,10 +547,10 @@ def _rounded(q: NDArray, counts: Counts, domain: Domain) -> NDArray:
 
 def _state_after(lead_in: NDArray, track: Track, domain: Domain) -> Any:
     """Return the state of the hysteresis after the commands of a lead-in, None without."""
-    play = domain.loaded.play
-    if play is None or len(lead_in) < 2:
+    hysteresis = domain.loaded.hysteresis
+    if not hysteresis or len(lead_in) < 2:
         return None
-    return play.apply(lead_in, None, _period(track))[1]
+    return hysteresis.apply(lead_in, None, _period(track))[1]
 
 
 def read_track(path: str | Path, log_format: robots.LogFormat) -> Log:
@@ -633,9 +633,8 @@ def _add_commands(
     """Add the commands and their limits, in names, unit and sign of the robot's logs."""
     loaded = domain.loaded
     log_format = loaded.log_format()
-    counts: tuple[int, ...] = (loaded.n_actuators,)
-    if isinstance(loaded.chain, ArcChain):
-        counts = loaded.chain.actuators_per_segment
+    rings = loaded.module.robot.rings or (slice(0, loaded.n_actuators),)
+    counts = [ring.stop - ring.start for ring in rings]
     n = len(counts)
     figure, axes = hybridkin.plots.new_figure(
         7.0, 1.0 + 1.8 * n, n, 1, sharex=True, squeeze=False

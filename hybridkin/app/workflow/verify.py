@@ -367,11 +367,8 @@ def _evidence(
     order = np.argsort(rows, kind="stable")
     rows = rows[order]
     q = motion[rows]
-    robot = loaded.module
-    if loaded.chain is not None:
-        robot = loaded.chain
+    robot = loaded.module.robot
     bodies = [body.tip_model for body in (robot, *robot.softer())]
-    layout = robot.actuator_layout
     off_plane = _off_plane(loaded, q)
     low = motion.min(axis=0)
     high = motion.max(axis=0)
@@ -386,7 +383,7 @@ def _evidence(
         x=x[order],
         model=loaded.module,
         bodies=bodies,
-        actuators=_actuators(loaded.log_format(), layout),
+        actuators=_actuators(loaded.log_format(), robot.actuator_layout),
         inside=loaded.domain_distance(q - off_plane) <= 1.0,
         off_plane=off_plane,
         promised=expected,

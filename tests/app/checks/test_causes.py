@@ -6,7 +6,7 @@ import torch
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from hybridkin import ConstantCurvatureChain, CreepOperator, PlayOperator
+from hybridkin import ConstantCurvatureChain, Hysteresis
 from hybridkin.app.checks.causes.alignment import Alignment, FreeBase, FreeOrigin
 from hybridkin.app.checks.causes.comparison import CAUSES, compare_causes
 from hybridkin.app.checks.causes.evidence import Actuators, Evidence
@@ -90,9 +90,9 @@ FAULTS = {
     "dead": (with_column(2, lambda q: 0.11 + 0.0 * q), "dead actuator", "m3 stands at +110 mm"),
     "swap": (tips(Q[:, [0, 4, 2, 3, 1, 5]]), "two actuators swapped", "m2 and m5"),
     "numbering": (tips(Q[:, [0, 2, 1, 3, 5, 4]]), "numbering in the other direction", ""),
-    "backlash": (tips(PlayOperator(4e-3).apply(Q)[0]), "backlash", "4 mm wide"),
+    "backlash": (tips(Hysteresis.backlash(4e-3).apply(Q)[0]), "backlash", "4 mm wide"),
     "creep": (
-        tips(CreepOperator([0.3], [2.0]).apply(Q, dt=np.full(N, PERIOD))[0]),
+        tips(Hysteresis.creep([0.3], [2.0]).apply(Q, dt=np.full(N, PERIOD))[0]),
         "creep",
         "30 % of every change comes with a time constant of 2 s",
     ),
@@ -156,7 +156,7 @@ def test_what_cannot_be_told_apart_is_said_with_the_motion_that_can():
     """Where one actuator moves alone at one speed, backlash and a late camera are alike."""
     q = np.repeat(Q[:1], N, axis=0)
     q[:, 2] += 0.02 * np.linspace(0.0, 1.0, N)  # never reversed
-    x = tips(PlayOperator(2e-3).apply(q)[0])
+    x = tips(Hysteresis.backlash(2e-3).apply(q)[0])
     compared = compare_causes(evidence(x, q))
     names = {compared.likely.name, *(e.name for e in compared.also)}
     assert {"backlash", "lag"} <= names

@@ -34,7 +34,7 @@ def test_every_command_has_help_with_exit_codes(command, capsys):
         ["fit"],
         ["animate", "model", "track", "--out", "a.gif", "--frames", "0"],
         ["track", "model", "--shape", "line", "--tol", "-1", "--out", "out"],
-        ["fit", "l", "--robot", "r", "--play", "-1", "--out", "out"],
+        ["fit", "l", "--robot", "r", "--hysteresis", "-1", "--out", "out"],
         ["fit", "l", "--robot", "r", "--folds", "1", "--out", "out"],
         ["track", "model", "--shape", "line", "--size", "1,a,0", "--out", "out"],
     ],

@@ -194,36 +194,38 @@ def test_describe_tells_what_a_model_is(fitted, capsys):
 
 
 @pytest.mark.parametrize(
-    ("option", "play"), [("auto", "auto"), ("0.4", 4e-4), ("0", 0.0), (None, "detect")]
+    ("option", "setting"), [("auto", "auto"), ("0.4", 4e-4), ("0", 0.0), (None, "detect")]
 )
-def test_play_reaches_the_fit_in_metres(log, robot, tmp_path, monkeypatch, option, play):
+def test_hysteresis_reaches_the_fit_in_metres(log, robot, tmp_path, monkeypatch, option, setting):
     seen = []
 
     def fit_log(*_, settings, **__):
-        seen.append(settings.play)
+        seen.append(settings.hysteresis)
         raise ValueError("enough")
 
     monkeypatch.setattr(workflow, "fit_log", fit_log, raising=False)
     arguments = ["fit", log, "--robot", robot, "--out", tmp_path / "m"]
-    arguments += [] if option is None else ["--play", option]
+    arguments += [] if option is None else ["--hysteresis", option]
     assert main([str(argument) for argument in arguments]) == 2
-    assert seen == [play]
-    assert type(seen[0]) is type(play)
+    assert seen == [setting]
+    assert type(seen[0]) is type(setting)
 
 
-def test_play_is_a_width_in_the_unit_of_q_of_every_actuator(log, robot, tmp_path, monkeypatch):
+def test_hysteresis_is_a_width_in_the_unit_of_q_of_every_actuator(
+    log, robot, tmp_path, monkeypatch
+):
     """Of motors whose signs differ: a width has no sign."""
     seen = []
 
     def fit_log(*_, settings, **__):
-        seen.append(settings.play)
+        seen.append(settings.hysteresis)
         raise ValueError("enough")
 
     monkeypatch.setattr(workflow, "fit_log", fit_log, raising=False)
     text = ROBOT.replace("q_sign = -1", "q_sign = [1, -1, 1, -1, 1, -1]")
     text = text.replace('q_unit = "mm"', 'q_unit = "deg"').partition("[limits]")[0]
     robot.write_text(text.replace("radius = 0.0055", "radius = 0.0055\nspool_radius = 0.006"))
-    arguments = ["fit", log, "--robot", robot, "--out", tmp_path / "m", "--play", "2"]
+    arguments = ["fit", log, "--robot", robot, "--out", tmp_path / "m", "--hysteresis", "2"]
     assert main([str(argument) for argument in arguments]) == 2
     np.testing.assert_allclose(seen[0], np.full(6, np.radians(2.0)))
 

@@ -8,7 +8,7 @@ import torch
 from simulated_log import COLUMNS, ROBOT, document, rows, run
 
 import hybridkin
-from hybridkin import IKStatus, PlayOperator, save_model
+from hybridkin import Hysteresis, IKStatus, save_model
 from hybridkin.app import workflow
 from hybridkin.app.workflow import Counts
 from hybridkin.app.workflow.domain import Domain
@@ -19,14 +19,14 @@ PROMISE = {"at_rows": 1e-3, "per_distance": 0.0, "p95": 2.0}
 EIGHT = ["--shape", "figure-eight", "--size", "20,10", "--duration", "2", "--dt", "0.05"]
 
 
-def saved(home, play=None, **notes):
+def saved(home, hysteresis=0.0, **notes):
     """Return a folder with a model of a simulated log whose errors are those of PROMISE."""
     table = rows()
     q = -1e-3 * table[:, 1:7]
-    moved = q if play is None else PlayOperator(play).apply_by_group(q, table[:, 10])
+    moved = Hysteresis.backlash(hysteresis).apply_by_group(q, table[:, 10])
     with torch.no_grad():
         x = CHAIN(torch.from_numpy(moved)).numpy() + 5e-4 * np.sin(200 * moved[:, :3])
-    model = hybridkin.HybridForwardModel(CHAIN, "quadratic", play=play)
+    model = hybridkin.HybridForwardModel(CHAIN, "quadratic", hysteresis=hysteresis)
     model.fit(q, x, groups=table[:, 10])
     (home / "robot.toml").write_text(ROBOT)
     held_out = {"hybrid": {"mean": 1e-3, "p95": 2e-3}}
@@ -48,7 +48,7 @@ def home(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def playful(tmp_path_factory):
-    return saved(tmp_path_factory.mktemp("playful"), play=4e-4)
+    return saved(tmp_path_factory.mktemp("playful"), hysteresis=4e-4)
 
 
 def line_to(home, end, n=21):
@@ -159,7 +159,7 @@ def test_errors_and_statuses_are_those_of_the_commands_alone(playful, dq_max):
     size = (0.03, 0.015)
     path = workflow.shape_path(loaded, limits, "figure-eight", size, duration=4.0, dt=0.2)
     track = best_track(domain, path, 1e-4, Attempts(lambda *_: None))
-    effective, _ = PlayOperator(4e-4).apply(track.q)
+    effective, _ = Hysteresis.backlash(4e-4).apply(track.q)
     np.testing.assert_allclose(track.effective, effective, rtol=0, atol=1e-15)
     error = np.linalg.norm(loaded.tips(effective) - path.x, axis=1)
     np.testing.assert_allclose(track.error, error, rtol=0, atol=1e-12)

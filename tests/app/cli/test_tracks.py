@@ -8,14 +8,7 @@ import torch
 from simulated_log import COLUMNS, ROBOT, document, rows, run, write
 
 import hybridkin
-from hybridkin import (
-    PlayOperator,
-    datasets,
-    load_model,
-    robots,
-    save_model,
-    trajectories,
-)
+from hybridkin import Hysteresis, datasets, load_model, robots, save_model, trajectories
 from hybridkin.app import workflow
 
 SHAPE = ["--shape", "figure-eight", "--unit", "mm", "--dt", "0.1"]
@@ -168,7 +161,7 @@ def test_track_of_a_shape_can_be_sent_and_read_back(fitted, tmp_path, capsys):
     assert code == 0
     assert record["reached"] == record["n"] == 41
     assert record["limits"]["source"] == "robot description, within the training range"
-    assert (record["in_domain"], record["play"]) == (1.0, None)
+    assert (record["in_domain"], record["hysteresis"]) == (1.0, None)
     # What the file says, in the robot's units and sign, leads the model where it says.
     target = ["target_x", "target_y", "target_z"]
     units = {"q_unit": "mm", "x_unit": "mm", "q_sign": -1}
@@ -245,12 +238,12 @@ def playful(tmp_path_factory):
     """A folder with a model whose actuators have play, its robot and a log of it."""
     home = tmp_path_factory.mktemp("playful")
     table = rows()
-    q = PlayOperator(4e-4).apply_by_group(-1e-3 * table[:, 1:7], table[:, 10])
+    q = Hysteresis.backlash(4e-4).apply_by_group(-1e-3 * table[:, 1:7], table[:, 10])
     with torch.no_grad():
         table[:, 7:10] = 1e3 * (CHAIN(torch.from_numpy(q)).numpy() + 5e-4 * np.sin(200 * q[:, :3]))
     write(home / "log.csv", table)
     (home / "robot.toml").write_text(ROBOT)
-    model = hybridkin.HybridForwardModel(CHAIN, "quadratic", play=4e-4)
+    model = hybridkin.HybridForwardModel(CHAIN, "quadratic", hysteresis=4e-4)
     model.fit(-1e-3 * table[:, 1:7], 1e-3 * table[:, 7:10], groups=table[:, 10])
     save_model(model, home / "model.safetensors")
     return home
@@ -301,15 +294,15 @@ def test_code_and_trackers_tell_unit_sign_and_backlash_of_q(playful, tmp_path, c
 
 
 @pytest.mark.slow
-def test_track_with_play_tells_what_to_send_and_what_it_does(playful, tmp_path, capsys):
+def test_track_with_hysteresis_tells_what_to_send_and_what_it_does(playful, tmp_path, capsys):
     out = tmp_path / "track"
     shape = ["--shape", "figure-eight", "--size", "20,10", "--duration", "2", "--dt", "0.05"]
     code, record = document(capsys, "track", playful, *shape, "--out", out)
-    assert (code, record["play"]) == (0, [0.4])
+    assert (code, record["hysteresis"]) == (0, [0.4])
     table = np.genfromtxt(out / "track.csv", delimiter=",", names=True, dtype=None, encoding=None)
     sent = -1e-3 * np.column_stack([table[name] for name in COLUMNS])
     does = -1e-3 * np.column_stack([table[f"effective_{name}"] for name in COLUMNS])
-    np.testing.assert_allclose(PlayOperator(4e-4).apply(sent)[0], does, atol=1e-10)
+    np.testing.assert_allclose(Hysteresis.backlash(4e-4).apply(sent)[0], does, atol=1e-10)
     assert np.abs(sent - does).max() == pytest.approx(2e-4)
     assert np.abs(sent).max() <= 0.006
     steps = np.abs(np.diff(sent, axis=0))

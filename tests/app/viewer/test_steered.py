@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybridkin import ConstantCurvatureChain, HybridForwardModel, PlayOperator, robots
+from hybridkin import ConstantCurvatureChain, HybridForwardModel, Hysteresis, robots
 from hybridkin.app.viewer.steered import RATE, SteeredRobot
 from hybridkin.app.workflow import LoadedModel, path_limits
 
@@ -77,14 +77,14 @@ def test_commands_lead_the_play_and_are_in_the_unit_of_the_log():
     bends = 0.002 * rng.uniform(-1, 1, (60, 2))
     angles = 2 * np.pi / 3 * np.arange(3)
     q = bends @ np.stack([np.cos(angles), np.sin(angles)])
-    model = HybridForwardModel(chain, "drop", play=0.0004)
+    model = HybridForwardModel(chain, "drop", hysteresis=0.0004)
     x = HybridForwardModel(chain, "drop").fit(q, np.zeros((60, 3))).predict(q)
     robot = steered(model.fit(q, x, groups=np.arange(60) // 20))
     for sign in (1.0, -1.0):
         robot.go_to(robot.q + sign * np.array([5e-4, -2.5e-4, -2.5e-4]))
         run(robot, 200)
     commands = robot.commands()
-    motion, _ = PlayOperator(0.0004).apply(commands)
+    motion, _ = Hysteresis.backlash(0.0004).apply(commands)
     assert motion[-1] == pytest.approx(robot.q, abs=1e-12)
     assert np.abs(commands[-1] - robot.q).max() == pytest.approx(0.0002)
 

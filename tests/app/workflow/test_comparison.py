@@ -17,7 +17,7 @@ from hybridkin.app.workflow.compare import (
     _models_for,
     compare,
     models_of,
-    with_play_detected,
+    with_hysteresis_detected,
 )
 from hybridkin.app.workflow.log import checked
 from hybridkin.hybrid.cross_fit import _held_out_anew, _WeightedLog
@@ -41,12 +41,14 @@ def compared(robot, rows, **settings):
     """Return the calibration to all rows, the comparison, and its settings."""
     settings = FitSettings(**settings)
     mechanical = Mechanical.of(robot, rows, settings.loss)
-    settings = with_play_detected(settings, rows, mechanical)
+    settings = with_hysteresis_detected(settings, rows, mechanical)
     return mechanical, compare(rows, robot, settings, mechanical, n_jobs=1), settings
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("settings", [{}, {"play": 1e-3}, {"auto": False}, {"loss": "soft_l1"}])
+@pytest.mark.parametrize(
+    "settings", [{}, {"hysteresis": 1e-3}, {"auto": False}, {"loss": "soft_l1"}]
+)
 def test_a_held_out_motion_does_not_change_its_own_predictions(settings):
     """Only the starts of the searches know it; the blend has its own test."""
     robot, rows = measured(6)

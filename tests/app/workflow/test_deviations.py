@@ -5,15 +5,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from hybridkin import (
-    ConstantCurvatureChain,
-    CreepOperator,
-    HysteresisSeries,
-    PlayOperator,
-    app,
-    calibrate,
-    robots,
-)
+from hybridkin import ConstantCurvatureChain, Hysteresis, app, calibrate, robots
 from hybridkin._core.units import LogUnit
 from hybridkin.app import workflow
 from hybridkin.app.workflow.calibrated import calibrated_parameters, deviations
@@ -109,8 +101,8 @@ def test_gains_and_widths_are_in_the_unit_of_the_log():
     assert of_gain.digits(of_gain.start) == "0.01"
     assert of_gain.value == pytest.approx(1e3 * float(result.chain.gains[0]), rel=1e-12)
     assert of_gain.digits(0.00923456) == "0.00923"
-    series = HysteresisSeries([PlayOperator([12.34, 9.0]), CreepOperator([0.25], [3.0])])
+    series = Hysteresis.backlash([12.34, 9.0]) | Hysteresis.creep([0.25], [3.0])
     words = series.in_words(LogUnit.of("counts"))
     assert words == "backlash of 12.3 counts and creep (up to 25 % late, with 3 s)"
-    assert PlayOperator(0.0004).in_words(LogUnit.of("m")) == "backlash of 0.4 mm"
-    assert PlayOperator(np.radians(3.0)).in_words(LogUnit.of("deg")) == "backlash of 3 deg"
+    assert Hysteresis.backlash(0.0004).in_words(LogUnit.of("m")) == "backlash of 0.4 mm"
+    assert Hysteresis.backlash(np.radians(3.0)).in_words(LogUnit.of("deg")) == "backlash of 3 deg"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from hybridkin import ConstantCurvatureChain, HybridForwardModel, PlayOperator, datasets
+from hybridkin import ConstantCurvatureChain, HybridForwardModel, Hysteresis, datasets
 from hybridkin.app.workflow.compare import AUTO, CALIBRATED, DATA_ELM
 from hybridkin.app.workflow.errors import HeldOutErrors
 from hybridkin.app.workflow.explained import explained_in_words
@@ -24,8 +24,8 @@ def held_out(**means):
     return errors
 
 
-@pytest.mark.parametrize("play", [4e-4, None])
-def test_the_floor_is_the_noise_of_the_log(play):
+@pytest.mark.parametrize("width", [4e-4, 0.0])
+def test_the_floor_is_the_noise_of_the_log(width):
     rng = np.random.default_rng(0)
     turn = np.linspace(0.0, 6.0, 80)
     ring = 2.0 * np.pi / 3.0 * np.arange(3)
@@ -35,15 +35,15 @@ def test_the_floor_is_the_noise_of_the_log(play):
         motions.append(0.003 * np.outer(np.sin(turn), way) * (-1.0) ** k)
     q = np.concatenate(motions)
     groups = np.repeat(np.arange(12), 80)
-    y = q if play is None else PlayOperator(play).apply_by_group(q, groups)
+    y = Hysteresis.backlash(width).apply_by_group(q, groups)
     with torch.no_grad():
         x = CHAIN(torch.from_numpy(y)).numpy() + NOISE * rng.standard_normal((len(q), 3))
     rows = checked(datasets.Log(q, x, groups), None, base_is_free=False)
-    model = HybridForwardModel(CHAIN, "drop", play=play).fit(q, x, groups=groups)
+    model = HybridForwardModel(CHAIN, "drop", hysteresis=width).fit(q, x, groups=groups)
     errors = held_out(**{CALIBRATED: 3e-3, DATA_ELM: 2e-3, AUTO: 1e-3})
     words = explained_in_words(errors, rows, model)
     floors = [float(value) for value in re.findall(r"about (\S+) mm", words)]
-    if play is None:
+    if width == 0.0:
         assert f"best function of q ({AUTO}) leaves 1 mm; the least" in words
     else:
         assert f"({DATA_ELM}) leaves 2 mm, and {AUTO}, with hysteresis, 1 mm; the" in words

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from hybridkin import (
     ConstantCurvatureChain,
     HybridForwardModel,
-    PlayOperator,
+    Hysteresis,
     robots,
     trajectories,
 )
@@ -118,7 +118,7 @@ LIMITS = robots.Limits(
 COLUMNS = tuple("abcdef")
 
 
-def loaded(gains, tmp_path, *, learned=False, width=None):
+def loaded(gains, tmp_path, *, learned=False, width=0.0):
     """Return a robot whose q are metres over gains, of the same geometry and limits."""
     chain = ConstantCurvatureChain(**RADII, gains=gains)
     signs = tuple(np.sign(gains).astype(int).tolist())
@@ -133,8 +133,7 @@ def loaded(gains, tmp_path, *, learned=False, width=None):
         q = -0.004 * (bends @ np.stack([np.cos(ring), np.sin(ring)])).reshape(120, 6)
         with torch.no_grad():
             x = PLAIN(torch.from_numpy(q)).numpy() + 0.1 * q[:, :3]
-        play = None if width is None else (width / np.abs(gains))
-        model = HybridForwardModel(chain, "linear", play=play)
+        model = HybridForwardModel(chain, "linear", hysteresis=width / np.abs(gains))
         model.fit(q / gains, x, groups=np.arange(120) // 10)
     return workflow.LoadedModel("r", tmp_path / "model", model, description)
 
@@ -169,10 +168,10 @@ def test_commands_exceed_the_limits_by_half_the_backlash_in_any_unit(tmp_path):
         described = Domain(model, workflow.path_limits(model, within_fit=False)).of_commands
         ends = np.sort([described[0] * gains, described[1] * gains], axis=0)
         assert_allclose(ends, [LIMITS.q_min, LIMITS.q_max], rtol=1e-9)
-        of_log = np.ravel(model.play.width)
+        of_log = np.ravel(model.hysteresis.width)
         if gains is GAINS:
             of_log = np.degrees(of_log)
-        assert_allclose(model.play_widths, of_log, rtol=1e-12)
+        assert_allclose(model.hysteresis_widths, of_log, rtol=1e-12)
     assert_allclose(found[1], found[0], rtol=1e-9, atol=1e-12)
     inner = workflow.path_limits(metres)
     assert_allclose(found[0], [inner.q_min - 0.5 * width, inner.q_max + 0.5 * width])
@@ -366,7 +365,7 @@ def test_a_comparison_does_not_depend_on_units_and_names(tmp_path, sign):
         x = PLAIN(torch.from_numpy(q)).numpy() + 30.0 * q[:, :3] ** 2
     x += 1e-4 * rng.standard_normal(x.shape)
     names = np.array(["m0", "m1", "m5", "mz"])[motions]
-    settings = FitSettings(n_folds=2, auto=False, play=None)
+    settings = FitSettings(n_folds=2, auto=False, hysteresis=0.0)
     found = []
     for gains, labels in ((np.ones(6), motions), (sign * np.abs(GAINS), names)):
         chain = ConstantCurvatureChain(**RADII, gains=gains)
@@ -389,7 +388,9 @@ def test_a_comparison_does_not_depend_on_units_and_names(tmp_path, sign):
 
 def backlash(q):
     with torch.no_grad():
-        return PLAIN(torch.from_numpy(PlayOperator(6e-4).apply(q)[0])).numpy() + 0.1 * q[:, :3]
+        return (
+            PLAIN(torch.from_numpy(Hysteresis.backlash(6e-4).apply(q)[0])).numpy() + 0.1 * q[:, :3]
+        )
 
 
 def moved(q):

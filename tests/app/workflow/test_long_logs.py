@@ -7,7 +7,7 @@ import pytest
 import torch
 from numpy.testing import assert_array_equal
 
-from hybridkin import Commands, ConstantCurvatureChain, PlayOperator, load_model, robots
+from hybridkin import Commands, ConstantCurvatureChain, Hysteresis, load_model, robots
 from hybridkin.app import check_log, workflow
 from hybridkin.app.workflow.log import checked
 from hybridkin.datasets import Log
@@ -15,7 +15,7 @@ from hybridkin.hybrid._hysteresis import coarse_in_words
 from hybridkin.hybrid._rows import Rows
 
 CHAIN = ConstantCurvatureChain([0.05])
-PLAY = PlayOperator(0.02)
+PLAY = Hysteresis.backlash(0.02)
 
 
 def log_of(n_motions, seed=0, n_rows=60):
@@ -93,7 +93,7 @@ def test_more_motions_do_not_make_the_model_worse(tmp_path):
         out = tmp_path / str(n_motions)
         record = workflow.fit_log(log_of(n_motions), robot, out, settings, n_jobs=1).record
         model = load_model(out / "model.safetensors")
-        np.testing.assert_allclose(model.play_.width, 0.02, rtol=0.05)
+        np.testing.assert_allclose(model.hysteresis_.width, 0.02, rtol=0.05)
         errors.append(np.linalg.norm(model.predict(commands) - truth, axis=1).mean())
         assert record.rows <= 600
         assert len(record.thinned) > 0 or n_motions == 10
@@ -109,7 +109,7 @@ def test_a_log_that_is_too_coarse_for_its_reversals_says_so():
 
     assert not [f for f in check_log(log).findings if f.kind == "reversals"]
     assert words(1) == []
-    assert "reverses about" in words(2, PlayOperator(0.001))[0]
+    assert "reverses about" in words(2, Hysteresis.backlash(0.001))[0]
     coarse = log.rows(np.arange(0, len(log.q), 12))
     (finding,) = (f for f in check_log(coarse).findings if f.kind == "reversals")
     assert "% of the rows" in finding.message

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from hybridkin import (
     ConstantCurvatureChain,
     HybridForwardModel,
-    PlayOperator,
+    Hysteresis,
     robots,
     save_model,
 )
@@ -96,7 +96,7 @@ def test_a_robot_as_in_the_log_keeps_the_promise(verified):
 
 
 def with_backlash(q):
-    return q, truth(PlayOperator(6e-4).apply(q)[0])
+    return q, truth(Hysteresis.backlash(6e-4).apply(q)[0])
 
 
 def on_a_moved_base(q):

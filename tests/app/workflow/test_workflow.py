@@ -10,7 +10,7 @@ import torch
 from hybridkin import (
     ConstantCurvatureChain,
     HybridForwardModel,
-    PlayOperator,
+    Hysteresis,
     datasets,
     robots,
     save_model,
@@ -22,7 +22,7 @@ from hybridkin.app.workflow.choices import choices_by_fold
 from hybridkin.app.workflow.compare import (
     Mechanical,
     compare,
-    with_play_detected,
+    with_hysteresis_detected,
 )
 from hybridkin.app.workflow.domain import Domain
 from hybridkin.app.workflow.log import checked
@@ -66,7 +66,7 @@ def playful():
     swing = np.sin(np.linspace(0, 6, 20)) * rng.uniform(1, 8, 8)[:, None]
     q = 0.0005 * np.stack([np.cos(groups - a) * swing.ravel() for a in (0, 2.0944, 4.1888)], axis=1)
     with torch.no_grad():
-        x = chain(torch.from_numpy(PlayOperator(4e-4).apply_by_group(q, groups))).numpy()
+        x = chain(torch.from_numpy(Hysteresis.backlash(4e-4).apply_by_group(q, groups))).numpy()
     robot = robots.RobotDescription("playful", chain, ("radii",), None)
     return robot, datasets.Log(q, x, groups, time=np.tile(np.arange(20.0), 8))
 
@@ -74,7 +74,7 @@ def playful():
 @pytest.mark.slow
 def test_play_lowers_the_errors_of_auto_on_held_out_motions(playful):
     robot, log = playful
-    settings = workflow.FitSettings(n_folds=2, play=4e-4)
+    settings = workflow.FitSettings(n_folds=2, hysteresis=4e-4)
     log = checked(log, robot.chain, base_is_free=True)
     mechanical = Mechanical.of(robot, log, settings.loss)
     compared = compare(log, robot, settings, mechanical, n_jobs=1)
@@ -87,19 +87,21 @@ def test_play_lowers_the_errors_of_auto_on_held_out_motions(playful):
 def test_play_is_tried_by_itself_where_the_order_of_the_rows_matters(playful):
     robot, log = playful
 
-    def play_of(log, **settings):
+    def detected(log, **settings):
         rows = checked(log, robot.chain, base_is_free=False)
         mechanical = Mechanical.of(robot, rows, "linear")
-        return with_play_detected(workflow.FitSettings(**settings), rows, mechanical).play
+        return with_hysteresis_detected(
+            workflow.FitSettings(**settings), rows, mechanical
+        ).hysteresis
 
-    assert play_of(log) == "auto"
-    assert play_of(log, play=0.0) == 0.0
-    assert play_of(log, auto=False) is None
-    assert play_of(replace(log, groups=None)) is None
-    assert play_of(replace(log, time=-log.time)) is None
+    assert detected(log) == "auto"
+    assert detected(log, hysteresis=0.0) == 0.0
+    assert detected(log, auto=False) == 0.0
+    assert detected(replace(log, groups=None)) == 0.0
+    assert detected(replace(log, time=-log.time)) == 0.0
     with torch.no_grad():
         x = robot.chain(torch.from_numpy(log.q)).numpy()
-    assert play_of(replace(log, x=x)) is None
+    assert detected(replace(log, x=x)) == 0.0
 
 
 @pytest.mark.slow
@@ -203,8 +205,8 @@ def test_a_robot_without_segments_from_the_log_to_the_commands(log, tmp_path):
         workflow.open_model(robot)
     description = robots.read_description(robot)
     measured = workflow.read_log(path, description.log, chain=description.chain)
-    with pytest.raises(ValueError, match="`play` requires a robot with segments"):
-        workflow.fit_log(measured, description, model, workflow.FitSettings(play="auto"))
+    with pytest.raises(ValueError, match="`hysteresis` requires a robot with segments"):
+        workflow.fit_log(measured, description, model, workflow.FitSettings(hysteresis="auto"))
     settings = workflow.FitSettings(n_folds=2, auto=False)
     report = workflow.fit_log(measured, description, model, settings, n_jobs=1)
     errors = report.record.held_out
@@ -238,8 +240,8 @@ def test_a_log_that_does_not_pass_its_check_stops_the_fit(log, tmp_path):
     with pytest.raises(workflow.LogError, match="did not pass its check") as caught:
         workflow.fit_log(spoilt, description, tmp_path / "m")
     assert [f.kind for f in caught.value.report.errors] == ["frozen tip"]
-    settings = workflow.FitSettings(auto=False, play="auto")
-    with pytest.raises(ValueError, match="`play` requires"):
+    settings = workflow.FitSettings(auto=False, hysteresis="auto")
+    with pytest.raises(ValueError, match="`hysteresis` requires"):
         workflow.fit_log(measured, description, tmp_path / "m", settings)
     assert not (tmp_path / "m").exists()
 

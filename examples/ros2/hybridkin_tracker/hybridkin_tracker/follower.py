@@ -31,7 +31,7 @@ class Follower:
         limits = workflow.path_limits(
             self.loaded, dq_max=dq_max * factors if dq_max > 0.0 else None
         )
-        half = self.loaded.half_play  # commands lead what the actuators do
+        half = self.loaded.half_width  # commands lead what the actuators do
         self._low, self._high = limits.q_min - half, limits.q_max + half
         self._ik = InverseKinematics(
             self.loaded.model,

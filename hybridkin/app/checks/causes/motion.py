@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Self
 
-from hybridkin.chains.hysteresis import HysteresisOperator
+from hybridkin import Hysteresis
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +104,7 @@ class Motion:
         columns = [np.interp(passed, places, column) for column in values.T]
         return np.stack(columns, axis=1)
 
-    def after(self, hysteresis: HysteresisOperator) -> NDArray:
+    def after(self, hysteresis: Hysteresis) -> NDArray:
         """Return the motion (T, n) behind a hysteresis in which every run begins at rest."""
         effective = np.empty_like(self.q)
         for rows in self._rows_of_runs:

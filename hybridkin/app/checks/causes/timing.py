@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Self
 
-from hybridkin import CreepOperator, PlayOperator
+from hybridkin import Hysteresis
 from hybridkin.app.checks.causes.cause import Cause
 from hybridkin.app.checks.causes.commands import ActuatorCause
 from hybridkin.app.checks.causes.evidence import Evidence
@@ -102,7 +102,7 @@ class Backlash(_Hysteresis):
     def effective(self, motion: Motion, parameters: NDArray) -> NDArray:
         """Return the motion (T, n) behind the backlash [unit of q]."""
         width = max(float(parameters[0]), 0.0)
-        return motion.after(PlayOperator(width))
+        return motion.after(Hysteresis.backlash(width))
 
     def amount(self, evidence: Evidence, parameters: NDArray) -> str:
         """Return the width in words."""
@@ -116,9 +116,7 @@ class Creep(_Hysteresis):
     """A share of every change comes late."""
 
     name = "creep"
-    remedy = (
-        "fit named motions with times (--play auto), or move slowly and wait for rest"
-    )
+    remedy = "fit named motions with times (--hysteresis auto), or move slowly and wait for rest"
     n_parameters = 2
 
     def starts(self, evidence: Evidence) -> Sequence[NDArray]:
@@ -146,7 +144,7 @@ class Creep(_Hysteresis):
     def effective(self, motion: Motion, parameters: NDArray) -> NDArray:
         """Return the motion (T, n) of which a part comes late [unit of q]."""
         late_part, time = self._share_and_time(motion, parameters)
-        return motion.after(CreepOperator([late_part], [time]))
+        return motion.after(Hysteresis.creep([late_part], [time]))
 
     def amount(self, evidence: Evidence, parameters: NDArray) -> str:
         """Return the share and the time constant in words."""

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
-from hybridkin.calibration.hysteresis_fit import HysteresisProblem
-from hybridkin.calibration.hysteresis_log import HysteresisLog
-from hybridkin.chains.hysteresis import HysteresisOperator
+from hybridkin.hysteresis.fit import HysteresisProblem
+from hybridkin.hysteresis.log import HysteresisLog
+from hybridkin.hysteresis.value import NO_HYSTERESIS, Hysteresis
 
 _CLOSE = 0.002  # tolerance of a refined width, relative to it
 _LEAST = 0.0025  # first width, relative to the stroke
@@ -73,11 +73,11 @@ def search_width(
     return WidthSearch(tried, best)
 
 
-def find_hysteresis(log: HysteresisLog) -> HysteresisOperator | None:
-    """Return the hysteresis of the actuators; None if none lowers the error on held-out groups.
+def find_hysteresis(log: HysteresisLog) -> Hysteresis:
+    """Return the hysteresis of the actuators; empty if none lowers the error on held-out groups.
 
-    Tried are no friction, one backlash of the best width, and Prandtl-Ishlinskii operators about
-    this width, each with and without creep. The one of least error must be better than none with
+    Tried are no friction, one backlash of the best width, and friction of plays about this width,
+    each with and without creep. The one of least error must be better than none with
     certainty: its mean gain over the groups is above twice the standard error, and above 1 % of the
     error, which the linear correction can feign. Then the simplest is taken to which it has no
     clear gain, above one standard error and 1 %.
@@ -104,9 +104,9 @@ def find_hysteresis(log: HysteresisLog) -> HysteresisOperator | None:
         candidates = [search.best, creep, *_with_friction(log, search.best)]
     least = min(candidates, key=Candidate.error)
     if not gain(none, least).certain:
-        return None
+        return NO_HYSTERESIS
     as_good = (c for c in candidates if not gain(c, least).clear)
-    return next(as_good).operator
+    return next(as_good).hysteresis
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,14 +117,14 @@ class Candidate:
     ----------
     width : float
         Width of the backlash [unit of q]; 0 without friction.
-    operator : HysteresisOperator or None
-        Fitted to all rows; None for no hysteresis.
+    hysteresis : Hysteresis
+        Fitted to all rows; maybe empty.
     errors : ndarray of shape (G,)
         Mean tip distance of every group, of fits without it [m].
     """
 
     width: float
-    operator: HysteresisOperator | None
+    hysteresis: Hysteresis
     errors: NDArray
 
     @classmethod
@@ -134,7 +134,7 @@ class Candidate:
         """Return the candidate of the width of a backlash and of the spreads of the weights."""
         problem = HysteresisProblem(log, width, creep=spreads[1] > 0.0)
         fit = problem.fitted(*spreads)
-        return cls(width, problem.operator(fit), log.by_group(fit.distances))
+        return cls(width, problem.hysteresis(fit), log.by_group(fit.distances))
 
     def error(self) -> float:
         """Return the mean error [m]."""

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from hybridkin._core.model import ForwardModel
 from hybridkin._core.runs import RunOrder
 from hybridkin.calibration.measured import folds
-from hybridkin.chains.reversals import behind, reversals
+from hybridkin.hysteresis.reversals import behind, reversals
 
 _MOST_COUNTED = 10_000  # rows whose errors are computed
-_MOST_FOLLOWED = 20_000  # rows that the operators follow, if few enough reverse
+_MOST_FOLLOWED = 20_000  # rows that the stages follow, if few enough reverse
 _FINEST = (
     6e-4  # reversals that are always followed, relative to the range of an actuator
 )

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridkin._core.runs import BEGINS, RunOrder
-from hybridkin.chains.play import PlayOperator
+from hybridkin.hysteresis.follow import followed
+from hybridkin.hysteresis.stages.backlash import Backlash
 
 _SEEN = (
     0.02  # smallest way back that is no jitter, relative to the range of an actuator
@@ -19,7 +20,7 @@ _MOST_REVERSALS = 1.0 / 3.0  # of the rows; postures at random have two thirds
 def behind(q: NDArray, order: RunOrder, sizes: NDArray) -> NDArray:
     """Return commands without the ways back that are smaller than some sizes (N, n).
 
-    They are what a backlash of that width does, which no operator of hysteresis that follows them
+    They are what a backlash of that width does, which no hysteresis that follows them
     misses by more.
 
     Parameters
@@ -32,7 +33,7 @@ def behind(q: NDArray, order: RunOrder, sizes: NDArray) -> NDArray:
         Smallest way back that counts, zero or more [unit of q].
     """
     steps = np.where(order.first, BEGINS, 0.0)
-    return PlayOperator(sizes).followed(q, steps)
+    return followed([Backlash(sizes)], q, steps)
 
 
 def reversals(q: NDArray, order: RunOrder) -> NDArray[np.bool_]:

@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from hybridkin._core.arrays import LARGEST
-from hybridkin.calibration.hysteresis_log import HysteresisLog
-from hybridkin.chains.creep import CreepOperator
-from hybridkin.chains.hysteresis import HysteresisOperator
-from hybridkin.chains.play import PlayOperator
-from hybridkin.chains.prandtl_ishlinskii import PrandtlIshlinskiiOperator
-from hybridkin.chains.series import HysteresisSeries
+from hybridkin.hysteresis.follow import followed
+from hybridkin.hysteresis.log import HysteresisLog
+from hybridkin.hysteresis.stages.backlash import Backlash
+from hybridkin.hysteresis.stages.creep import Creep
+from hybridkin.hysteresis.value import Hysteresis
 
 # Widths of the plays, relative to one backlash.
 _FACTORS = np.array([0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0])
@@ -26,7 +25,7 @@ _LEAST_NOISE = 1e-5  # relative to the spread of the tips
 _COMMON = 0.5  # prior correlation of the weights of two actuators
 _BLOCK = 5_000_000  # largest number of entries that creep follows at once
 _MOST_LATE = 0.95  # largest share of a change that comes late
-_LEAST_GAIN = 1e-6  # of creep
+_LEAST_SHARE = 1e-6  # of creep
 
 
 class HysteresisFit(NamedTuple):
@@ -35,15 +34,15 @@ class HysteresisFit(NamedTuple):
     Attributes
     ----------
     slopes : ndarray of shape (K, n)
-        Slopes of the plays, see `PrandtlIshlinskiiOperator`.
-    gains : ndarray of shape (J, n)
-        Gains of creep, see `CreepOperator`.
+        Slopes of the plays, see `Hysteresis.friction`.
+    shares : ndarray of shape (J, n)
+        Shares of creep, see `Hysteresis.creep`.
     distances : ndarray of shape (C,)
         Distances of the counted rows from a fit without their group [m].
     """
 
     slopes: NDArray
-    gains: NDArray
+    shares: NDArray
     distances: NDArray
 
 
@@ -51,12 +50,12 @@ class HysteresisProblem:
     """Friction and creep by least squares of the tips, with a linear correction inside the model.
 
     The tips are F(z(y) + W [1, y]): the model at the effective changes y, plus a linear correction
-    of its inner coordinates z, as of serial coupling. With the plays P_k of a
-    Prandtl-Ishlinskii operator of slopes s, and slow states S_j of creep of gains g,
+    of its inner coordinates z, as of serial coupling. With the plays P_k of
+    friction of slopes s, and slow states S_j of creep of shares g,
     ``u = P_K + sum_k s_k (P_k - P_{k+1})`` and ``y = u + sum_j g_j (S_j(u) - u)``, where S_j is
     linear. Gauss-Newton steps from one backlash solve for s, g and W together. A normal prior holds
-    the slopes near those of the backlash and the gains near zero; it is correlated, as actuators of
-    one robot are alike.
+    the slopes near those of the backlash and the shares near zero; it is correlated, as the
+    actuators of one robot are alike.
 
     Parameters
     ----------
@@ -103,13 +102,11 @@ class HysteresisProblem:
         late = np.empty((len(counted), len(self.times), n_changes, n))
         at_once = max(1, _BLOCK // rows.size)
         block: list[NDArray] = []
-        play = PlayOperator(self.widths[0]).followed(rows, steps)
+        play = followed([Backlash(self.widths[0])], rows, steps)
         for k in range(n_changes):
-            wider = np.zeros_like(
-                play
-            )  # what is left of the widest one is the last change
+            wider = np.zeros_like(play)  # what is left of the widest is the last change
             if k + 1 < n_changes:
-                wider = PlayOperator(self.widths[k + 1]).followed(rows, steps)
+                wider = followed([Backlash(self.widths[k + 1])], rows, steps)
             block.append(play - wider)
             play = wider
             changes[:, k] = block[-1][counted]
@@ -131,37 +128,35 @@ class HysteresisProblem:
         """
         held_back = _held_back(steps / time, self.log.recorded)
         held = change - held_back[:, None] * np.diff(change, axis=0, prepend=change[:1])
-        half = CreepOperator([0.5], [time])  # y - u = (S(u) - u) / 2
-        return 2.0 * half.followed(held, steps) - held - change
+        half = Creep([0.5], [time])  # y - u = (S(u) - u) / 2
+        return 2.0 * followed([half], held, steps) - held - change
 
-    def operator(self, fit: HysteresisFit) -> HysteresisOperator | None:
-        """Return the operator of fitted slopes and gains; None without hysteresis."""
-        operators: list[HysteresisOperator] = []
+    def hysteresis(self, fit: HysteresisFit) -> Hysteresis:
+        """Return the hysteresis of fitted slopes and shares; maybe none."""
+        hysteresis = Hysteresis()
         if (fit.slopes != self.start).any():
-            operators.append(PrandtlIshlinskiiOperator(self.widths, fit.slopes))
+            hysteresis = Hysteresis.friction(self.widths, fit.slopes)
         elif self.widths.any():
-            operators.append(PlayOperator(self.widths[_FACTORS == 1.0].item()))
-        some = (fit.gains > _LEAST_GAIN).any(axis=1)
-        if some.any():
-            operators.append(CreepOperator(fit.gains[some], self.times[some]))
-        if len(operators) < 2:
-            return operators[0] if operators else None
-        return HysteresisSeries(operators)
+            hysteresis = Hysteresis.backlash(self.widths[_FACTORS == 1.0].item())
+        some = (fit.shares > _LEAST_SHARE).any(axis=1)
+        if not some.any():
+            return hysteresis
+        return hysteresis | Hysteresis.creep(fit.shares[some], self.times[some])
 
-    def fitted(self, slope_spread: float, gain_spread: float) -> HysteresisFit:
+    def fitted(self, slope_spread: float, share_spread: float) -> HysteresisFit:
         """Return the fit to all rows, and the errors of fits without each fold.
 
         The fits without a fold share the last linearisation of the fit to all rows.
 
         Parameters
         ----------
-        slope_spread, gain_spread : float
-            Standard deviations of the priors of a slope and of a gain; 0 for fixed ones.
+        slope_spread, share_spread : float
+            Standard deviations of the priors of a slope and of a share; 0 for fixed ones.
         """
         n_slopes, n = self.start.shape
-        n_gains = len(self.times)
-        weights = np.concatenate([self.start, np.zeros((n_gains, n))])
-        spreads = np.repeat([slope_spread, gain_spread], [n_slopes, n_gains])
+        n_shares = len(self.times)
+        weights = np.concatenate([self.start, np.zeros((n_shares, n))])
+        spreads = np.repeat([slope_spread, share_spread], [n_slopes, n_shares])
         prior = _Prior.of(weights, spreads)
         correction = self._no_correction()
         system = None
@@ -174,8 +169,8 @@ class HysteresisProblem:
             solution = system.solution(system.products)
             correction = solution[: correction.size].reshape(correction.shape)
             weights[prior.free] = solution[correction.size :].reshape(-1, n)
-            gains = weights[n_slopes:]
-            gains *= _MOST_LATE / np.maximum(gains.sum(axis=0), _MOST_LATE)
+            shares = weights[n_slopes:]
+            shares *= _MOST_LATE / np.maximum(shares.sum(axis=0), _MOST_LATE)
         assert system is not None
         distances = np.empty(len(self.log.rows))
         for _, test in self.log.folds:
@@ -194,14 +189,14 @@ class HysteresisProblem:
         An actuator depends on its own weights (K + J, n) only.
         """
         n_slopes = len(self.start)
-        gains = weights[n_slopes:]
+        shares = weights[n_slopes:]
         of_changes = np.ones((n_slopes + 1, weights.shape[1]))  # the last are 1
         of_changes[:-1] = weights[:n_slopes]
-        by_gains = (self.late * of_changes).sum(axis=2)
-        y = (self.changes * of_changes).sum(axis=1) + (by_gains * gains).sum(axis=1)
-        delayed = (self.late[:, :, :n_slopes] * gains[:, None]).sum(axis=1)
+        by_shares = (self.late * of_changes).sum(axis=2)
+        y = (self.changes * of_changes).sum(axis=1) + (by_shares * shares).sum(axis=1)
+        delayed = (self.late[:, :, :n_slopes] * shares[:, None]).sum(axis=1)
         by_slopes = self.changes[:, :n_slopes] + delayed
-        return y, np.concatenate([by_slopes, by_gains], axis=1)
+        return y, np.concatenate([by_slopes, by_shares], axis=1)
 
     def _linearised(
         self, weights: NDArray, correction: NDArray, prior: _Prior

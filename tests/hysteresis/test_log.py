@@ -8,24 +8,19 @@ import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
 
-from hybridkin import (
-    CreepOperator,
-    HysteresisSeries,
-    PlayOperator,
-    as_forward_model,
-)
+from hybridkin import Hysteresis, as_forward_model
 from hybridkin._core.runs import RunOrder, spread
-from hybridkin.calibration import hysteresis_log
-from hybridkin.calibration.hysteresis_fit import HysteresisProblem, _held_back
-from hybridkin.calibration.hysteresis_log import HysteresisLog
-from hybridkin.calibration.hysteresis_search import find_hysteresis
-from hybridkin.chains.reversals import behind, reversals
+from hybridkin.hysteresis import log as hysteresis_log
+from hybridkin.hysteresis.fit import HysteresisProblem, _held_back
+from hybridkin.hysteresis.log import HysteresisLog
+from hybridkin.hysteresis.reversals import behind, reversals
+from hybridkin.hysteresis.search import find_hysteresis
 
 M = np.array([[1.0, 0.3, 0.0], [0.0, 0.8, -0.4], [0.2, 0.0, 1.1]])
 OPERATORS = {
-    "backlash": PlayOperator(0.3),
-    "creep": CreepOperator([0.1, 0.2], [1.0, 8.0]),
-    "both": HysteresisSeries([PlayOperator(0.3), CreepOperator([0.2], [4.0])]),
+    "backlash": Hysteresis.backlash(0.3),
+    "creep": Hysteresis.creep([0.1, 0.2], [1.0, 8.0]),
+    "both": Hysteresis.backlash(0.3) | Hysteresis.creep([0.2], [4.0]),
 }
 
 

@@ -6,13 +6,13 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from torch.testing import assert_close
 
-from hybridkin import PlayOperator, PrandtlIshlinskiiOperator
+from hybridkin import Hysteresis
 
 ROWS = st.integers(1, 12).flatmap(
     lambda T: arrays(np.float64, (T, 3), elements=st.floats(-0.01, 0.01))
 )
 OPERATORS = arrays(np.float64, (3, 3), elements=st.sampled_from([0.0, 0.3, 1.0, 1.7])).map(
-    lambda slopes: PrandtlIshlinskiiOperator([0.0, 0.001, 0.003, 0.009], slopes)
+    lambda slopes: Hysteresis.friction([0.0, 0.001, 0.003, 0.009], slopes)
 )
 CHECKS = settings(max_examples=100, deadline=None)
 
@@ -23,7 +23,7 @@ def close(a, b):
 
 def test_a_loop_by_hand():
     # After a reversal at 2 the slope is 1/4 for half a unit, 1/2 up to two units, then 1.
-    hysteresis = PrandtlIshlinskiiOperator([0.0, 0.5, 2.0], [0.25, 0.5])
+    hysteresis = Hysteresis.friction([0.0, 0.5, 2.0], [0.25, 0.5])
     q = np.array([[0.0], [2.0], [1.5], [0.5], [0.0], [-1.0]])
     y, state = hysteresis.apply(q)
     # The first rise begins in the middle of the plays: half of every width.
@@ -37,8 +37,8 @@ def test_a_loop_by_hand():
 @given(q=ROWS, width=st.sampled_from([0.001, 0.003, 0.009]))
 def test_one_play_is_a_special_case(q, width):
     widths = np.array([0.0, 0.001, 0.003, 0.009])
-    hysteresis = PrandtlIshlinskiiOperator(widths, 1.0 * (widths[:-1] >= width))
-    close(hysteresis.apply(q)[0], PlayOperator(width).apply(q)[0])
+    hysteresis = Hysteresis.friction(widths, 1.0 * (widths[:-1] >= width))
+    close(hysteresis.apply(q)[0], Hysteresis.backlash(width).apply(q)[0])
     assert hysteresis.width == pytest.approx(width)
 
 
@@ -68,14 +68,14 @@ def test_chunks_with_the_state_carried_are_the_whole(q, hysteresis, data):
 
 
 def test_a_target_that_stays_keeps_its_command():
-    hysteresis = PrandtlIshlinskiiOperator([0.1, 0.5, 2.0], [0.3, 0.8])
+    hysteresis = Hysteresis.friction([0.1, 0.5, 2.0], [0.3, 0.8])
     y = np.repeat(np.random.default_rng(0).normal(size=(30, 2)), 3, axis=0)
     q, _ = hysteresis.command(y)
     assert np.ptp(q.reshape(30, 3, 2), axis=1).max() == 0.0
 
 
 def test_single_precision_and_tensors_come_back_as_they_came():
-    hysteresis = PrandtlIshlinskiiOperator([0.0, 0.5, 2.0], [0.25, 0.5])
+    hysteresis = Hysteresis.friction([0.0, 0.5, 2.0], [0.25, 0.5])
     q = torch.randn(20, 3, generator=torch.Generator().manual_seed(0))
     y, state = hysteresis.apply(q)
     assert y.dtype == state.dtype == torch.float32
@@ -100,13 +100,13 @@ def test_single_precision_and_tensors_come_back_as_they_came():
 )
 def test_bad_widths_and_slopes_are_named(widths, slopes, name):
     with pytest.raises(ValueError, match=f"`{name}` must"):
-        PrandtlIshlinskiiOperator(widths, slopes)
+        Hysteresis.friction(widths, slopes)
 
 
 def test_bad_rows_and_states_are_named():
-    hysteresis = PrandtlIshlinskiiOperator([0.1, 0.2], [[0.5, 0.5]])
+    hysteresis = Hysteresis.friction([0.1, 0.2], [[0.5, 0.5]])
     with pytest.raises(ValueError, match=r"`q` must have shape \(T, 2\), got \(3, 3\)"):
         hysteresis.apply(np.zeros((3, 3)))
-    _, state = PlayOperator(0.1).apply(np.zeros((3, 2)))
+    _, state = Hysteresis.backlash(0.1).apply(np.zeros((3, 2)))
     with pytest.raises(ValueError, match=r"`state` must have shape \(4, 2\), got \(3, 2\)"):
         hysteresis.apply(np.zeros((3, 2)), state)

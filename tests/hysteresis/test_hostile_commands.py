@@ -3,11 +3,14 @@
 `examine commands` puts 20,000 of these motions through; here are a few, and closed forms.
 """
 
+from functools import reduce
+from operator import or_
+
 import numpy as np
 import pytest
 
-from hybridkin import CreepOperator, HysteresisSeries, PlayOperator, PrandtlIshlinskiiOperator
-from hybridkin.chains import hysteresis as operators
+from hybridkin import Hysteresis
+from hybridkin.hysteresis import follow as following
 from hybridkin.native import available
 
 DTYPES = (np.float64, np.float32)
@@ -25,7 +28,7 @@ def plays(rng, n):
         widths[-1] = np.nextafter(widths[rng.integers(count)], np.inf)
     widths = np.unique(widths)
     shape = (len(widths) - 1, n) if rng.random() < 0.5 else len(widths) - 1
-    return PrandtlIshlinskiiOperator(widths, rng.choice(SLOPES, shape))
+    return Hysteresis.friction(widths, rng.choice(SLOPES, shape))
 
 
 def creep(rng, n):
@@ -34,15 +37,16 @@ def creep(rng, n):
     gains = rng.dirichlet(np.ones(count)) * (1.0 - 10.0 ** -rng.choice([0.1, 1, 5]))
     if rng.random() < 0.5:
         gains = np.tile(gains[:, None], n)
-    return CreepOperator(gains, 10.0 ** rng.uniform(-3, 4, count))
+    return Hysteresis.creep(gains, 10.0 ** rng.uniform(-3, 4, count))
 
 
 def random_operator(rng, n):
     """Return one to three operators in series."""
     makers = rng.choice(
-        [plays, plays, creep, lambda rng, n: PlayOperator(rng.uniform(0, 2, n))], rng.integers(1, 4)
+        [plays, plays, creep, lambda rng, n: Hysteresis.backlash(rng.uniform(0, 2, n))],
+        rng.integers(1, 4),
     )
-    return HysteresisSeries([maker(rng, n) for maker in makers])
+    return reduce(or_, [maker(rng, n) for maker in makers])
 
 
 def random_motion(rng, operator, n):
@@ -72,10 +76,10 @@ def apart(operator, n, dtype, *rows):
     """
     size = np.max([np.abs(a).max(initial=0.0) for a in rows])
     total = 0.0
-    for stage in operator.stages(n):
+    for stage in operator.stages:
         steepest = parts = 1.0
-        if stage.size > 0:
-            half, slopes = stage.numbers
+        if stage.kernel == "plays":
+            half, slopes = stage.numbers(n)
             steepest = slopes.max()
             parts = np.abs(np.diff(slopes, axis=0, prepend=0.0)).sum(axis=0).max()
             size = size + half.max()
@@ -85,9 +89,9 @@ def apart(operator, n, dtype, *rows):
 
 def paths():
     """Return what computes rows of a precision, by name: a dtype and a function as `follow`."""
-    ways = {"no core": operators.follow_in_numpy}
+    ways = {"no core": following.follow_in_numpy}
     if available():
-        ways["core"] = operators.follow
+        ways["core"] = following.follow_in_core
     return {
         f"{name}, {dtype.__name__}": (dtype, follow)
         for name, follow in ways.items()
@@ -104,8 +108,8 @@ def examined(rng, ways):
     commands = {}
     for path, (dtype, follow) in ways.items():
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(operators, "available", lambda: True)
-            patch.setattr(operators, "follow", follow)
+            patch.setattr(following, "available", lambda: True)
+            patch.setattr(following, "follow_in_core", follow)
             goals = y.astype(dtype)
             _, before = operator.apply(past.astype(dtype), dt=1.0)
             q, after = operator.command(goals, before, steps)
@@ -133,9 +137,9 @@ def test_commands_of_random_motions_are_finite_and_do_them(seed):
 def test_a_flat_piece_ends_where_it_begins(path, dtype, follow, monkeypatch):
     # The slopes are 1, 0 and 1: a result on the flat piece has the first command that gives it, and
     # one beyond it those behind the piece.
-    monkeypatch.setattr(operators, "available", lambda: True)
-    monkeypatch.setattr(operators, "follow", follow)
-    hysteresis = PrandtlIshlinskiiOperator([0.0, 1.0, 2.0], [1.0, 0.0])
+    monkeypatch.setattr(following, "available", lambda: True)
+    monkeypatch.setattr(following, "follow_in_core", follow)
+    hysteresis = Hysteresis.friction([0.0, 1.0, 2.0], [1.0, 0.0])
     _, state = hysteresis.apply(np.array([[0.0]], dtype))
     for goal, command in ((0.25, 0.25), (0.5, 0.5), (0.5, 0.5), (0.75, 1.25), (0.75, 1.25)):
         q, state = hysteresis.command(np.array([[goal]], dtype), state)
@@ -146,9 +150,9 @@ def test_a_flat_piece_ends_where_it_begins(path, dtype, follow, monkeypatch):
 @pytest.mark.parametrize(("path", "dtype", "follow"), [(k, *v) for k, v in paths().items()])
 def test_creep_that_leaves_nothing_at_once_keeps_the_command(path, dtype, follow, monkeypatch):
     # The largest share below 1: a command within no time moves nothing beyond rounding.
-    monkeypatch.setattr(operators, "available", lambda: True)
-    monkeypatch.setattr(operators, "follow", follow)
-    creep = CreepOperator([np.nextafter(1.0, 0.0)], [2.0])
+    monkeypatch.setattr(following, "available", lambda: True)
+    monkeypatch.setattr(following, "follow_in_core", follow)
+    creep = Hysteresis.creep([np.nextafter(1.0, 0.0)], [2.0])
     _, state = creep.apply(np.array([[0.25]], dtype))
     q, state = creep.command(np.array([[1.0], [2.0]], dtype), state, 0.0)
     assert (q == 0.25).all()
@@ -208,10 +212,10 @@ ROUNDED = {
 
 @pytest.mark.parametrize(("path", "dtype", "follow"), [(k, *v) for k, v in paths().items()])
 def test_a_slope_of_zero_gives_no_infinite_command(path, dtype, follow, monkeypatch):
-    monkeypatch.setattr(operators, "available", lambda: True)
-    monkeypatch.setattr(operators, "follow", follow)
+    monkeypatch.setattr(following, "available", lambda: True)
+    monkeypatch.setattr(following, "follow_in_core", follow)
     widths, slopes, state, goal = ROUNDED[np.dtype(dtype).name]
-    hysteresis = PrandtlIshlinskiiOperator(widths, slopes)
+    hysteresis = Hysteresis.friction(widths, slopes)
     before = np.array(state, dtype)[:, None]
     goals = np.array([[goal], [0.0], [goal]], dtype)  # the later ones were infinite too
     q, after = hysteresis.command(goals, before)
@@ -235,11 +239,11 @@ def test_single_precision_is_double_precision_rounded():
 def test_one_width_is_a_play():
     q = np.random.default_rng(0).normal(size=(20, 3))
     for slopes in ([], np.empty((0, 3))):
-        sums = PrandtlIshlinskiiOperator([0.4], slopes)
+        sums = Hysteresis.friction([0.4], slopes)
         assert (sums.width == 0.4).all()
         for run, expected in (
-            (sums.apply, PlayOperator(0.4).apply),
-            (sums.command, PlayOperator(0.4).command),
+            (sums.apply, Hysteresis.backlash(0.4).apply),
+            (sums.command, Hysteresis.backlash(0.4).command),
         ):
             for found, wanted in zip(run(q), expected(q), strict=True):
                 np.testing.assert_allclose(found, wanted, rtol=0.0, atol=1e-15)
@@ -248,9 +252,7 @@ def test_one_width_is_a_play():
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("size", [1e30, 1e75, 1e154, 1e308, np.inf, np.nan])
 def test_finite_numbers_have_finite_results_and_others_are_refused(size, dtype):
-    operator = HysteresisSeries(
-        [PrandtlIshlinskiiOperator([0.0, 1.0, 1e300], [0.5, 0.0]), CreepOperator([0.9], [1.0])]
-    )
+    operator = Hysteresis.friction([0.0, 1.0, 1e300], [0.5, 0.0]) | Hysteresis.creep([0.9], [1.0])
     with np.errstate(over="ignore"):
         far = np.array([[0.0], [size], [-size], [1.0]], dtype)
     _, state = operator.apply(far[:1])

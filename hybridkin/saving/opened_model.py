@@ -1,0 +1,110 @@
+"""A model of a file, of the folder of a fit, or of a robot description, with what describes it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from hybridkin._core.arrays import as_path
+from hybridkin._core.model import ForwardModel, as_forward_model
+from hybridkin.chains.robots import RobotDescription, read_description
+from hybridkin.hybrid.description import nominal_hybrid
+from hybridkin.hybrid.estimator import HybridForwardModel
+from hybridkin.hybrid.model_description import ModelDescription
+from hybridkin.saving.header import model_header
+from hybridkin.saving.saved_model import load_model
+
+__all__ = ["open_model"]
+
+_MODEL = "model.safetensors"
+_ROBOT = "robot.toml"
+
+
+def open_model(
+    model: str | Path | ForwardModel, robot: str | Path | None = None
+) -> HybridForwardModel:
+    """Return a model as a fitted estimator, with what is known of its robot, log and file.
+
+    Parameters
+    ----------
+    model : str, Path or ForwardModel
+        A file that `save_model` wrote, a folder with a ``model.safetensors``, as `hybridkin fit`
+        writes it, or a robot description (TOML), which gives its nominal chain; or a chain.
+    robot : str or Path, optional
+        Robot description, for the format of its logs and its limits. Default: ``robot.toml`` in
+        the folder of the model.
+
+    Returns
+    -------
+    HybridForwardModel
+        Fitted; its ``description_`` holds the description of the robot and the notes of the fit.
+        A chain is a model with ``error_model="drop"`` that no rows were fitted to: its
+        ``training_range_`` is infinite.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ValueError
+        If the file is not a model, or not one of that robot.
+
+    Examples
+    --------
+    >>> from hybridkin import open_model, robots
+    >>> model = open_model(robots.bionic_handling_assistant())
+    >>> model.predict([[0.2] * 9]).round(3)
+    array([[0. , 0. , 0.6]])
+    """
+    if isinstance(model, ForwardModel):
+        return nominal_hybrid(model)
+    path = as_path(model, "model")
+    if path.suffix.lower() == ".toml":
+        return _described(path)
+    if path.is_dir():
+        path = path / _MODEL
+    return _saved(path, robot)
+
+
+def _described(path: Path) -> HybridForwardModel:
+    """Return the nominal model of a robot description."""
+    robot = read_description(path)
+    if robot.chain is None:
+        raise ValueError(
+            f"`model` {path} describes a robot without segments. It has no model before a "
+            f"fit: hybridkin fit LOG --robot {path} --out MODEL."
+        )
+    opened = nominal_hybrid(robot.chain)
+    return opened.described(replace(opened.description_, robot=robot, path=path))
+
+
+def _saved(path: Path, robot: str | Path | None) -> HybridForwardModel:
+    """Return the model of a file."""
+    opened = load_model(path)
+    if not isinstance(opened, HybridForwardModel):
+        opened = nominal_hybrid(as_forward_model(opened))
+    beside = path.with_name(_ROBOT)
+    if robot is None and path.name == _MODEL and beside.is_file():
+        robot = beside
+    known = _of_file(path, opened.description_)
+    if robot is not None:
+        known = replace(known, robot=read_description(robot))
+    n = opened.n_features_in_
+    if known.robot.n_actuators not in (0, n):
+        raise ValueError(
+            f"`robot` {known.name!r} has {known.robot.n_actuators} actuators, but the model "
+            f"{path} has {n}; give the description that it was fitted with."
+        )
+    return opened.described(known)
+
+
+def _of_file(path: Path, known: ModelDescription) -> ModelDescription:
+    """Return what the header of a file says of its model."""
+    header = model_header(path)
+    return replace(
+        known,
+        robot=RobotDescription(path.stem, None, (), None),
+        path=path,
+        training=header.get("training") or {},
+        created=header.get("created", ""),
+        versions=header.get("versions") or {},
+    )
