@@ -190,7 +190,7 @@ class LoadedModel:
         if self.hybrid is None:
             # Nominal: no fit.
             return None if self.header else np.zeros(len(q), dtype=bool)
-        fitted = np.isin(row_digests(q, x), self.hybrid._fitted.fitted_rows)
+        fitted = np.isin(row_digests(q, x), self.hybrid._fit.fitted_rows)
         _, motion = np.unique(motions, return_inverse=True)
         half_fitted = np.bincount(motion, fitted) >= 0.5 * np.bincount(motion)
         return fitted | half_fitted[motion]
