@@ -19,7 +19,9 @@ if TYPE_CHECKING:
     from hybridkin.chains.length_driven import LengthDrivenChain
     from hybridkin.chains.rigid import RigidChain
     from hybridkin.hybrid.choose_rows import choose_rows
+    from hybridkin.hybrid.cross_fit import cross_fit
     from hybridkin.hybrid.estimator import HybridForwardModel
+    from hybridkin.hybrid.held_out import CrossFit
     from hybridkin.hybrid.model_description import ModelDescription
     from hybridkin.hysteresis.value import Hysteresis
     from hybridkin.ik import tasks, trajectories
@@ -36,6 +38,7 @@ __all__ = [
     "Chain",
     "Commands",
     "ConstantCurvatureChain",
+    "CrossFit",
     "ELMRegressor",
     "ELMRegressorCV",
     "ElasticTendonChain",
@@ -56,6 +59,7 @@ __all__ = [
     "as_forward_model",
     "calibrate",
     "choose_rows",
+    "cross_fit",
     "datasets",
     "jacobian",
     "load_model",
@@ -79,6 +83,8 @@ _NAMES_OF = {
     "chains.length_driven": ("LengthDrivenChain",),
     "chains.rigid": ("RigidChain",),
     "hybrid.choose_rows": ("choose_rows",),
+    "hybrid.cross_fit": ("cross_fit",),
+    "hybrid.held_out": ("CrossFit",),
     "hybrid.model_description": ("ModelDescription",),
     "saving.opened_model": ("open_model",),
     "hybrid.estimator": ("HybridForwardModel",),

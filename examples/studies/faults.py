@@ -36,12 +36,11 @@ from fault_robots import PERIOD, ROBOTS, FaultRobot
 from log_mistakes import Case, advised, fits
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from sklearn.model_selection import GroupKFold
 
 from hybridkin import (
-    Commands,
     HybridForwardModel,
     Hysteresis,
+    cross_fit,
     native,
     open_model,
     save_model,
@@ -50,7 +49,6 @@ from hybridkin.app import check_log, workflow
 from hybridkin.app.workflow.errors import Promise
 from hybridkin.app.workflow.report import Report
 from hybridkin.datasets import Log
-from hybridkin.hybrid.log_distance import held_out_distances
 
 N_MOTIONS, N_ROWS = 24, 80  # of the log
 N_TRACK = 300  # rows
@@ -207,14 +205,10 @@ def fitted(robot: FaultRobot, seed: int, folder: Path) -> HybridForwardModel:
     x = robot.tips(q)
     x += robot.noise * rng.standard_normal(x.shape)
     model = HybridForwardModel(robot.chain, random_state=0, **robot.settings)
-    errors = np.empty(len(q))
-    far = np.empty(len(q))
-    for train, test in GroupKFold(3).split(q, groups=groups):
-        model.fit(q[train], x[train], groups=groups[train])
-        predicted = model.predict(Commands(q[test], groups[test]))
-        errors[test] = np.linalg.norm(predicted - x[test], axis=1)
-        far[test] = held_out_distances(q[train], groups[train], q[test])
-    model.fit(q, x, groups=groups)
+    log = Log(q, x, groups)
+    compared = cross_fit({"hybrid": model}, log, 3)
+    errors = compared.distances[0]
+    far = compared.distances_from_others
     held_out = {"mean": float(errors.mean()), "p95": float(np.quantile(errors, 0.95))}
     training: dict[str, Any] = {"saved": "hybrid", "held_out": {"hybrid": held_out}}
     training["promise"] = vars(Promise.of(errors, far))

@@ -31,7 +31,6 @@ from sklearn.linear_model import LinearRegression
 from hybridkin import HybridForwardModel
 from hybridkin.app import check_log
 from hybridkin.datasets import Log, load_log
-from hybridkin.hybrid.estimator import prepared
 from hybridkin.hybrid.log_fit import fit_to_log
 
 SEEDS = 5
@@ -188,7 +187,7 @@ def error_of(case: Case, log: Log) -> float:
     """Return the error of a model of a log on new motions [mm]."""
     names = ("radii", "base") if case.base_is_free else ("radii",)
     model = HybridForwardModel(case.chain, LinearRegression(), calibrate=names)
-    fitted = fit_to_log(*prepared(model, log.q, log.x, log.groups))
+    fitted = fit_to_log(*model.prepared(log.q, log.x, groups=log.groups))
     with torch.no_grad():
         tips: NDArray = fitted.module(torch.from_numpy(case.test.q)).numpy()
     return float(1e3 * np.linalg.norm(tips - case.test.x, axis=1).mean())

@@ -41,7 +41,6 @@ from hybridkin import ConstantCurvatureChain, ElasticTendonChain, HybridForwardM
 from hybridkin.app import check_log
 from hybridkin.app.workflow.report import Report
 from hybridkin.datasets import Log
-from hybridkin.hybrid.estimator import prepared
 from hybridkin.hybrid.log_fit import fit_to_log
 
 N_MOTIONS, N_ROWS = 12, 16  # of the fitted log
@@ -492,7 +491,7 @@ def examined(case: Case, fit: bool | None = None) -> Outcome:
     # What data decide at once; lengths and stiffnesses stay nominal, as many users leave them.
     names = ("radii", "base") if case.base_is_free else ("radii",)
     model = HybridForwardModel(case.chain, LinearRegression(), calibrate=names)
-    fitted = fit_to_log(*prepared(model, case.log.q, case.log.x, case.log.groups))
+    fitted = fit_to_log(*model.prepared(case.log.q, case.log.x, groups=case.log.groups))
     messages = fitted.messages
     kinds += ("calibration",) * bool(messages)
     with torch.no_grad():

@@ -44,11 +44,10 @@ from joblib import Parallel, delayed
 from motor_robot import COMMANDS, MotorRobot, RecordedLog
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
-from sklearn.model_selection import GroupKFold
 
 from hybridkin import (
-    Commands,
     HybridForwardModel,
+    cross_fit,
     datasets,
     native,
     open_model,
@@ -58,7 +57,6 @@ from hybridkin import (
 )
 from hybridkin.app.workflow.errors import Promise
 from hybridkin.app.workflow.report import Report
-from hybridkin.hybrid.log_distance import held_out_distances
 
 FIT = "fit"  # models that begin so are made by the command line
 _STILL = 0.02  # of the rms of the direction with the largest motion
@@ -224,14 +222,9 @@ def _fit_in_python(setup: Setup, error_model: str) -> dict[str, float]:
     hybrid = HybridForwardModel(
         robot.chain, error_model, calibrate=robot.calibrate, random_state=0
     )
-    errors, far = np.empty(len(data.q)), np.empty(len(data.q))
-    for train, test in GroupKFold(_FOLDS).split(data.q, groups=data.groups):
-        hybrid.fit(data.q[train], data.x[train], groups=data.groups[train])
-        predicted = hybrid.predict(Commands(data.q[test], data.groups[test]))
-        errors[test] = np.linalg.norm(predicted - data.x[test], axis=1)
-        far[test] = held_out_distances(data.q[train], data.groups[train], data.q[test])
+    compared = cross_fit({"hybrid": hybrid}, data, _FOLDS)
+    errors, far = compared.distances[0], compared.distances_from_others
     held_out = {"mean": float(errors.mean()), "p95": float(np.quantile(errors, 0.95))}
-    hybrid.fit(data.q, data.x, groups=data.groups)
     folder = _model_folder(setup, error_model)
     folder.mkdir(exist_ok=True)
     training = {"saved": "hybrid", "held_out": {"hybrid": held_out}}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -95,6 +95,10 @@ class GeometryChoice:
     rivals: tuple[GeometryChoice, ...] = ()
     starts: tuple[Start | None, ...] = ()
     usual: tuple[GeometryChoice, ...] = ()
+
+    def __iter__(self) -> Iterator[str]:
+        """Return an iterator over the parameters to calibrate."""
+        return iter(self.parameters)
 
     def smaller(self, name: str) -> GeometryChoice:
         """Return the usual set of this name in place of the chosen one, if there is one."""

@@ -8,7 +8,6 @@ from __future__ import annotations
 import copy
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
 from dataclasses import replace
 from math import inf, nan
 from typing import Any, Generic, NamedTuple, TypeVar, cast
@@ -94,6 +93,10 @@ class PerMarker(ErrorModel):
 
     def __init__(self, models: Sequence[ErrorModel]) -> None:
         self.models = tuple(models)
+
+    def without_errors(self) -> ErrorModel:
+        """Return these models for fits of which only the predictions count."""
+        return PerMarker([model.without_errors() for model in self.models])
 
     def fit(self, rows: Rows, spec: Spec) -> FittedError:
         """Return every error model fitted to its marker."""
@@ -190,14 +193,14 @@ class FeatureModel(TipModel):
             assert marker.mechanical is not None
             readout = read_out.readout.up_to_tip_of(marker.mechanical.robot)
             fit = read_out._replace(readout=readout)
-            fits.append(self._fitted(fit, of_marker))
+            fits.append(self._with_correction(fit, of_marker))
         return replace(_of_markers(fits), settled=fits[0].settled)
 
     def fit_tip(self, rows: Rows, spec: Spec) -> FittedError:
         """Return the fitted readout; without motion of the rows there is nothing to learn."""
         if spec.mechanical is not None and not rows.directions.moved.size:
             return _nothing(self, rows)
-        return self._fitted(self.read_out(rows, spec), rows)
+        return self._with_correction(self.read_out(rows, spec), rows)
 
     def read_out(self, rows: Rows, spec: Spec) -> ReadoutFit:
         """Return the readout of least tip error."""
@@ -212,20 +215,21 @@ class FeatureModel(TipModel):
                 self.coupling,
                 self.alphas,
                 self.noise_ratio,
-                spec.held_out,
+                self.tells_errors,
                 self.near,
                 self.start,
             )
         except torch.linalg.LinAlgError as error:  # pyright: ignore
             raise too_far() from error
 
-    def _fitted(self, fit: ReadoutFit, rows: Rows) -> FittedError:
+    def _with_correction(self, fit: ReadoutFit, rows: Rows) -> FittedError:
         module = _on_moved_directions(fit.readout, rows.directions)
         if self.coupling == "serial":
             correction = InnerCorrection(module)
         else:
             correction = TipCorrection(module)
         settled = copy.copy(self)
+        settled.tells_errors = True
         settled.alphas = fit.alphas
         settled.noise_ratio = fit.noise_ratio
         settled.near = False
@@ -345,10 +349,10 @@ class RegressorModel(TipModel, Generic[_Regressor]):
         if directions.still.size:
             matrix, offset = directions.projection()
             rows = replace(rows, X=(rows.X @ matrix + offset).astype(rows.X.dtype))
-        regressor = self._fitted(rows)
+        regressor = self._learned(rows)
         module = error_module(cast(Regressor, regressor), rows.q)
         noise = nan
-        if spec.held_out:
+        if self.tells_errors:
             noise = self._noise(regressor, module, rows)
         correction = TipCorrection(_on_moved_directions(module, directions))
         return FittedError(
@@ -359,8 +363,8 @@ class RegressorModel(TipModel, Generic[_Regressor]):
             held_out=self.holds_out,
         )
 
-    def _fitted(self, rows: Rows) -> _Regressor:
-        return _fitted(self.regressor, rows)
+    def _learned(self, rows: Rows) -> _Regressor:
+        return _fit_to_residuals(self.regressor, rows)
 
     def knows_held_out_error(self, rows: Rows) -> bool:
         """Return whether the `noise` of its fit is that of held-out rows, or groups if given."""
@@ -387,11 +391,13 @@ class RegressorModel(TipModel, Generic[_Regressor]):
 class ForeignModel(RegressorModel[Any]):
     """A regressor of another library, which sees residuals of unit spread."""
 
-    def _fitted(self, rows: Rows) -> Any:
-        scaling = UnitSpread.of(_residual(rows), rows.counts)
-        if not sees_scale(self.regressor):
-            return _fitted(self.regressor, rows)
-        return _fitted(ResidualRegressor(self.regressor, scaling), rows)
+    def _learned(self, rows: Rows) -> Any:
+        regressor = self.regressor
+        if sees_scale(regressor):
+            scaling = UnitSpread.of(_residual(rows), rows.counts)
+            regressor = ResidualRegressor(regressor, scaling)
+        with TURNS.filters:  # it may change them while it fits
+            return _fit_to_residuals(regressor, rows)
 
 
 class NetworkModel(RegressorModel[ELMRegressor]):
@@ -459,13 +465,14 @@ class KernelModel(RegressorModel[KernelRidge]):
     def __init__(self) -> None:
         super().__init__(KernelRidge())
 
-    def _fitted(self, rows: Rows) -> KernelRidge:
+    def _learned(self, rows: Rows) -> KernelRidge:
         assert rows.residual is not None
         tuned = tuned_kernel(rows.X, rows.residual, rows.counts, rows.groups)
-        return _fitted(tuned, rows)
+        with TURNS.filters:  # scikit-learn's solver changes them
+            return _fit_to_residuals(tuned, rows)
 
     def _settled(self, regressor: KernelRidge) -> ErrorModel:
-        return RegressorModel(_copy(regressor))
+        return ForeignModel(_copy(regressor))
 
 
 class FittedBlend(NamedTuple):
@@ -490,17 +497,28 @@ class Blend(ErrorModel):
         self.weights = tuple(weights)
         self.models = tuple(models)
 
+    def without_errors(self) -> ErrorModel:
+        """Return these models for fits of which only the predictions count."""
+        return Blend(self.weights, [model.without_errors() for model in self.models])
+
     def fit(self, rows: Rows, spec: Spec) -> FittedError:
         """Return all models fitted to the same rows."""
         fits = [model.fit(rows, spec) for model in self.models]
-        corrections: list[Weighted] = [[] for _ in fits[0].corrections]
-        for weight, fitted in zip(self.weights, fits, strict=True):
-            for blended, of_model in zip(corrections, fitted.corrections, strict=True):
-                blended += [
-                    (weight * part, correction) for part, correction in of_model
-                ]
-        results = tuple(fitted.result for fitted in fits)
-        return FittedError(FittedBlend(self.weights, results), corrections, self)
+        return replace(blended(fits, self.weights), settled=self)
+
+
+def blended(fits: Sequence[FittedError], weights: Sequence[float]) -> FittedError:
+    """Return the weighted mean of fitted error models; of a single one itself."""
+    if len(fits) == 1:
+        return fits[0]
+    corrections: list[Weighted] = [[] for _ in fits[0].corrections]
+    for weight, fitted in zip(weights, fits, strict=True):
+        for of_blend, of_model in zip(corrections, fitted.corrections, strict=True):
+            for part, correction in of_model:
+                of_blend.append((weight * part, correction))
+    results = tuple(fitted.result for fitted in fits)
+    result = FittedBlend(tuple(weights), results)
+    return FittedError(result, corrections, fits[0].settled)
 
 
 def network_model(
@@ -523,7 +541,7 @@ def _copy(regressor: _Regressor) -> _Regressor:
     return copied
 
 
-def _fitted(regressor: _Regressor, rows: Rows) -> _Regressor:
+def _fit_to_residuals(regressor: _Regressor, rows: Rows) -> _Regressor:
     """Return a copy of the regressor fitted to the residuals, with the arguments that it takes."""
     copied: Any = clone(regressor)
     within: Any = copied
@@ -536,12 +554,8 @@ def _fitted(regressor: _Regressor, rows: Rows) -> _Regressor:
         options["sample_weight"] = rows.weights
     if rows.groups is not None and has_fit_parameter(within, "groups"):
         options["groups"] = rows.groups
-    turn = nullcontext()
-    if isinstance(regressor, KernelRidge):
-        turn = TURNS.filters
     try:
-        with turn:
-            copied.fit(rows.X, rows.residual, **options)
+        copied.fit(rows.X, rows.residual, **options)
     except ValueError as error:
         if not _takes_one_column(within, rows):
             raise

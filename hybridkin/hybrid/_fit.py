@@ -3,42 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
-from torch import Tensor
 
 from hybridkin.calibration.choice import unmoved
 from hybridkin.calibration.measured import points
 from hybridkin.hybrid._guards import GroupDistance, Plane, fit_guard
 from hybridkin.hybrid._module import Hybrid, HybridModule, TipCorrection
 from hybridkin.hybrid._rows import Rows, rare_marker
-from hybridkin.hybrid._spec import FittedError, Spec, Weighted, residuals
+from hybridkin.hybrid._spec import (
+    FittedError,
+    FittedHybrid,
+    Spec,
+    Weighted,
+    residuals,
+)
 from hybridkin.hybrid._wrapped import Stacked, WithPose
 
 _NEVER = 1e-9  # part of an actuator in the moved directions, if it never moves
 _COUNTS = 1e12  # largest ratio of weights; a smaller weight is lost in a float64 sum
-
-
-class FittedHybrid(NamedTuple):
-    """Result of a fit; its warnings are in the messages of `spec` and were not issued."""
-
-    spec: Spec  # with the calibrated mechanical model
-    error: FittedError
-    module: Hybrid
-
-    def take_low_rank(self, q: Tensor) -> None:
-        """Give networks and their guards a leverage of low rank, for training rows q (N, n)."""
-        for part in [*self.module.modules()]:
-            if isinstance(part, TipCorrection):
-                part.take_low_rank(q)
-
-    def predict(self, X: NDArray) -> NDArray:
-        """Return the tips (N, m) at actuator vectors (N, n) [m]."""
-        with torch.no_grad():
-            return self.module(torch.from_numpy(X.astype(np.float64))).numpy()
 
 
 def fit_hybrid(spec: Spec, rows: Rows) -> FittedHybrid:
@@ -57,6 +41,11 @@ def fit_hybrid(spec: Spec, rows: Rows) -> FittedHybrid:
     residual = residuals(spec.mechanical, rows.q, rows.y, spec.output)
     rows = replace(rows, residual=residual)
     error = spec.error_model.fit(rows, spec)
+    return FittedHybrid(spec, error, module_of(spec, rows, error))
+
+
+def module_of(spec: Spec, rows: Rows, error: FittedError) -> Hybrid:
+    """Return the hybrid of a fitted error model; rows give its guards and its domain."""
     modules = []
     within = spec
     if error.refined is not None:
@@ -64,31 +53,32 @@ def fit_hybrid(spec: Spec, rows: Rows) -> FittedHybrid:
     markers = within.by_marker(rows)
     for part, corrections in zip(markers, error.corrections, strict=True):
         modules.append(_module(*part, corrections))
-    module = modules[0]
     if len(modules) > 1:
-        module = Stacked(spec.mechanical, modules)
-    return FittedHybrid(spec, error, module)
+        return Stacked(spec.mechanical, modules)
+    return modules[0]
 
 
 def _module(rows: Rows, spec: Spec, weighted: Weighted) -> HybridModule | WithPose:
     """Return the hybrid of one tip, with guarded corrections and its domain."""
-    corrections = [correction for _, correction in weighted]
+    corrections: list[TipCorrection] = []
     weights = rows.q.new_tensor([weight for weight, _ in weighted])
     # Without a mechanical model nothing would remain.
-    guarded = bool(corrections) and None not in (spec.mechanical, spec.guard)
-    if guarded:
-        for correction in corrections:
+    guarded = bool(weighted) and None not in (spec.mechanical, spec.guard)
+    for _, correction in weighted:
+        guard = None
+        if guarded:
             alone = HybridModule(spec.mechanical, [correction], weights.new_ones(1))
             with torch.no_grad():
                 values = alone.error_part(rows.q)
-            correction.guard = fit_guard(
+            guard = fit_guard(
                 spec.guard, values, correction.module, rows.q, rows.counts
             )
+        corrections.append(type(correction)(correction.module, guard))
     directions = rows.directions
     tested = plane = None
     if spec.error_model.learns or not directions.moved.size:
         # Backlash moves actuators off the plane of their commands, but only by its width.
-        plane = Plane.of_log(spec.mechanical, rows.q, spec.commanded or directions)
+        plane = Plane.of_log(spec.mechanical, rows.q, rows.commanded or directions)
         groups = None
         if guarded:
             groups = rows.groups

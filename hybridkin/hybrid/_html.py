@@ -18,10 +18,10 @@ def fitted_rows(model: HybridPredictor) -> dict[str, object]:
         "calibrated": _calibrated(model),
         "error model": _error_model(model),
         **_error(model),
-        "training rows": f"{len(model._fitted.fitted_rows)} different rows",
+        "training rows": f"{len(model._fit.fitted_rows)} different rows",
         "domain": _domain(model),
     }
-    words = model._fitted.error.structure_in_words()
+    words = model.structure_in_words()
     if words:
         rows["structure"] = " ".join(words)
     if model.radius_ is not None:
@@ -66,10 +66,10 @@ def _error_model(model: HybridPredictor) -> str:
             if weight > 0.0:
                 parts.append(f"{weight:.2f} {name}")
         return f'{" + ".join(parts)} (chosen by "auto")'
-    name = model._fitted.kind
+    name = model._fit.kind
     if isinstance(model.error_model, str):
         name = f'"{model.error_model}"'
-    if model._fitted.error.rejected:
+    if model._fit.error.rejected:
         return f"{name}, {model.coupling}, rejected by the held-out error"
     return f"{name}, {model.coupling}"
 
@@ -83,8 +83,8 @@ def _error(model: HybridPredictor) -> dict[str, str]:
         error_of_first = _mm(results["mean_distance"][0])
         words = f"mean {mean}, {first} model alone {error_of_first}"
         return {"held-out error": words}
-    words = f"standard deviation of a coordinate {_mm(model._fitted.error.noise)}"
-    if model._fitted.error.held_out:
+    words = f"standard deviation of a coordinate {_mm(model._fit.error.noise)}"
+    if model._fit.error.held_out:
         return {"held-out error": words}
     return {"training error": words}
 

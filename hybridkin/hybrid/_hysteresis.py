@@ -169,24 +169,6 @@ def choose_hysteresis(spec: Spec, rows: Rows) -> Hysteresis:
     )
 
 
-def moved_without(spec: Spec, log: Rows, held_out: NDArray) -> Rows:
-    """Return the measured rows with what the actuators do, by the hysteresis of the others.
-
-    Parameters
-    ----------
-    spec, log
-        As for `HysteresisChoice.of`; rows of weight zero move the actuators.
-    held_out : ndarray of int
-        Places of measured rows that do not count.
-    """
-    measured = log.counted
-    weights = log.counts.copy()
-    weights[measured[held_out]] = 0.0
-    known = replace(log, weights=weights).in_runs()
-    hysteresis, _ = spec.hysteresis.of(spec, known)
-    return log.effective(hysteresis).take(measured)
-
-
 def continued(hysteresis: Hysteresis, rows: Rows, past: Past) -> tuple[NDArray, Past]:
     """Return the motion of the actuators (N, n), which go on from the past, and the new past."""
     moved = np.empty_like(rows.X)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import warnings
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -49,26 +50,54 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     error_model: object
     coupling: str
-    calibrate: Sequence[str] | str | None
+    calibrate: Iterable[str] | str | None
     guard: str | None
     output: str
     n_features_in_: int
     module_: ForwardModel
-    fitted_module_: Hybrid
     change_: Change
     mechanical_model_: ForwardModel | None
-    calibration_: CalibrationResult | None
-    error_model_: object
-    candidates_: dict[str, Hybrid] | None
-    cv_results_: CvResults | None
-    radius_: Radius | None
     description_: ModelDescription
-    _fitted: HybridFit
+    _fit: HybridFit
     _past: Past
     _drift: Drift
     _plausible_rows: PlausibleRows = UnknownRows.of(0)
     # Those that need no other check, and do not change by hysteresis.
     _plain_rows: PlausibleRows = UnknownRows.of(0)
+
+    @property
+    def fitted_module_(self) -> Hybrid:
+        """The module of the fit, without what has changed since."""
+        return self._fit.module
+
+    @property
+    def error_model_(self) -> object:
+        """The fitted error model."""
+        return self._fit.error.result
+
+    @property
+    def calibration_(self) -> CalibrationResult | None:
+        """The result of the calibration."""
+        return self._fit.calibration
+
+    @property
+    def cv_results_(self) -> CvResults | None:
+        """The comparison of the candidates of error_model="auto"."""
+        return self._fit.error.comparison
+
+    @property
+    def candidates_(self) -> dict[str, Hybrid] | None:
+        """The candidates of error_model="auto", fitted to all rows."""
+        return self._fit.candidates
+
+    @property
+    def radius_(self) -> Radius | None:
+        """The estimated error radius."""
+        return self._fit.radius
+
+    def structure_in_words(self) -> list[str]:
+        """Return the errors of the structure, and a forecast for more rows; none without them."""
+        return self._fit.error.structure_in_words()
 
     def predict(
         self,
@@ -207,7 +236,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         q = check_inputs(self, Commands.of(X).q)
         measured = real_array(y, "y")
         check_shape(measured, "y", (len(q), "m"), "one row for each row of `X`")
-        return np.isin(row_digests(q, measured), self._fitted.fitted_rows)
+        return np.isin(row_digests(q, measured), self._fit.fitted_rows)
 
     def effective(self, X: object) -> NDArray:
         """Return what the actuators do for commands X [unit of q]; without `hysteresis`, X itself.
@@ -246,12 +275,12 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     @property
     def hysteresis_(self) -> Hysteresis:
         """The hysteresis between the commands and what the actuators do; maybe none."""
-        return self._fitted.hysteresis
+        return self._fit.hysteresis
 
     @property
     def training_range_(self) -> TrainingRange:
         """The range of q in the fit, where it lies after `adapt` [unit of q]."""
-        return self._fitted.training_range.moved(-self.change_.shift)
+        return self._fit.training_range.moved(-self.change_.shift)
 
     @property
     def _repr_html_(self) -> Callable[[], str]:
@@ -322,7 +351,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def _are_states_seen(self, X: object) -> NDArray[np.bool_]:
         """Return whether the log had the states inside of the hysteresis, and such a pace (N,)."""
         commands = Commands.of(X)
-        states_of_log = self._states_of_log
+        states_of_log = self._fit.state_range
         if not self.hysteresis_ or states_of_log is None:
             return np.ones(len(commands), dtype=bool)
         rows = check_inputs(self, commands.q)
@@ -333,35 +362,29 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         )
         for k, state in enumerate(states):
             seen &= ((low[k] <= state) & (state <= high[k])).all(axis=1)
-        if self._fitted.pace is not None and commands.time is not None:
+        if self._fit.pace is not None and commands.time is not None:
             paces = each_pace(
                 rows,
                 commands.run_of_rows,
                 commands.time,
                 self.hysteresis_.time_constants,
             )
-            seen &= self._fitted.pace.holds(paces, len(rows))
+            seen &= self._fit.pace.holds(paces, len(rows))
         return seen
 
-    @property
-    def _states_of_log(self) -> TrainingRange | None:
-        """Range of the states inside of `hysteresis_` in the log; None without any."""
-        return self._fitted.state_range
-
-    def _take(self, fit: HybridFit) -> None:
+    def take_fit(self, fit: HybridFit) -> None:
         """Become the model of a fit; the robot has not changed since."""
-        self._fitted = fit
-        self.fitted_module_ = fit.module
-        self.error_model_ = fit.error.result
-        self.calibration_ = fit.calibration
-        self.cv_results_ = fit.error.comparison
-        self.candidates_ = fit.error.candidates
-        self.radius_ = fit.radius
+        self._fit = fit
         self.change_ = Change.none(self.n_features_in_)
         self._drift = fit.no_drift
         self._past = NO_PAST
         self._follow_robot()
         self.description_ = ModelDescription.of(self.module_, self.n_features_in_)
+
+    def count_as_fitted(self, q: NDArray, x: NDArray) -> None:
+        """Count rows q (N, n) with tips x (N, m) as fitted: those of a log that was thinned."""
+        digests = np.unique(row_digests(q, x))
+        self._fit = replace(self._fit, fitted_rows=digests)
 
     def _follow_robot(self) -> None:
         """Set the module and its mechanical model after the change and the drift of the robot."""
@@ -421,6 +444,6 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if rows.dtype != _FLOAT64:
             with np.errstate(over="ignore"):  # too large for float32
                 arrays = [array.astype(rows.dtype) for array in arrays]
-        if self._fitted.single_output:
+        if self._fit.single_output:
             arrays = [array[:, 0] if array.ndim > 1 else array for array in arrays]
         return arrays

@@ -127,7 +127,7 @@ def fit_readout(
             if near:
                 fit = _chosen(problem_in_noise, members, alphas, weights, rounds=1)
             else:
-                fit = _fitted(problem_in_noise, members, alphas, weights)
+                fit = _fit_with_penalties(problem_in_noise, members, alphas, weights)
     rmse = problem.mean_distance(fit.residual, 2) ** 0.5
     return fit._replace(residual=rows.as_given(fit.residual), rmse=rmse)
 
@@ -161,16 +161,16 @@ def _chosen(
         alphas, scores = _linearised.choose(score, alphas)
         weights, _ = problem.minimum(weights, problem.penalty(alphas), _FACTORS)
     assert alphas is not None
-    fit = _fitted(problem, members, alphas, weights)._replace(scores=scores)
+    fit = _fit_with_penalties(problem, members, alphas, weights)._replace(scores=scores)
     without = problem.mean_distance(problem.rest.numpy(force=True), 2)
     if problem.mean_distance(fit.residual, 2) > without:
         # The improvement of the linearised problem is not there in the exact one.
-        nothing = _fitted(problem, members, (inf, inf), problem.nothing)
+        nothing = _fit_with_penalties(problem, members, (inf, inf), problem.nothing)
         return nothing._replace(scores=scores)
     return fit
 
 
-def _fitted(
+def _fit_with_penalties(
     problem: _Problem,
     members: list[Tensor] | None,
     alphas: Pair,

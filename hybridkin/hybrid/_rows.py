@@ -32,6 +32,7 @@ class Rows:
     place: NDArray | None = None
     # Shaped like y: measured minus mechanical model [m], in a fit
     residual: NDArray | None = None
+    commanded: Directions | None = None  # of the commands, with hysteresis before X
 
     def __len__(self) -> int:
         return len(self.X)
@@ -85,6 +86,15 @@ class Rows:
     def counted(self) -> NDArray[np.intp]:
         """The rows that count (K,); others only move the actuators."""
         return np.flatnonzero(self.counts > 0.0)
+
+    def counting(self, rows: NDArray) -> Self:
+        """Return the log in which only some rows count; a single group is divided into rows."""
+        weights = np.zeros(len(self))
+        weights[rows] = self.counts[rows]
+        groups = self.groups
+        if groups is not None and len(np.unique(groups[rows])) == 1:
+            groups = None  # of a single motion, rows are held out
+        return replace(self, weights=weights, groups=groups, runs=self.run_of_rows)
 
     def marker(self, k: int) -> Self:
         """Return the rows in which marker k was measured, with only its positions as tips."""

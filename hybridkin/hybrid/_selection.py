@@ -6,6 +6,7 @@ import copy
 import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from itertools import starmap
 from typing import NamedTuple
 
 import numpy as np
@@ -27,14 +28,16 @@ from hybridkin.hybrid._error_models import (
     QuadraticModel,
     RegressorModel,
     ShapeModel,
+    blended,
 )
-from hybridkin.hybrid._fit import FittedHybrid, fit_hybrid
+from hybridkin.hybrid._fit import fit_hybrid, module_of
 from hybridkin.hybrid._kernel import folds_of
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._spec import (
     UNREFINED,
     ErrorModel,
     FittedError,
+    FittedHybrid,
     Refinement,
     Seed,
     Spec,
@@ -44,9 +47,10 @@ from hybridkin.hybrid._structural_model import ENOUGH, best_refinement
 from hybridkin.hybrid._structure import fit_structure
 from hybridkin.hybrid.held_out import (
     MEAN_LENGTH,
-    HeldOut,
+    CrossFit,
+    Outer,
     Predictions,
-    chosen_blend,
+    fold_of_rows,
 )
 from hybridkin.hybrid.structure_fit import StructureFit
 from hybridkin.learning.elm_cv import growing_network
@@ -58,36 +62,8 @@ _FEW_ROWS = 100
 _ANEW = 3  # folds, without each of which penalties are then chosen once more
 
 
-class Part(NamedTuple):
-    """Rows of a log to fit to, with the mechanical model calibrated on them, and test rows."""
-
-    spec: Spec
-    rows: Rows
-    train: NDArray
-    test: NDArray
-
-    @classmethod
-    def of(cls, spec: Spec, rows: Rows, train: NDArray, test: NDArray) -> Part:
-        """Return the part of a log with these rows."""
-        # A single held-out motion has similar ones in training; folds are a harder test.
-        training_rows = replace(rows, groups=None).take(train)
-        return cls(spec.recalibrated(training_rows), training_rows, train, test)
-
-    def predicted(self, model: ErrorModel, rows: Rows) -> NDArray:
-        """Return the predictions (M, m) of an error model for the test rows."""
-        with TURNS.filters, warnings.catch_warnings():  # the full fit gives them
-            warnings.simplefilter("ignore", LinAlgWarning)
-            fitted = fit_hybrid(replace(self.spec, error_model=model), self.rows)
-        return fitted.predict(rows.X[self.test])
-
-
 class Auto(ErrorModel):
-    """The blend of error models with the least error on held-out groups, or rows.
-
-    Every candidate is fitted to all rows, which fixes its penalties. Then it is fitted to all folds
-    but one, and to the inner rows, each time with the mechanical model calibrated on the same rows.
-    The predictions for the held-out and the outer rows give the weights of the blend. It can be a
-    single candidate.
+    """The candidates of which a table of held-out predictions chooses one, or a blend.
 
     Parameters
     ----------
@@ -115,48 +91,13 @@ class Auto(ErrorModel):
         return best_refinement(spec, geometry, rows)
 
     def starting_at(self, settled: ErrorModel) -> ErrorModel:
-        """Return the candidates without their blend; their choices start at settled ones."""
+        """Return the candidates, whose choices start at settled ones."""
         return settled
 
     def fit(self, rows: Rows, spec: Spec) -> FittedError:
-        """Return the blend, fitted to all rows, and the comparison of the candidates."""
+        """Return the candidates fitted to all rows, which fixes their penalties."""
         spec, rows = _refined(spec, rows)
-        folds = folds_of(rows.X, rows.groups)
-        fold = _fold_of_rows(folds)
-        parts = [Part.of(spec, rows, train, test) for train, test in folds]
-        outer = inner_and_outer(rows.X)[1]
-        candidates = self._candidates(spec, len(rows))
-        fits, on_outer = _fitted(candidates, rows, spec, fold)
-        settled = [fitted.error.settled for fitted in fits.values()]
-        predicted = np.empty((len(settled), *rows.tips.shape), rows.tips.dtype)
-        for k, model in enumerate(settled):
-            for part in parts:
-                predicted[k, part.test] = part.predicted(model, rows)
-        on_folds = Predictions(predicted, rows.tips, rows.counts, rows.groups)
-        held_out = HeldOut.of(on_folds, on_outer, np.append(fold, fold[outer]))
-        weights, comparison = chosen_blend([*candidates], held_out, spec.geometry)
-        near = {}
-        for (name, candidate), model in zip(candidates.items(), settled, strict=True):
-            near[name] = candidate.starting_at(model)
-        alone = spec.held_out and not spec.compared
-        if alone and weights[0] < 1.0 and _is_small(rows):
-            blended = np.tensordot(weights, predicted, 1)
-            comparison["expected_distance"] *= _optimism(
-                blend_of(near.values(), weights),
-                parts,
-                _by_fold(rows, fold),
-                blended,
-            )
-        return replace(
-            blend_of(settled, weights).fit(rows, spec),
-            settled=Candidates(near),
-            noise=comparison["expected_distance"] / MEAN_LENGTH,
-            held_out=True,
-            comparison=comparison,
-            refined=_errors_of_structure(spec),
-            structure=_structure_of(spec, rows),
-            candidates={name: fitted.module for name, fitted in fits.items()},
-        )
+        return _side_by_side(self._candidates(spec, len(rows)), rows, spec)
 
     def _candidates(self, spec: Spec, n_rows: int) -> dict[str, ErrorModel]:
         """Return the error models by name; of equal candidates the first, simplest one wins."""
@@ -185,35 +126,40 @@ class Auto(ErrorModel):
 
 
 class Candidates(ErrorModel):
-    """The candidates of "auto" for a part of a log; their choices start at those for all rows.
-
-    The fit is that of the first candidate, without a correction or linear. The others, and what all
-    predict for the outer rows after a fit to the inner ones, stand beside it.
+    """Error models that are fitted side by side; the first, simplest one counts.
 
     Parameters
     ----------
     models : dict of str to ErrorModel
         The candidates by name.
+    refined : Refinement
+        How the mechanical model is refined below all of them.
     """
 
     chooses = True
     needs_mechanical = False
 
-    def __init__(self, models: dict[str, ErrorModel]) -> None:
+    def __init__(self, models: dict[str, ErrorModel], refined: Refinement) -> None:
         self.models = models
+        self.refined = refined
+
+    def refinement(
+        self, spec: Spec, geometry: GeometryChoice, rows: Rows
+    ) -> Refinement:
+        """Return the refinement that was chosen with the candidates."""
+        return self.refined
+
+    def without_errors(self) -> ErrorModel:
+        """Return the candidates for fits of which only the predictions count."""
+        models = {name: model.without_errors() for name, model in self.models.items()}
+        candidates = Candidates(models, self.refined)
+        candidates.tells_errors = False
+        return candidates
 
     def fit(self, rows: Rows, spec: Spec) -> FittedError:
         """Return the fits of all candidates."""
         spec, rows = _refined(spec, rows)
-        fold = _fold_of_rows(folds_of(rows.X, rows.groups))
-        fits, outside = _fitted(self.models, rows, spec, fold)
-        return replace(
-            next(iter(fits.values())).error,
-            settled=self,
-            refined=_errors_of_structure(spec),
-            candidates={name: fitted.module for name, fitted in fits.items()},
-            outside=outside,
-        )
+        return _side_by_side(self.models, rows, spec)
 
 
 def _refined(spec: Spec, rows: Rows) -> tuple[Spec, Rows]:
@@ -221,6 +167,148 @@ def _refined(spec: Spec, rows: Rows) -> tuple[Spec, Rows]:
     spec = spec.refined(rows)
     residual = residuals(spec.mechanical, rows.q, rows.y, spec.output)
     return spec, replace(rows, residual=residual)
+
+
+def _side_by_side(
+    models: Mapping[str, ErrorModel], rows: Rows, spec: Spec
+) -> FittedError:
+    """Return the fits of all candidates, with penalties chosen on folds of the rows."""
+    by_fold = _by_fold(rows, fold_of_rows(folds_of(rows.X, rows.groups)))
+    fits = {}
+    near = {}
+    for name, model in models.items():
+        error = model.fit(by_fold, spec)
+        module = module_of(spec, rows, error)
+        fits[name] = FittedHybrid(replace(spec, error_model=model), error, module)
+        near[name] = model.starting_at(error.settled)
+    return replace(
+        fits[next(iter(fits))].error,
+        settled=Candidates(near, spec.refinement),
+        refined=_errors_of_structure(spec),
+        candidates=fits,
+    )
+
+
+class Settled(NamedTuple):
+    """Models whose choices are those for all rows, for fits to some of the rows.
+
+    Attributes
+    ----------
+    spec : Spec
+        The settings, with the chosen geometry.
+    rows : Rows
+        The rows.
+    models : dict of str to ErrorModel
+        The error models with their choices, by name.
+    """
+
+    spec: Spec
+    rows: Rows
+    models: dict[str, ErrorModel]
+
+    @classmethod
+    def of(cls, fitted: FittedHybrid, rows: Rows) -> Settled:
+        """Return the candidates of a fit to rows, or the one model that it has."""
+        fits = fitted.error.candidates or {"model": fitted}
+        models = {}
+        for name, fit in fits.items():
+            models[name] = fit.error.settled.without_errors()
+        return cls(fitted.spec, rows, models)
+
+    def part(self, train: NDArray) -> tuple[Spec, Rows]:
+        """Return the specification calibrated on training rows, and these rows."""
+        # A single held-out motion has similar ones in training; folds are a harder test.
+        rows = replace(self.rows, groups=None).take(train).distinct()
+        return self.spec.recalibrated(rows), rows
+
+    def held_out(self, train: NDArray, test: NDArray) -> Predictions:
+        """Return what the models predict for test rows after fits to training rows."""
+        spec, rows = self.part(train)
+        test_rows = self.rows.take(test)
+        tips = []
+        for model in self.models.values():
+            with TURNS.filters, warnings.catch_warnings():  # the full fit gives them
+                warnings.simplefilter("ignore", LinAlgWarning)
+                fitted = fit_hybrid(replace(spec, error_model=model), rows)
+            tips.append(fitted.predict(test_rows.X))
+        # Choices that know the rows give no domain that held-out rows have tested.
+        inside = np.ones((len(tips), len(test)), dtype=bool)
+        return Predictions(np.array(tips), inside)
+
+    def outer(self) -> Outer:
+        """Return the outer rows, predicted by fits to the inner ones."""
+        inner, outer = inner_and_outer(self.rows.X)
+        test = self.rows.take(outer)
+        return Outer(self.held_out(inner, outer).tips, test.tips, test.counts, outer)
+
+    def table(self) -> CrossFit:
+        """Return the held-out predictions of folds of groups or rows, and those of outer rows."""
+        splits = folds_of(self.rows.X, self.rows.groups)
+        held_out = starmap(self.held_out, splits)
+        return CrossFit.of([*self.models], self.rows, splits, held_out, self.outer())
+
+
+def decided(fitted: FittedHybrid, rows: Rows, table: CrossFit) -> FittedHybrid:
+    """Return the fit of the candidates that a table chose: one, or a blend.
+
+    Parameters
+    ----------
+    fitted : FittedHybrid
+        The fit of all candidates.
+    rows : Rows
+        The rows of the fit.
+    table : CrossFit
+        The held-out predictions of the candidates.
+    """
+    spec = fitted.spec
+    error = fitted.error
+    parts = []
+    weights = []
+    for part, weight in zip(error.candidates.values(), table.weights, strict=True):
+        if weight > 0.0:
+            parts.append(part.error)
+            weights.append(float(weight))
+    blend = replace(
+        blended(parts, weights),
+        settled=error.settled,
+        noise=table.expected_error / MEAN_LENGTH,
+        held_out=True,
+        comparison=table.results(spec.geometry),
+        refined=error.refined,
+        candidates=error.candidates,
+    )
+    blend = replace(blend, structure=_structure_of(error.refined, rows))
+    return FittedHybrid(spec, blend, module_of(spec, rows, blend))
+
+
+def expected_with_new_choices(
+    fitted: FittedHybrid, rows: Rows, table: CrossFit
+) -> float:
+    """Return the mean distance to expect if penalties are chosen without the held-out rows [m].
+
+    Of few rows or motions, penalties that suit the held-out rows would make it too small. The ratio
+    of both errors comes from the fits without each of three folds.
+    """
+    weights = table.weights
+    if weights[0] == 1.0 or not _is_small(rows):
+        return table.expected_error
+    settled = Settled.of(fitted, rows)
+    near = fitted.error.settled
+    assert isinstance(near, Candidates)
+    model = blend_of(near.models.values(), weights).without_errors()
+    tips = np.tensordot(weights, table.tips, 1)
+    before = 0.0
+    after = 0.0
+    for fold in range(_ANEW):
+        test = np.flatnonzero(table.fold == fold)
+        train = np.flatnonzero(table.fold != fold)
+        spec, _ = settled.part(train)
+        training_rows = _by_fold(rows, table.fold).take(train)
+        anew = fit_hybrid(replace(spec, error_model=model), training_rows)
+        test_rows = rows.take(test)
+        before += test_rows.counts @ distance(tips[test], test_rows.tips)
+        after += test_rows.counts @ distance(anew.predict(test_rows.X), test_rows.tips)
+    return table.expected_error * float(after / before)
 
 
 def _errors_of_structure(spec: Spec) -> ForwardModel | None:
@@ -231,34 +319,11 @@ def _errors_of_structure(spec: Spec) -> ForwardModel | None:
     return model
 
 
-def _structure_of(spec: Spec, rows: Rows) -> StructureFit | None:
-    """Return the fit of the refined mechanical model, if it is refined and more rows could help."""
-    model = _errors_of_structure(spec)
+def _structure_of(model: ForwardModel | None, rows: Rows) -> StructureFit | None:
+    """Return the fit of a refined mechanical model, if more rows could help."""
     if model is None or len(rows) > ENOUGH:
         return None
     return fit_structure(model.without_errors, rows, left_out=False)
-
-
-def _fitted(
-    models: Mapping[str, ErrorModel], rows: Rows, spec: Spec, fold: NDArray
-) -> tuple[dict[str, FittedHybrid], Predictions]:
-    """Return error models fitted to rows, and their predictions of the outer rows.
-
-    Folds (N,), if there are groups, are held out for their penalties. The outer rows are predicted
-    with these penalties by fits to the inner rows.
-    """
-    inner, outer = inner_and_outer(rows.X)
-    outside = Part.of(spec, rows, inner, outer)
-    by_fold = _by_fold(rows, fold)
-    fits = {}
-    predicted = []
-    for name, model in models.items():
-        if spec.progress is not None:
-            spec.progress(len(fits), len(models))
-        fits[name] = fit_hybrid(replace(spec, error_model=model), by_fold)
-        predicted.append(outside.predicted(fits[name].error.settled, rows))
-    test = rows.take(outer)
-    return fits, Predictions(np.array(predicted), test.tips, test.counts, test.groups)
 
 
 def _by_fold(rows: Rows, fold: NDArray) -> Rows:
@@ -266,35 +331,11 @@ def _by_fold(rows: Rows, fold: NDArray) -> Rows:
     return rows if rows.groups is None else replace(rows, groups=fold)
 
 
-def _fold_of_rows(folds: list[tuple[NDArray, NDArray]]) -> NDArray:
-    """Return the fold in which every row is held out (N,)."""
-    fold = np.empty(sum(len(test) for _, test in folds), dtype=int)
-    for k, (_, test) in enumerate(folds):
-        fold[test] = k
-    return fold
-
-
 def _is_small(rows: Rows) -> bool:
     """Return whether penalties chosen on all rows suit held-out ones, and folds can be refitted."""
     if rows.groups is None:
         return 2 < len(rows) < _FEW_ROWS
     return 2 < len(np.unique(rows.groups)) < _FEW_MOTIONS
-
-
-def _optimism(
-    model: ErrorModel, folds: list[Part], rows: Rows, blended: NDArray
-) -> float:
-    """Return the ratio of held-out errors with penalties chosen without a fold, to those with it.
-
-    Penalties that suit the held-out rows would make the error to expect too small.
-    """
-    before = after = 0.0
-    for fold in folds[:_ANEW]:
-        test = rows.take(fold.test)
-        anew = fit_hybrid(replace(fold.spec, error_model=model), rows.take(fold.train))
-        before += test.counts @ distance(blended[fold.test], test.tips)
-        after += test.counts @ distance(anew.predict(test.X), test.tips)
-    return float(after / before)
 
 
 def blend_of(models: Iterable[ErrorModel], weights: NDArray) -> ErrorModel:

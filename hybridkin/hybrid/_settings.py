@@ -7,6 +7,7 @@ from numbers import Real
 from sklearn.utils._param_validation import HasMethods, Interval, StrOptions
 from torch import nn
 
+from hybridkin.calibration.choice import GeometryChoice
 from hybridkin.hybrid._error_models import NAMED, ForeignModel, network_model
 from hybridkin.hybrid._selection import Auto
 from hybridkin.hybrid._spec import ErrorModel, Seed
@@ -24,7 +25,12 @@ CONSTRAINTS = {
         None,
     ],
     "coupling": [StrOptions({"parallel", "serial"})],
-    "calibrate": [StrOptions({"auto", "default"}), "array-like", None],
+    "calibrate": [
+        StrOptions({"auto", "default"}),
+        GeometryChoice,
+        "array-like",
+        None,
+    ],
     "guard": [StrOptions({"leverage"}), None],
     "hysteresis": [StrOptions({"auto"}), Real, "array-like", Hysteresis],
     "coverage": [Interval(Real, 0, 1, closed="neither"), None],

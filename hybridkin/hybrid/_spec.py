@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from math import nan
 from typing import NamedTuple, cast
 
@@ -15,8 +16,8 @@ from torch import Tensor
 from typing_extensions import Self
 
 from hybridkin._core.arrays import countable
-from hybridkin._core.directions import Directions
 from hybridkin._core.model import ForwardModel
+from hybridkin.calibration._search import Start
 from hybridkin.calibration.calibrate import CalibrationResult, fit_geometry, refitted
 from hybridkin.calibration.choice import GeometryChoice, choose_geometry
 from hybridkin.chains.chain import Chain
@@ -26,10 +27,11 @@ from hybridkin.hybrid._module import Hybrid, TipCorrection
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._wrapped import pose_errors
 from hybridkin.hybrid.cv_results import CvResults
-from hybridkin.hybrid.held_out import MEAN_LENGTH, Predictions
+from hybridkin.hybrid.held_out import MEAN_LENGTH
 from hybridkin.hybrid.structure_fit import StructureFit
 from hybridkin.hysteresis.value import NO_HYSTERESIS, Hysteresis
 
+Starts = tuple[Start | None, ...]
 Seed = int | np.random.RandomState | None
 Weighted = list[tuple[float, TipCorrection]]  # weights and corrections, without guards
 
@@ -42,6 +44,7 @@ class ErrorModel(ABC):
     couplings: tuple[str, ...] = ("parallel", "serial")
     for_poses = False  # whether it learns the six numbers of a pose
     needs_mechanical = True
+    tells_errors = True  # whether a fit computes errors of held-out rows
 
     @classmethod
     def of(cls, coupling: str, random_state: Seed) -> Self:
@@ -51,6 +54,12 @@ class ErrorModel(ABC):
     def starting_at(self, settled: ErrorModel) -> ErrorModel:
         """Return this model for other rows; its choice may start at the settled settings."""
         return self
+
+    def without_errors(self) -> ErrorModel:
+        """Return this model for fits of which only the predictions count."""
+        model = copy.copy(self)
+        model.tells_errors = False
+        return model
 
     def refinement(
         self, spec: Spec, geometry: GeometryChoice, rows: Rows
@@ -67,7 +76,7 @@ class ErrorModel(ABC):
         rows : Rows
             Different rows, with the residuals of the mechanical model.
         spec : Spec
-            The calibrated mechanical model, and whether errors of held-out rows are needed.
+            The calibrated mechanical model.
         """
 
 
@@ -118,10 +127,8 @@ class FittedError:
         The refined mechanical model that the corrections are added to. None: the calibrated one.
     structure : StructureFit or None
         The fit of the refined model to the same rows. None: not refined, or of a part of a log.
-    candidates : dict of str to Hybrid, or None
-        Of "auto": every candidate, fitted to all rows.
-    outside : Predictions or None
-        Of the candidates for a part of a log: their predictions for its outer rows.
+    candidates : dict of str to FittedHybrid
+        Of "auto": every candidate, fitted to all rows; else none.
     """
 
     result: object
@@ -133,8 +140,7 @@ class FittedError:
     comparison: CvResults | None = None
     refined: StructuralChain | None = None
     structure: StructureFit | None = None
-    candidates: dict[str, Hybrid] | None = None
-    outside: Predictions | None = None
+    candidates: Mapping[str, FittedHybrid] = field(default_factory=dict)
 
     @property
     def kind(self) -> str | None:
@@ -171,14 +177,6 @@ class Refinement:
 UNREFINED = Refinement()
 
 
-class FitStart(NamedTuple):
-    """Where the choices of a fit to a part of a log start: those of the fit to the whole log."""
-
-    error_model: ErrorModel
-    geometry: GeometryChoice | None
-    refinement: Refinement = UNREFINED
-
-
 @dataclass(frozen=True)
 class Spec:
     """Specification of a fit: the resolved settings of a HybridForwardModel."""
@@ -190,48 +188,40 @@ class Spec:
     output: str = "position"
     hysteresis: HysteresisChoice = NO_CHOICE
     coverage: float | None = None
-    near: GeometryChoice | None = (
-        None  # that of the whole log, where that choice starts
-    )
+    starts: Starts = ()  # of the choice of what to calibrate
     geometry: GeometryChoice | None = None  # how `calibrate` was chosen
-    refinement: Refinement = (
-        UNREFINED  # of the calibrated model, before its residual is learned
-    )
+    # Of the calibrated model, before its residual is learned.
+    refinement: Refinement = UNREFINED
     calibration: CalibrationResult | None = None  # how `mechanical` was calibrated
     messages: tuple[str, ...] = ()  # warnings of that choice and calibration
-    held_out: bool = True  # whether errors of held-out rows are computed
-    compared: bool = False  # whether a comparison will give the error to expect
-    # Of the commands, with backlash between them and the rows.
-    commanded: Directions | None = None
-    progress: Callable[[int, int], None] | None = None  # gets (done, total)
 
-    def starting_at(self, start: FitStart) -> Spec:
+    def without_errors(self) -> Spec:
+        """Return the specification of fits of which only the predictions count."""
+        return replace(self, error_model=self.error_model.without_errors())
+
+    def starting_at(self, settled: ErrorModel, starts: Starts) -> Spec:
         """Return the specification of a fit to a part of a log, with starts of its choices.
 
-        Errors on held-out rows that predictions do not need are then not computed. "auto" fits only
-        its candidates.
+        Parameters
+        ----------
+        settled : ErrorModel
+            The error model with its choices for the whole log.
+        starts : tuple of Start or None
+            Where the choice of what to calibrate starts.
         """
-        return replace(
-            self,
-            error_model=self.error_model.starting_at(start.error_model),
-            near=start.geometry,
-            refinement=start.refinement,
-            held_out=False,
-        )
+        error_model = self.error_model.starting_at(settled).without_errors()
+        return replace(self, error_model=error_model, starts=starts)
 
-    def with_geometry_chosen(
-        self,
-        rows: Rows,
-        geometry: GeometryChoice | None = None,
-    ) -> Spec:
+    def with_geometry_chosen(self, rows: Rows) -> Spec:
         """Return the specification with the parameters to calibrate, chosen on the rows or given.
 
         For a list and an error model that chooses, a plain chain is compared with elastic tendons.
         """
-        automatic = self.calibrate == "auto"
-        if not self.calibrate or not (automatic or self.error_model.chooses):
-            return self
+        geometry = self.geometry
         if geometry is None:
+            automatic = self.calibrate == "auto"
+            if not self.calibrate or not (automatic or self.error_model.chooses):
+                return self
             geometry = choose_geometry(
                 cast(Chain, self.mechanical),
                 rows.q,
@@ -240,11 +230,9 @@ class Spec:
                 weights=rows.weights,
                 outside=self.error_model.learns,
                 parameters=None if automatic else self.calibrate,
-                starts=() if self.near is None else self.near.starts,
+                starts=self.starts,
             )
-        refinement = self.refinement
-        if self.near is None:
-            refinement = self.error_model.refinement(self, geometry, rows)
+        refinement = self.error_model.refinement(self, geometry, rows)
         geometry = geometry.smaller(refinement.geometry)
         return replace(
             self,
@@ -262,7 +250,7 @@ class Spec:
             spec = self.with_geometry_chosen(rows)
         if not spec.calibrate:
             return spec
-        if spec.geometry is not None and not spec.held_out:
+        if spec.geometry is not None and not spec.error_model.tells_errors:
             return replace(spec.recalibrated(rows), calibrate=())
         result, messages = fit_geometry(
             cast(Chain, spec.mechanical),
@@ -284,7 +272,7 @@ class Spec:
 
     def recalibrated(self, rows: Rows) -> Spec:
         """Return the specification calibrated to other rows, without errors of held-out rows."""
-        spec = replace(self, held_out=False)
+        spec = self
         if self.geometry is not None and self.geometry.start is not None:
             counts = torch.from_numpy(rows.counts)
             start = self.geometry.start
@@ -319,6 +307,25 @@ class Spec:
             (rows.marker(k), replace(self, mechanical=tip))
             for k, tip in enumerate(tips)
         ]
+
+
+class FittedHybrid(NamedTuple):
+    """Result of a fit; its warnings are in the messages of `spec` and were not issued."""
+
+    spec: Spec  # with the calibrated mechanical model
+    error: FittedError
+    module: Hybrid
+
+    def take_low_rank(self, q: Tensor) -> None:
+        """Give networks and their guards a leverage of low rank, for training rows q (N, n)."""
+        for part in [*self.module.modules()]:
+            if isinstance(part, TipCorrection):
+                part.take_low_rank(q)
+
+    def predict(self, X: NDArray) -> NDArray:
+        """Return the tips (N, m) at actuator vectors (N, n) [m]."""
+        with torch.no_grad():
+            return self.module(torch.from_numpy(X.astype(np.float64))).numpy()
 
 
 def residuals(

@@ -126,7 +126,7 @@ class StructuralModel(ErrorModel):
                 "error_model='quadratic'."
             )
         factors = self.factors if len(rows) >= _FEW else self.factors[:1]
-        left_out = spec.held_out or len(factors) > 1
+        left_out = self.tells_errors or len(factors) > 1
         fits = [fit_structure(chain, rows, factor, left_out) for factor in factors]
         best = fits[0]
         for fit in fits[1:]:

@@ -42,7 +42,7 @@ def worse_than_mechanical(fitted: FittedHybrid, rows: Rows) -> list[str]:
     model = spec.error_model
     if spec.mechanical is None or not isinstance(model, (RegressorModel, HiddenLayer)):
         return []
-    if spec.compared or len(rows) < _FEW:  # which have warnings of their own
+    if len(rows) < _FEW:  # which have a warning of their own
         return []
     squares, corrected = _squares(spec, fitted.module, rows)
     chance = _standard_error(squares, rows.groups)
@@ -54,7 +54,7 @@ def worse_than_mechanical(fitted: FittedHybrid, rows: Rows) -> list[str]:
         where = "on held-out rows"
     elif after <= before + chance and _can_hold_out(rows):
         train, test = folds(rows.X, rows.groups)[0]
-        settled = replace(spec, error_model=fitted.error.settled, held_out=False)
+        settled = replace(spec, error_model=fitted.error.settled).without_errors()
         with TURNS.filters, warnings.catch_warnings():  # the full fit has given them
             warnings.simplefilter("ignore")
             module = fit_hybrid(settled, rows.take(train)).module

@@ -81,7 +81,7 @@ def stored_hybrid(model: HybridForwardModel) -> Stored:
     """Return the description of a fitted hybrid."""
     if "module_" not in vars(model):
         raise TypeError("`model` must be fitted before it is saved; call `fit` first.")
-    fit = model._fitted
+    fit = model._fit
     nominal = model.mechanical_model
     params = params_of(model)
     del params["mechanical_model"], params["error_model"]
@@ -95,7 +95,7 @@ def stored_hybrid(model: HybridForwardModel) -> Stored:
             },
             **model.change_._asdict(),
             "training_range": fit.training_range,
-            "state_range": model._states_of_log,
+            "state_range": fit.state_range,
             **_stored_pace(model),
             "radius": model.radius_,
             "fitted_rows": fit.fitted_rows,
@@ -186,7 +186,7 @@ def hybrid_of(stored: Stored, training: object) -> HybridForwardModel:
             m = in_columns(module, model.output)(q).shape[1]
         drift = _restored_drift(stored, Drift.of_range(q, m))
         fit = _restored_fit(stored, training, module, drift.emptied(), error_model)
-        model._take(fit)
+        model.take_fit(fit)
         shift = stored.array("shift", (n,))
         model.change_ = Change(shift, stored.array("motion", (4, 4)))
         model._drift = drift
@@ -214,7 +214,7 @@ def nominal_hybrid(mechanical: ForwardModel) -> HybridForwardModel:
     model.n_features_in_ = n
     error_model = model._checked_error_model()
     module = HybridModule(mechanical, [], q.new_zeros(0))
-    model._take(
+    model.take_fit(
         HybridFit(
             module=module,
             error=FittedError(None, [], error_model),
@@ -230,8 +230,8 @@ def nominal_hybrid(mechanical: ForwardModel) -> HybridForwardModel:
 
 def _stored_pace(model: HybridForwardModel) -> dict[str, NDArray]:
     """Return the arrays of the range of paces; none without creep."""
-    pace = model._fitted.pace
-    if pace is None or model._states_of_log is None:
+    pace = model._fit.pace
+    if pace is None:
         return {}
     return {"pace_low": pace.low, "pace_high": pace.high}
 
@@ -314,7 +314,7 @@ def _restored_drift(stored: Stored, empty: Drift) -> Drift:
 
 def training_of(model: HybridForwardModel) -> dict[str, object]:
     """Return the results of the training of a fitted hybrid as JSON values, errors in metres."""
-    results: dict[str, object] = {"rows": len(model._fitted.fitted_rows)}
+    results: dict[str, object] = {"rows": len(model._fit.fitted_rows)}
     calibration = model.calibration_
     if calibration is not None:
         results["calibration"] = {

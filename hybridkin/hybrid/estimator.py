@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any, cast
 
@@ -20,6 +20,7 @@ from hybridkin._core.commands import Commands
 from hybridkin._core.distinct import targets_that_count
 from hybridkin._core.model import ForwardModel, as_forward_model
 from hybridkin._core.other_units import check_tips
+from hybridkin.calibration.choice import GeometryChoice
 from hybridkin.calibration.measured import (
     LEAVE_OUT,
     WEIGH_ZERO,
@@ -38,7 +39,7 @@ from hybridkin.hybrid._predictor import HybridPredictor
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._settings import CONSTRAINTS, error_model_of
 from hybridkin.hybrid._spec import ErrorModel, Spec, residuals
-from hybridkin.hybrid.log_fit import HybridFit, fit_to_log
+from hybridkin.hybrid.log_fit import fit_to_log
 from hybridkin.hysteresis.value import Hysteresis, checked_times
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.hidden_layer import check_rows
@@ -197,7 +198,7 @@ class HybridForwardModel(HybridPredictor):
         error_model: object = None,
         *,
         coupling: str = "parallel",
-        calibrate: Sequence[str] | str | None = None,
+        calibrate: Iterable[str] | str | None = None,
         guard: str | None = "leverage",
         hysteresis: ArrayLike | Hysteresis | str = 0.0,
         coverage: float | None = None,
@@ -273,10 +274,11 @@ class HybridForwardModel(HybridPredictor):
             their held-out errors; and none below 20 rows). The mean square must exceed that of the
             mechanical model by more than the standard error of the latter over rows, or groups.
         """
-        fitted = fit_to_log(*prepared(self, X, y, groups, sample_weight))
-        for message in fitted.messages:
+        fit = fit_to_log(*self.prepared(X, y, sample_weight, groups))
+        for message in fit.messages:
             warnings.warn(message, stacklevel=2)
-        return with_fit(self, fitted)
+        self.take_fit(fit)
+        return self
 
     def partial_fit(
         self,
@@ -336,7 +338,7 @@ class HybridForwardModel(HybridPredictor):
         residual = error.reshape(rows.tips.shape) - learned
         drift = self._drift.learned(rows.q.numpy(), residual, rows.counts, decay)
         if alpha is None:
-            alpha = drift.likeliest_alpha(self._fitted.error.noise)
+            alpha = drift.likeliest_alpha(self._fit.error.noise)
         self._drift = drift._replace(alpha=float(alpha))
         self._follow_robot()
         return self
@@ -413,16 +415,28 @@ class HybridForwardModel(HybridPredictor):
         self.change_, message = likeliest_change(
             self.fitted_module_,
             rows,
-            self._fitted.error.noise,
+            self._fit.error.noise,
             self._drift.scale,
             parameters,
         )
         if message is not None:
             warnings.warn(message, stacklevel=2)
-        self._drift = self._fitted.no_drift
+        self._drift = self._fit.no_drift
         self._past = NO_PAST
         self._follow_robot()
         return self
+
+    def prepared(
+        self,
+        X: object,
+        y: object,
+        sample_weight: ArrayLike | None = None,
+        groups: ArrayLike | None = None,
+    ) -> tuple[Spec, Rows]:
+        """Return the checked settings and the checked rows of a log, as for `fit`."""
+        error_model = self._checked_error_model()
+        log = self._checked_rows(X, y, sample_weight, groups)
+        return self._spec(error_model, log), log
 
     @property
     def follows_order(self) -> bool:
@@ -526,6 +540,7 @@ class HybridForwardModel(HybridPredictor):
         """Return the settings as a specification, with a copy of the mechanical model."""
         mechanical = self.mechanical_model
         names = ()
+        geometry = None
         if mechanical is not None:
             mechanical = as_forward_model(copy.deepcopy(mechanical)).frozen()
             # A function does not tell how many, but its rows do.
@@ -534,7 +549,11 @@ class HybridForwardModel(HybridPredictor):
                 check_unscaled("X", rows.X, "actuator vectors [m or rad]")
                 check_unscaled("y", rows.tips[rows.counts > 0.0], "tip positions [m]")
                 mechanical.check_actuators(rows.q, "X")
-                names = self._names_to_calibrate(mechanical, error_model)
+                if isinstance(self.calibrate, GeometryChoice):
+                    geometry = self.calibrate
+                    names = geometry.parameters
+                else:
+                    names = self._names_to_calibrate(mechanical, error_model)
         return Spec(
             mechanical,
             error_model,
@@ -543,6 +562,7 @@ class HybridForwardModel(HybridPredictor):
             self.output,
             choice_of(self.hysteresis),
             self.coverage,
+            geometry=geometry,
         )
 
     def _names_to_calibrate(
@@ -565,22 +585,3 @@ def _geometry(mechanical: object) -> dict[str, Tensor]:
 def _check_positive(name: str, value: object, high: float) -> None:
     if not 0.0 < number(value, name) <= high:
         raise ValueError(f"`{name}` must lie in (0, {high:g}], got {value!r}.")
-
-
-def prepared(
-    model: HybridForwardModel,
-    X: object,
-    y: object,
-    groups: ArrayLike | None = None,
-    sample_weight: ArrayLike | None = None,
-) -> tuple[Spec, Rows]:
-    """Return the checked settings of a model and the rows of a log, for `fit_to_log`."""
-    error_model = model._checked_error_model()
-    log = model._checked_rows(X, y, sample_weight, groups)
-    return model._spec(error_model, log), log
-
-
-def with_fit(model: HybridForwardModel, fit: HybridFit) -> HybridForwardModel:
-    """Return a model, after `prepared`, as its `fit` returns it."""
-    model._take(fit)
-    return model

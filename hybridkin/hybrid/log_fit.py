@@ -3,27 +3,46 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
+from itertools import starmap
+from typing import NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 from typing_extensions import Self
 
-from hybridkin._core.digests import row_digests
 from hybridkin.calibration.calibrate import CalibrationResult
 from hybridkin.calibration.choice import GeometryChoice
-from hybridkin.hybrid._drift import Drift
+from hybridkin.calibration.measured import folds
+from hybridkin.hybrid._drift import Drift, too_far
 from hybridkin.hybrid._fit import few_rows, fit_hybrid, fit_messages
-from hybridkin.hybrid._hysteresis import moved_without
 from hybridkin.hybrid._module import Hybrid
 from hybridkin.hybrid._pace import Pace, PaceRange, each_pace, pace_range
-from hybridkin.hybrid._radius import Radius, conformal_radius
+from hybridkin.hybrid._radius import Radius
 from hybridkin.hybrid._range import TrainingRange, state_range
 from hybridkin.hybrid._rows import Rows
-from hybridkin.hybrid._spec import UNREFINED, FitStart, FittedError, Refinement, Spec
+from hybridkin.hybrid._selection import (
+    Settled,
+    decided,
+    expected_with_new_choices,
+)
+from hybridkin.hybrid._spec import (
+    FittedError,
+    FittedHybrid,
+    HysteresisChoice,
+    Spec,
+    Starts,
+)
 from hybridkin.hybrid._worse import worse_than_mechanical
 from hybridkin.hybrid.cv_results import CvResults
-from hybridkin.hybrid.held_out import MEAN_LENGTH
+from hybridkin.hybrid.held_out import (
+    MEAN_LENGTH,
+    CrossFit,
+    FoldChoice,
+    Outer,
+    Predictions,
+)
 from hybridkin.hysteresis.value import NO_HYSTERESIS, Hysteresis
 
 
@@ -51,8 +70,6 @@ class HybridFit:
         The attributes of the model.
     geometry : GeometryChoice or None
         How the parameters to calibrate were chosen.
-    refinement : Refinement
-        What was learned of the calibrated model before its residual.
     messages : tuple of str
         Warnings, which were not issued.
     """
@@ -66,37 +83,195 @@ class HybridFit:
     no_drift: Drift
     calibration: CalibrationResult | None = None
     geometry: GeometryChoice | None = None
-    refinement: Refinement = UNREFINED
     hysteresis: Hysteresis = NO_HYSTERESIS
     state_range: TrainingRange | None = None
     pace: PaceRange | None = None
     radius: Radius | None = None
     messages: tuple[str, ...] = ()
 
-    @property
-    def start(self) -> FitStart:
-        """Where the choices of fits to parts of the log start."""
-        return FitStart(self.error.settled, self.geometry, self.refinement)
-
-    def expecting(self, distance: float) -> Self:
-        """Return the same with the mean error of a comparison, which "auto" expects [m]."""
-        comparison = self.error.comparison
-        if comparison is None:
-            return self
-        expected: CvResults = {**comparison, "expected_distance": distance}
-        noise = distance / MEAN_LENGTH
+    def with_hysteresis(self, hysteresis: Hysteresis) -> Self:
+        """Return the same with another hysteresis, whose states the log does not show."""
         return replace(
-            self, error=replace(self.error, comparison=expected, noise=noise)
+            self,
+            module=self.module.behind(hysteresis),
+            hysteresis=hysteresis,
+            state_range=None,
+            pace=None,
         )
 
-    def of_all_rows(self, q: NDArray, x: NDArray) -> Self:
-        """Return the same for a log of more rows, all of which count as fitted."""
-        return replace(self, fitted_rows=np.unique(row_digests(q, x)))
+    @property
+    def candidates(self) -> dict[str, Hybrid] | None:
+        """The candidates of "auto", fitted to all rows; None for other error models."""
+        fits = self.error.candidates
+        return {name: fit.module for name, fit in fits.items()} or None
 
 
-def fit_to_log(
-    spec: Spec, log: Rows, geometry: GeometryChoice | None = None
-) -> HybridFit:
+@dataclass(frozen=True, eq=False)
+class FitOnce:
+    """A fit to a log, without what a table of held-out predictions tells.
+
+    Attributes
+    ----------
+    spec : Spec
+        The settings, with the chosen geometry.
+    log, rows : Rows
+        The log, and its different rows with what the actuators do.
+    hysteresis : Hysteresis
+        The hysteresis; empty without one.
+    fitted : FittedHybrid
+        The hybrid of these rows.
+    messages : list of str
+        Warnings about the hysteresis.
+    radius : Radius or None
+        The estimated error radius; None: not asked for, or not known yet.
+    """
+
+    spec: Spec
+    log: Rows
+    rows: Rows
+    hysteresis: Hysteresis
+    fitted: FittedHybrid
+    messages: list[str]
+    radius: Radius | None = None
+
+    @property
+    def starts(self) -> Starts:
+        """Where the choice of what to calibrate starts in parts of the log."""
+        if self.spec.geometry is None:
+            return ()
+        return self.spec.geometry.starts
+
+    def effective(self, log: Rows) -> Tensor:
+        """Return what the actuators do at the rows of a log (N, n)."""
+        return log.effective(self.hysteresis).q
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the candidates of "auto"; of other error models the one name "model"."""
+        return [*self.fitted.error.candidates] or ["model"]
+
+    def settled(self) -> Settled:
+        """Return the models with their choices, for fits to some of the rows that count."""
+        moved = self.log.effective(self.hysteresis)
+        return Settled.of(self.fitted, moved.take(self.log.counted))
+
+    def outer(self) -> Outer | None:
+        """Return what the candidates predict for the outer rows that count; None without any."""
+        if not self.fitted.error.candidates:
+            return None
+        outer = Settled.of(self.fitted, self.rows).outer()
+        assert self.rows.place is not None
+        place = self.rows.place[self.log.counted]
+        _, first = np.unique(place, return_index=True)
+        return outer._replace(rows=first[outer.rows])
+
+    def decided(self, table: CrossFit) -> Self:
+        """Return the fit with the blend of its candidates by the weights of a table."""
+        if not self.fitted.error.candidates:
+            return self
+        return replace(self, fitted=decided(self.fitted, self.rows, table))
+
+    def with_settled_blend(self, table: CrossFit) -> Self:
+        """Return the fit with a blend by settled choices, and the error of a table to expect.
+
+        The penalties of all rows are those of the model, so its weights are chosen with them.
+        """
+        if not self.fitted.error.candidates:
+            return self
+        settled = Settled.of(self.fitted, self.rows).table()
+        return self.decided(settled).expecting(table.expected_error)
+
+    def with_radius(self, table: CrossFit) -> Self:
+        """Return the fit with the radius of a table of new choices, if it is asked for."""
+        coverage = self.spec.coverage
+        if coverage is None:
+            return self
+        radius = table.radius(coverage)
+        doubts = radius.doubts(len(np.unique(table.groups_inside)))
+        return replace(self, radius=radius, messages=[*self.messages, *doubts])
+
+    def expecting(self, distance: float) -> Self:
+        """Return the fit with another mean distance to expect on new motions [m]."""
+        error = self.fitted.error
+        assert error.comparison is not None
+        comparison: CvResults = {**error.comparison, "expected_distance": distance}
+        error = replace(error, comparison=comparison, noise=distance / MEAN_LENGTH)
+        return replace(self, fitted=self.fitted._replace(error=error))
+
+    def found(self) -> HybridFit:
+        """Return what a `HybridForwardModel` keeps of the fit."""
+        log = self.log
+        rows = self.rows
+        hysteresis = self.hysteresis
+        fitted = self.fitted
+        states = None
+        pace = None
+        if hysteresis:
+            measured = log.take(log.counted)
+            size = np.ptp(log.X, axis=0)
+            states = state_range(_states(hysteresis, log), measured, size)
+            pace = _pace(hysteresis, log, measured)
+        fitted.take_low_rank(rows.q)
+        messages = [*self.messages, *fit_messages(fitted.spec, rows)]
+        return HybridFit(
+            module=fitted.module.behind(hysteresis),
+            error=fitted.error,
+            kind=fitted.error.kind,
+            fitted_rows=log.distinct().digests(),
+            single_output=log.y.ndim == 1,
+            training_range=TrainingRange.of(rows.X),
+            no_drift=Drift.of_range(rows.q, rows.tips.shape[1]),
+            calibration=fitted.spec.calibration,
+            geometry=self.spec.geometry,
+            hysteresis=hysteresis,
+            state_range=states,
+            pace=pace,
+            radius=self.radius,
+            messages=tuple(dict.fromkeys(messages)),
+        )
+
+
+def fit_once(spec: Spec, log: Rows) -> FitOnce:
+    """Return the hybrid of a log, after the choices of its geometry and its hysteresis."""
+    commands = log.distinct()
+    chosen = spec.with_geometry_chosen(commands)
+    hysteresis, messages = chosen.hysteresis.of(chosen, log.in_runs())
+    rows = commands
+    if hysteresis:
+        rows = log.effective(hysteresis).distinct()
+        rows = replace(rows, commanded=commands.directions)
+    fitted = fit_hybrid(chosen, rows)
+    return FitOnce(chosen, log, rows, hysteresis, fitted, messages)
+
+
+class Anew(NamedTuple):
+    """A specification for fits to parts of a log, each of which makes its own choices."""
+
+    spec: Spec
+    log: Rows
+
+    def held_out(self, train: NDArray, test: NDArray) -> Predictions:
+        """Return what a fit to training rows predicts for test rows, of the rows that count."""
+        log = self.log
+        counted = log.counted
+        fit = fit_once(self.spec, log.counting(counted[train]))
+        modules = [fit.fitted.module]
+        if fit.fitted.error.candidates:
+            modules = [part.module for part in fit.fitted.error.candidates.values()]
+        q = fit.effective(log)[counted[test]]
+        tips = []
+        inside = []
+        with torch.no_grad():
+            for module in modules:
+                tips.append(module(q).numpy())
+                inside.append(module.in_domain(q).numpy())
+        if not np.isfinite(tips).all():
+            raise too_far()
+        choice = FoldChoice(fit.spec.geometry, fit.hysteresis, fit.fitted.error.result)
+        return Predictions(np.array(tips), np.array(inside), choice)
+
+
+def fit_to_log(spec: Spec, log: Rows) -> HybridFit:
     """Return what a fit finds; it changes no argument.
 
     Parameters
@@ -105,48 +280,35 @@ def fit_to_log(
         The settings.
     log : Rows
         The rows as they were measured.
-    geometry : GeometryChoice, optional
-        What to calibrate. Default: chosen on the rows.
     """
-    commands = log.distinct()
-    messages = few_rows(commands, spec)
-    chosen = spec.with_geometry_chosen(commands, geometry)
-    hysteresis, of_hysteresis = chosen.hysteresis.of(chosen, log.in_runs())
-    rows = commands
-    measured = commands
-    states = None
-    pace = None
-    moved = None
-    if hysteresis:
-        spec = replace(spec, commanded=commands.directions)
-        chosen = replace(chosen, commanded=commands.directions)
-        measured = log.take(log.counted)
-        states = state_range(_states(hysteresis, log), measured, np.ptp(log.X, axis=0))
-        pace = _pace(hysteresis, log, measured)
-        moved = partial(moved_without, chosen, log)
-        rows = log.effective(hysteresis).distinct()
-    fitted = fit_hybrid(chosen, rows)
-    fitted.take_low_rank(rows.q)
-    radius, of_radius = conformal_radius(spec, measured, moved)
-    messages += [*of_hysteresis, *of_radius, *fit_messages(fitted.spec, rows)]
-    messages += worse_than_mechanical(fitted, _by_motion(log, rows, hysteresis))
-    return HybridFit(
-        module=fitted.module.behind(hysteresis),
-        error=fitted.error,
-        kind=fitted.error.kind,
-        fitted_rows=commands.digests(),
-        single_output=log.y.ndim == 1,
-        training_range=TrainingRange.of(rows.X),
-        no_drift=Drift.of_range(rows.q, rows.tips.shape[1]),
-        calibration=fitted.spec.calibration,
-        geometry=chosen.geometry,
-        refinement=chosen.refinement,
-        hysteresis=hysteresis,
-        state_range=states,
-        pace=pace,
-        radius=radius,
-        messages=tuple(dict.fromkeys(messages)),
-    )
+    messages = few_rows(log.distinct(), spec)
+    fit = fit_once(spec, log)
+    if spec.coverage is not None:
+        table = _table_anew(spec, fit)
+        fit = fit.decided(table).with_radius(table)
+    elif fit.fitted.error.candidates:
+        table = Settled.of(fit.fitted, fit.rows).table()
+        expected = expected_with_new_choices(fit.fitted, fit.rows, table)
+        fit = fit.decided(table).expecting(expected)
+    by_motion = _by_motion(log, fit.rows, fit.hysteresis)
+    worse = worse_than_mechanical(fit.fitted, by_motion)
+    found = fit.found()
+    return replace(found, messages=(*messages, *found.messages, *worse))
+
+
+def _table_anew(spec: Spec, fit: FitOnce) -> CrossFit:
+    """Return the predictions of five folds of a log, which make the choices of a fit anew."""
+    if not fit.hysteresis:
+        spec = replace(spec, hysteresis=HysteresisChoice())
+        fit = replace(fit, log=fit.log.distinct())
+    log = fit.log
+    if fit.fitted.error.candidates:
+        spec = spec.starting_at(fit.fitted.error.settled, fit.starts)
+    anew = Anew(spec.without_errors(), log)
+    measured = log.take(log.counted)
+    splits = folds(measured.X, measured.groups)
+    held_out = starmap(anew.held_out, splits)
+    return CrossFit.of(fit.names, measured, splits, held_out, fit.outer())
 
 
 def _states(hysteresis: Hysteresis, log: Rows) -> NDArray:

@@ -1,5 +1,7 @@
 """Chains of arcs with errors of their structure."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -377,7 +379,8 @@ def fitted_on(g, q):
     """Return a hybrid estimator whose module stands on a chain with errors of its structure."""
     x = g(q).numpy()
     model = HybridForwardModel(g.chain, "drop").fit(q.numpy(), x)
-    model.fitted_module_ = HybridModule(g, [], torch.zeros(0).double())
+    module = HybridModule(g, [], torch.zeros(0).double())
+    model._fit = replace(model._fit, module=module)
     model._follow_robot()
     return model
 

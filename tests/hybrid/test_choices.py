@@ -9,10 +9,8 @@ import torch
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.stats import multivariate_normal
 from sklearn.base import BaseEstimator, RegressorMixin
-from sklearn.model_selection import KFold
 
 from hybridkin import ConstantCurvatureChain, HybridForwardModel
-from hybridkin.hybrid import _radius
 from hybridkin.hybrid._adapt import _Problem
 from hybridkin.hybrid._drift import MISFITS, SWITCH, Drift
 from hybridkin.hybrid._error_models import NoCorrection
@@ -23,7 +21,8 @@ from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._selection import _is_small
 from hybridkin.hybrid._spec import Spec
 from hybridkin.hybrid._wrapped import PoseRows, WithPose
-from hybridkin.hybrid.held_out import HeldOut, Predictions, chosen_blend
+from hybridkin.hybrid.held_out import CrossFit, Outer
+from hybridkin.hybrid.log_fit import fit_to_log
 
 CHAIN = ConstantCurvatureChain([0.05])
 N, M = 40, 10  # held-out and outer rows
@@ -44,16 +43,22 @@ def log(n, seed=0, noise=1e-4):
 # Blend
 
 
+def table_of(tips, y, counts, groups, fold, outer_tips, outer):
+    """Return a table of predicted tips, with outer rows at places of the others."""
+    names = NAMES[: len(tips)]
+    inside = np.ones(tips.shape[:2], dtype=bool)
+    beyond = Outer(outer_tips, y[outer], counts[outer], outer)
+    return CrossFit(names, tips, inside, y, y, counts, groups, fold, beyond)
+
+
 def held_out(errors, counts=None, groups=None):
     """Return predictions that are off by errors (K, N + M, 3), of tips at random."""
     rng = np.random.default_rng(0)
     y = rng.standard_normal((N, 3))
-    outer = np.arange(0, N, N // M)
     counts = np.ones(N) if counts is None else counts
-    of_folds = Predictions(y + errors[:, :N], y, counts, groups)
-    outside = Predictions(y[outer] + errors[:, N:], y[outer], counts[outer], None)
+    outer = np.arange(0, N, N // M)
     fold = np.arange(N) % 5
-    return HeldOut.of(of_folds, outside, np.append(fold, fold[outer]))
+    return table_of(y + errors[:, :N], y, counts, groups, fold, y[outer] + errors[:, N:], outer)
 
 
 def random_errors(*sizes):
@@ -61,38 +66,44 @@ def random_errors(*sizes):
     return np.array(sizes)[:, None, None] * rng.standard_normal((len(sizes), N + M, 3))
 
 
+def picked(table, rows):
+    """Return the weights that some of the held-out and the outer rows pick."""
+    return table._all_rows.picked(rows)
+
+
 def test_shares_are_tenths_and_the_first_of_equals_is_taken():
     every = np.ones(N + M, dtype=bool)
     noise = random_errors(1.0)[0]
     found = held_out(np.stack([noise, 0.1 * noise, 0.1 * noise]))
-    assert_array_equal(found.blend_weights(every), [0.0, 1.0, 0.0])
+    assert_array_equal(picked(found, every), [0.0, 1.0, 0.0])
     found = held_out(np.stack([noise, 0.5 * noise, -0.5 * noise]))
-    assert_array_equal(found.blend_weights(every), [0.0, 0.5, 0.5])  # their errors cancel
+    assert_array_equal(picked(found, every), [0.0, 0.5, 0.5])  # their errors cancel
     found = held_out(np.stack([noise, 0.25 * noise, -0.5 * noise]))
-    shares = found.blend_weights(every)
+    shares = picked(found, every)
     assert_allclose(shares.sum(), 1.0)
     assert_allclose(shares, [0.0, 0.7, 0.3])  # 2/3 and 1/3
     only = np.arange(N + M) < 7  # of some rows
     errors = np.stack([noise, 0.1 * noise, 0.1 * noise])
     errors[1, 7:] *= 100.0
-    assert_array_equal(held_out(errors).blend_weights(only), [0.0, 1.0, 0.0])
-    assert_array_equal(held_out(errors).blend_weights(~only), [0.0, 0.0, 1.0])
+    assert_array_equal(picked(held_out(errors), only), [0.0, 1.0, 0.0])
+    assert_array_equal(picked(held_out(errors), ~only), [0.0, 0.0, 1.0])
 
 
 @pytest.mark.parametrize("groups", [None, np.arange(N) // 4])
 def test_a_blend_is_taken_where_it_gains(groups):
     noise = random_errors(1.0)[0]
     found = held_out(np.stack([noise, 0.5 * noise, -0.5 * noise]), groups=groups)
-    shares, results = chosen_blend(NAMES, found)
-    assert_array_equal(shares, [0.0, 0.5, 0.5])
+    results = found.results()
+    assert_array_equal(found.weights, [0.0, 0.5, 0.5])
     assert results["chosen"] == "blend"
     assert results["candidate"] == [*NAMES, "blend"]
     assert results["weights"] == {"mechanical": 0.0, "left": 0.5, "right": 0.5}
-    off = np.linalg.norm(found.predicted - found.y, axis=2)
-    assert_allclose(results["mean_distance"], [*off[:, :N].mean(1), 0.0], atol=1e-15)
-    assert_allclose(results["io_distance"], [*off[:, N:].mean(1), 0.0], atol=1e-15)
+    off = np.linalg.norm(found.tips - found.y, axis=2)
+    outside = np.linalg.norm(found.outer.tips - found.outer.y, axis=2)
+    assert_allclose(results["mean_distance"], [*off.mean(1), 0.0], atol=1e-15)
+    assert_allclose(results["io_distance"], [*outside.mean(1), 0.0], atol=1e-15)
     assert results["expected_distance"] == results["mean_distance"][-1]
-    by_fold = [off[0, :N][np.arange(N) % 5 == k].mean() for k in range(5)]
+    by_fold = [off[0][np.arange(N) % 5 == k].mean() for k in range(5)]
     assert_allclose(results["std_distance"][0], np.std(by_fold, ddof=1))
 
 
@@ -103,9 +114,8 @@ def test_a_gain_in_one_motion_alone_is_not_sure():
     errors[1] = (
         errors[0] * np.where(np.concatenate([groups, groups[::4]]) == 0, 0.01, 1.05)[:, None]
     )
-    names = ["mechanical", "learned"]
-    assert chosen_blend(names, held_out(errors))[1]["chosen"] == "learned"
-    assert chosen_blend(names, held_out(errors, groups=groups))[1]["chosen"] == "mechanical"
+    assert held_out(errors).results()["chosen"] == "left"
+    assert held_out(errors, groups=groups).results()["chosen"] == "mechanical"
 
 
 def test_a_blend_is_scored_on_each_fold_with_weights_of_the_others():
@@ -113,19 +123,14 @@ def test_a_blend_is_scored_on_each_fold_with_weights_of_the_others():
     fold = np.arange(N) % 2
     y = np.zeros((N, 3))
     off = np.stack([np.full(N, 3.0), 0.8 * fold, 1.0 - fold])[..., None] * [1.0, 0.0, 0.0]
-    every = Predictions(y + off, y, np.ones(N), None)
-    both = HeldOut.of(every, every, np.append(fold, fold))
-    shares, results = chosen_blend(NAMES, both)
-    assert_array_equal(shares, [0.0, 1.0, 0.0])
+    both = table_of(y + off, y, np.ones(N), None, fold, y + off, np.arange(N))
+    results = both.results()
+    assert_array_equal(both.weights, [0.0, 1.0, 0.0])
+    assert_array_equal(both.fold_weights, [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
+    assert_allclose(np.linalg.norm(both.chosen.tips, axis=1).mean(), both.expected_error)
     assert_allclose(results["mean_distance"], [3.0, 0.4, 0.5, 0.9])
     assert_allclose(results["io_distance"], [3.0, 0.4, 0.5, 0.9])
     assert results["expected_distance"] == pytest.approx(0.9)
-
-
-def repeated(rows, many):
-    """Return predictions of rows, each as often as its place is in `many`."""
-    groups = None if rows.groups is None else rows.groups[many]
-    return Predictions(rows.predicted[:, many], rows.y[many], np.ones(len(many)), groups)
 
 
 @pytest.mark.parametrize("grouped", [False, True])
@@ -136,23 +141,28 @@ def test_weights_of_predictions_are_repetitions(grouped):
     errors = random_errors(1.2, 1.0, 0.9) + rng.uniform(-1.0, 1.0, (3, 1, 3))
     y = rng.standard_normal((N, 3))
     outer = np.arange(0, N, N // M)
-    of_folds = Predictions(y + errors[:, :N], y, counts, groups)
-    outside = Predictions(y[outer] + errors[:, N:], y[outer], counts[outer], None)
     fold = np.arange(N) % 5
-    weighed = HeldOut.of(of_folds, outside, np.append(fold, fold[outer]))
+    tips = y + errors[:, :N]
+    outer_tips = y[outer] + errors[:, N:]
+    weighed = table_of(tips, y, counts, groups, fold, outer_tips, outer)
     many = np.repeat(np.arange(N), counts.astype(int))
     further = np.repeat(np.arange(M), counts[outer].astype(int))
-    folds = np.append(fold[many], fold[outer][further])
-    twice = HeldOut.of(repeated(of_folds, many), repeated(outside, further), folds)
-    renamed = of_folds._replace(counts=7.0 * counts)
-    if grouped:
-        renamed = renamed._replace(groups=np.array([f"motion {k}" for k in groups]))
-    scaled = HeldOut.of(renamed, outside._replace(counts=7.0 * counts[outer]), weighed.fold)
-    shares, results = chosen_blend(NAMES, weighed)
+    twice = table_of(
+        tips[:, many],
+        y[many],
+        np.ones(len(many)),
+        groups[many] if grouped else None,
+        fold[many],
+        outer_tips[:, further],
+        np.searchsorted(many, outer[further]),
+    )
+    renamed = np.array([f"motion {k}" for k in groups]) if grouped else None
+    scaled = table_of(tips, y, 7.0 * counts, renamed, fold, outer_tips, outer)
+    shares, results = weighed.weights, weighed.results()
     assert 0.0 < shares[1] < 1.0
     for other in (twice, scaled):
-        other_shares, other_results = chosen_blend(NAMES, other)
-        assert_allclose(other_shares, shares)
+        other_results = other.results()
+        assert_allclose(other.weights, shares)
         assert other_results["chosen"] == results["chosen"]
         for name in ("mean_distance", "std_distance", "io_distance", "expected_distance"):
             assert_allclose(other_results[name], results[name], rtol=1e-12)
@@ -168,11 +178,11 @@ def test_the_gain_of_a_blend_is_weighted():
     errors = np.stack([noise, factor * noise])
     counts = np.where(often, 9.0, 1.0)
     found = held_out(errors, counts, np.arange(N) // 4)
-    _, results = chosen_blend(["mechanical", "learned"], found)
-    assert results["weights"]["learned"] > 0.5
+    results = found.results()
+    assert results["weights"]["left"] > 0.5
     assert_allclose(results["mean_distance"][:2], [1.0, (9.0 * 0.5 + 2.0) / 10.0])
     found = held_out(errors, None, np.arange(N) // 4)
-    assert chosen_blend(["mechanical", "learned"], found)[1]["chosen"] == "mechanical"
+    assert found.results()["chosen"] == "mechanical"
 
 
 class Recorded(NoCorrection):
@@ -188,25 +198,10 @@ class Recorded(NoCorrection):
 
 def test_the_radius_chooses_the_error_model_without_the_held_out_rows():
     model = Recorded()
-    found, messages = _radius.conformal_radius(Spec(CHAIN, model, coverage=0.5), Rows(*log(30)))
-    assert model.lengths == [24] * 5
-    assert messages == []
-    assert 0.0 < found.inside < inf
-
-
-def test_the_rows_of_the_radius_move_by_hysteresis_without_the_held_out_ones():
-    rows = Rows(*log(30))
-    model = Recorded()
-    without = []
-
-    def moved(held_out):
-        without.append(held_out)
-        return rows
-
-    _radius.conformal_radius(Spec(CHAIN, model, coverage=0.5), rows, moved)
-    expected = [test for _, test in KFold(5, shuffle=True, random_state=0).split(rows.X)]
-    for found, test in zip(without, expected, strict=True):
-        assert_array_equal(found, test)
+    found = fit_to_log(Spec(CHAIN, model, coverage=0.5), Rows(*log(30)))
+    assert model.lengths == [30] + [24] * 5
+    assert found.messages == ()
+    assert 0.0 < found.radius.inside < inf
 
 
 @pytest.mark.parametrize(

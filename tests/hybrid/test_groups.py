@@ -8,7 +8,6 @@ from sklearn.linear_model import Ridge
 
 from hybridkin import ConstantCurvatureChain, ELMRegressorCV, HybridForwardModel, calibrate
 from hybridkin.calibration.measured import inner_and_outer
-from hybridkin.hybrid import _selection
 from hybridkin.hybrid._error_models import (
     LinearModel,
     NoCorrection,
@@ -17,9 +16,8 @@ from hybridkin.hybrid._error_models import (
 )
 from hybridkin.hybrid._fit import fit_hybrid
 from hybridkin.hybrid._rows import Rows
-from hybridkin.hybrid._selection import Auto
-from hybridkin.hybrid._spec import FitStart, Spec
-from hybridkin.hybrid.held_out import chosen_blend
+from hybridkin.hybrid._selection import Auto, Settled
+from hybridkin.hybrid._spec import Spec
 
 CHAIN = ConstantCurvatureChain([0.05])
 NETWORK = ELMRegressorCV(40, weight_scales=(0.4,), relevance_rounds=0, max_hidden=0, random_state=0)
@@ -78,38 +76,33 @@ def test_the_candidates_of_auto_hold_out_motions(part):
     q, x, motions = repeated_motions()
     spec = Spec(CHAIN, Few(0), guard=None)
     fits = [fit_hybrid(spec, Rows(q, x, groups=groups)) for groups in (None, motions)]
-    assert fits[1].error.comparison["chosen"] == "mechanical"
+    rows = Rows(q, x, groups=motions)
+    assert Settled.of(fits[1], rows).table().results()["chosen"] == "mechanical"
     if part:  # with a start that suits the noise
-        near = spec.starting_at(FitStart(fits[0].error.settled, None))
-        fits[1] = fit_hybrid(near, Rows(q, x, groups=motions))
+        near = spec.starting_at(fits[0].error.settled, ())
+        fits[1] = fit_hybrid(near, rows)
     corrections = []
     for fitted in fits:
         with torch.no_grad():
-            tips = fitted.error.candidates["quadratic"](torch.from_numpy(q))
+            tips = fitted.error.candidates["quadratic"].module(torch.from_numpy(q))
         corrections.append(correction(tips, q))
     assert corrections[0] > 5e-3
     assert corrections[1] < 0.4 * corrections[0]
 
 
-def test_the_gain_of_a_blend_is_that_of_whole_motions(monkeypatch):
+def test_the_gain_of_a_blend_is_that_of_whole_motions():
     """Its score has every row in the fold of its motion, outer rows again, and the motion."""
-    given = []
-
-    def recorded(names, held_out, geometry):
-        given.append(held_out)
-        return chosen_blend(names, held_out, geometry)
-
-    monkeypatch.setattr(_selection, "chosen_blend", recorded)
     q, x, motions, _ = learnable()
-    fit_hybrid(Spec(CHAIN, FewAtTip(0), guard=None), Rows(q, x, groups=motions))
-    (held_out,) = given
-    assert_array_equal(held_out.groups, motions)
+    rows = Rows(q, x, groups=motions)
+    table = Settled.of(fit_hybrid(Spec(CHAIN, FewAtTip(0), guard=None), rows), rows).table()
+    assert_array_equal(table.groups, motions)
+    scored = table._all_rows
     outer = inner_and_outer(q)[1]
-    assert_array_equal(held_out.y, np.concatenate([x, x[outer]]))
-    fold_of_motion = [np.unique(held_out.fold[: len(q)][motions == k]) for k in range(8)]
+    assert_array_equal(scored.y, np.concatenate([x, x[outer]]))
+    fold_of_motion = [np.unique(table.fold[motions == k]) for k in range(8)]
     assert sorted(np.concatenate(fold_of_motion)) == list(range(8))
     assert_array_equal(
-        held_out.fold, np.concatenate(fold_of_motion)[np.append(motions, motions[outer])]
+        scored.fold, np.concatenate(fold_of_motion)[np.append(motions, motions[outer])]
     )
 
 
@@ -197,5 +190,5 @@ def test_names_of_motions_and_the_order_of_rows_do_not_matter(choice, monkeypatc
     other = HybridForwardModel(CHAIN, kind, **options).fit(q[order], x[order], groups=names[order])
     assert_allclose(other.predict(new), one.predict(new), rtol=0, atol=1e-8)
     assert_array_equal(other.in_domain(new), one.in_domain(new))
-    assert other._fitted.error.noise == pytest.approx(one._fitted.error.noise, rel=1e-6)
+    assert other._fit.error.noise == pytest.approx(one._fit.error.noise, rel=1e-6)
     assert np.abs(one.predict_error(new)).max() > 5e-3

@@ -131,7 +131,7 @@ def test_a_hybrid_says_what_few_rows_leave(kind, tmp_path):
     words = str(model.fit(q.numpy(), x).html_rows()["structure"])
     for part in ("25 rows: structural model", "100 rows like these", "Structure: "):
         assert part in words
-    expected = MEAN_LENGTH * model._fitted.error.noise
+    expected = MEAN_LENGTH * model._fit.error.noise
     assert f"expect {1e3 * expected:.2g} mm" in words
     path = tmp_path / "model.safetensors"
     save_model(model, path)

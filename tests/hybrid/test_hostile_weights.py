@@ -42,7 +42,7 @@ def answers(model, commands, x, weights):
         warnings.simplefilter("ignore")
         model.fit(commands, x, weights, np.arange(N) // 5)
         fitted = model.predict(commands), model.score(commands, x, weights)
-        record = model._fitted
+        record = model._fit
         found = record.error.noise, record.training_range, record.fitted_rows
         model.partial_fit(commands, x, weights)
         return *fitted, *found, model.predict(commands), model.effective(commands)

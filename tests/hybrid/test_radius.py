@@ -11,8 +11,7 @@ from hybridkin import (
     HybridForwardModel,
     robots,
 )
-from hybridkin.hybrid._radius import _quantile
-from hybridkin.hybrid.estimator import prepared, with_fit
+from hybridkin.hybrid._radius import covering_distance
 from hybridkin.hybrid.log_fit import fit_to_log
 
 
@@ -39,8 +38,9 @@ def few(n, coverage, groups=True, error_model="drop"):
     """Return a fit to few motions, its warnings, and its rows."""
     q, x, motion = motions(0, n, 4)
     model = HybridForwardModel(robots.bionic_handling_assistant(), error_model, coverage=coverage)
-    fitted = fit_to_log(*prepared(model, q, x, motion if groups else None))
-    return with_fit(model, fitted), fitted.messages, q
+    fitted = fit_to_log(*model.prepared(q, x, groups=motion if groups else None))
+    model.take_fit(fitted)
+    return model, fitted.messages, q
 
 
 @pytest.mark.parametrize(("n", "finite"), [(8, False), (9, True)])
@@ -56,11 +56,11 @@ def test_every_group_has_the_same_mass():
     values, groups = np.array([1.0, 2.0, 3.0, 5.0, 4.0, 6.0]), np.array([0, 0, 0, 0, 1, 2])
     ones = np.ones(6)
     # Masses: 1/16 for each value of the first group, 1/4 for 4 and for 6.
-    assert _quantile(values, groups, ones, 3 / 16) == 3.0
-    assert _quantile(values, groups, ones, 7 / 16) == 4.0
-    assert _quantile(values, groups, ones, 0.5) == 5.0
-    assert _quantile(values, groups, ones, 0.75) == 6.0
-    assert _quantile(values, groups, ones, 0.76) == np.inf
+    assert covering_distance(values, groups, ones, 3 / 16) == 3.0
+    assert covering_distance(values, groups, ones, 7 / 16) == 4.0
+    assert covering_distance(values, groups, ones, 0.5) == 5.0
+    assert covering_distance(values, groups, ones, 0.75) == 6.0
+    assert covering_distance(values, groups, ones, 0.76) == np.inf
 
 
 @pytest.mark.slow
@@ -111,7 +111,7 @@ def test_a_radius_of_two_motions_holds_out_one_and_then_rows(n, error_model):
     model = HybridForwardModel(
         chain, error_model, calibrate=["radii"], coverage=0.5, random_state=0
     )
-    fitted = fit_to_log(*prepared(model, q, x, motion))
+    fitted = fit_to_log(*model.prepared(q, x, groups=motion))
     told = any("`coverage`" in text for text in fitted.messages)
     assert (fitted.radius.inside < 0.2) == (not told)
     with pytest.raises(ValueError, match="`groups` must hold at least two motions"):

@@ -18,10 +18,11 @@ from hybridkin import (
 )
 from hybridkin.hybrid import _hysteresis
 from hybridkin.hybrid._error_models import NoCorrection
-from hybridkin.hybrid._hysteresis import FoundHysteresis, choose_hysteresis, moved_without
+from hybridkin.hybrid._hysteresis import FoundHysteresis, choose_hysteresis
 from hybridkin.hybrid._range import state_range
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._spec import Spec
+from hybridkin.hybrid.log_fit import Anew
 
 CHAIN = ConstantCurvatureChain([0.05])
 PLAY = Hysteresis.backlash(0.02)
@@ -81,7 +82,7 @@ def test_runs_and_times_have_no_effect_without_hysteresis(error_model):
         model = HybridForwardModel(CHAIN, error_model).fit(X, x[twice])
         models.append(model)
     assert_array_equal(models[1].predict(q), models[0].predict(q))
-    assert models[1]._fitted.error.noise == models[0]._fitted.error.noise
+    assert models[1]._fit.error.noise == models[0]._fit.error.noise
     for X, model in zip((q[twice], commands), models, strict=True):
         model.partial_fit(X, x[twice] + 0.01)
     assert_array_equal(models[1].predict(commands), models[0].predict(q[twice]))
@@ -170,17 +171,19 @@ def test_what_is_held_out_has_no_say_in_the_hysteresis():
     log = Rows(q, tips(PLAY.apply_by_group(q, runs)), groups=runs)
     weights = np.where(np.arange(len(q)) % 5, 1.0, 0.0)
     measured = np.flatnonzero(weights)
-    held_out = np.flatnonzero(runs[measured] == 1)
+    is_held_out = runs[measured] == 1
+    train, test = np.flatnonzero(~is_held_out), np.flatnonzero(is_held_out)
     spec = Spec(CHAIN, NoCorrection(), hysteresis=FoundHysteresis())
-    moved = []
+    found = []
     for wrong in (0.0, 0.1):
         y = log.y.copy()
         y[weights == 0.0] += wrong
-        y[measured[held_out]] -= wrong
-        rows = moved_without(spec, replace(log, y=y, weights=weights), held_out)
-        moved.append(rows.X)
-    assert_array_equal(moved[1], moved[0])
-    assert_allclose(moved[0], PLAY.apply_by_group(q, runs)[measured], rtol=0, atol=1e-3)
+        y[measured[test]] -= wrong
+        found.append(Anew(spec, replace(log, y=y, weights=weights)).held_out(train, test))
+    assert_array_equal(found[1].tips, found[0].tips)
+    moved = PLAY.apply_by_group(q, runs)[measured[test]]
+    assert_allclose(found[0].tips[0], tips(moved), rtol=0, atol=1e-3)
+    assert found[0].choice.hysteresis
 
 
 @pytest.mark.parametrize("mechanical", [CHAIN, None])

@@ -77,7 +77,7 @@ def test_it_says_what_it_chose(chosen):
     # Penalties chosen on 50 motions hardly suit one of them more than new ones.
     of_chosen = 0 if shares[results["candidate"][0]] == 1.0 else -1
     assert results["expected_distance"] == results["mean_distance"][of_chosen]
-    assert chosen._fitted.error.noise == pytest.approx(results["expected_distance"] / 1.596)
+    assert chosen._fit.error.noise == pytest.approx(results["expected_distance"] / 1.596)
 
 
 @pytest.mark.slow

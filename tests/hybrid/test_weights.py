@@ -28,7 +28,7 @@ from hybridkin.hybrid._error_models import NoCorrection, RegressorModel
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._selection import Auto
 from hybridkin.hybrid._spec import UNREFINED, Spec
-from hybridkin.hybrid.held_out import HeldOut, Predictions, chosen_blend
+from hybridkin.hybrid.held_out import CrossFit, Outer, Predictions
 from hybridkin.hybrid.log_fit import fit_to_log
 
 SERIAL = ("elm", "linear", "quadratic", "pose", "network")
@@ -65,8 +65,8 @@ def assert_equal_models(weighed, repeated, weights, new, atol=1e-10):
     assert_allclose(weighed.predict(new), repeated.predict(new), rtol=0, atol=atol)
     assert_allclose(weighed.error_weight(new), repeated.error_weight(new), rtol=0, atol=1e-8)
     assert weighed.radius_ == pytest.approx(repeated.radius_)
-    noise = weighed._fitted.error.noise
-    assert noise == pytest.approx(repeated._fitted.error.noise, rel=0, abs=atol, nan_ok=True)
+    noise = weighed._fit.error.noise
+    assert noise == pytest.approx(repeated._fit.error.noise, rel=0, abs=atol, nan_ok=True)
     for name in ("residual", "left_out_errors_"):
         if hasattr(weighed.error_model_, name):
             one, many = (getattr(model.error_model_, name) for model in (weighed, repeated))
@@ -105,7 +105,7 @@ def test_weights_are_repetitions_that_are_not_merged(coupling, kind, log):
     weighed = hybrid(kind, coupling, guard=None).fit(q, x, weights, motions)
     repeated = hybrid(kind, coupling, guard=None).fit(q[many], apart, groups=motions[many])
     if (coupling, kind) == ("parallel", "elm"):  # its noise is that of rows without all copies
-        repeated._fitted = weighed._fitted
+        repeated._fit = weighed._fit
     assert_equal_models(weighed, repeated, weights, new, atol=3e-8)
 
 
@@ -143,7 +143,7 @@ def test_the_noise_and_the_guard_of_a_network_are_those_of_fits_without_each_row
         leverage.append(alone.leverage(q[[row]])[0])
     model = HybridForwardModel(ConstantCurvatureChain([0.06]), network).fit(q, x, weights)
     variances = np.average(np.square(left_out), axis=0, weights=weights)
-    assert model._fitted.error.noise == pytest.approx(variances.mean() ** 0.5)
+    assert model._fit.error.noise == pytest.approx(variances.mean() ** 0.5)
     assert model.module_.corrections[0].guard.limit.item() == pytest.approx(max(leverage))
 
 
@@ -151,7 +151,7 @@ def test_the_noise_of_a_regressor_that_overfits_is_a_part_of_what_it_learned(log
     """A fifth of the spread about the mean, over rows as often as they count."""
     q, x, weights, _, error = counted(log)
     model = HybridForwardModel(ConstantCurvatureChain([0.06]), KNeighborsRegressor(1))
-    noise = model.fit(q, x, weights)._fitted.error.noise
+    noise = model.fit(q, x, weights)._fit.error.noise
     spread = np.repeat(error, weights.astype(int), axis=0).var(axis=0).mean() ** 0.5
     assert noise == pytest.approx(0.2 * spread)
     assert noise != pytest.approx(0.2 * error.var(axis=0).mean() ** 0.5, rel=1e-3)
@@ -214,18 +214,12 @@ def test_the_selection_compares_weighted_fits_without_the_rows_that_it_predicts(
         splits = [*GroupKFold(6, shuffle=True, random_state=0).split(q, groups=motions)]
     else:
         splits = [*KFold(10, shuffle=True, random_state=0).split(q)]
-    held_out = np.empty((3, *x.shape))
-    fold = np.empty(len(q), dtype=int)
-    for k, (train, test) in enumerate(splits):
-        held_out[:, test] = predicted(train, test)
-        fold[test] = k
     inner, outer = inner_and_outer(q)
-    both = HeldOut.of(
-        Predictions(held_out, x, weights, groups),
-        Predictions(predicted(inner, outer), x[outer], weights[outer], None),
-        np.append(fold, fold[outer]),
-    )
-    shares, expected = chosen_blend(results["candidate"][:-1], both)
+    inside = np.ones((3, 1), dtype=bool)
+    held_out = [Predictions(predicted(*split), inside) for split in splits]
+    beyond = Outer(predicted(inner, outer), x[outer], weights[outer], outer)
+    both = CrossFit.of(results["candidate"][:-1], rows, splits, held_out, beyond)
+    shares, expected = both.weights, both.results()
     # Calibrations of a comparison end at 1e-5 of its errors; a pick, 0.1, may be close.
     assert_allclose([*results["weights"].values()], shares, atol=0.11)
     for name in ("mean_distance", "std_distance", "io_distance"):
@@ -241,7 +235,7 @@ def test_weights_and_motions_reach_the_choice_of_parameters(log):
     chain = ConstantCurvatureChain([0.06])
     model = HybridForwardModel(chain, "drop", calibrate="auto").fit(q, x, weights, motions)
     choice = choose_geometry(chain, q, x, groups=motions, weights=weights, outside=False)
-    assert model._fitted.geometry.errors == choice.errors
+    assert model._fit.geometry.errors == choice.errors
     plain = choose_geometry(chain, q, x, groups=motions, outside=False)
     assert plain.errors["nothing"].cv != pytest.approx(choice.errors["nothing"].cv, rel=0.01)
 

@@ -68,4 +68,4 @@ def test_every_hysteresis_of_a_fit_is_loaded(k, name, tmp_path):
     twin = loaded(model, tmp_path)
     assert_array_equal(twin.predict(rows), model.predict(rows))
     if model.hysteresis_:
-        assert_array_equal(twin._states_of_log, model._states_of_log)
+        assert_array_equal(twin._fit.state_range, model._fit.state_range)

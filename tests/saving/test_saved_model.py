@@ -107,7 +107,7 @@ def test_every_kind_comes_back_with_its_settings(tmp_path, kind, fitted):
         assert_equal(twin.cv_results_, model.cv_results_)
         assert_array_equal(twin._drift.moment, model._drift.moment)
         for name in ("noise", "rejected", "held_out"):  # what adapt and notebooks read
-            assert_equal(getattr(twin._fitted.error, name), getattr(model._fitted.error, name))
+            assert_equal(getattr(twin._fit.error, name), getattr(model._fit.error, name))
         for name in ("radius_", "training_range_"):
             assert_equal(getattr(twin, name), getattr(model, name))
 
@@ -119,8 +119,8 @@ def test_a_file_knows_that_no_correction_was_taken(tmp_path):
     model = HybridForwardModel(chain, "linear")
     model.fit(q, chain(torch.from_numpy(q)).numpy() + noise, groups=groups)
     save_model(model, tmp_path / "model")
-    assert model._fitted.error.rejected
-    assert load_model(tmp_path / "model")._fitted.error.rejected
+    assert model._fit.error.rejected
+    assert load_model(tmp_path / "model")._fit.error.rejected
 
 
 def test_a_loaded_model_of_one_output_is_adapted_without_its_drift(tmp_path):
@@ -184,7 +184,7 @@ def test_the_header_describes_the_model(tmp_path, fitted):
     adapted = fitted["adapted"][0]
     save_model(adapted, path)
     assert np.abs(adapted.change_.shift).min() > 1e-6
-    low, high = adapted._fitted.training_range
+    low, high = adapted._fit.training_range
     assert_allclose(model_header(path)["domain"]["q_low"], low - adapted.change_.shift)
     assert_allclose(model_header(path)["domain"]["q_high"], high - adapted.change_.shift)
     save_model(arm(), path)

@@ -11,29 +11,31 @@ from pathlib import Path
 
 import numpy as np
 
-from hybridkin import HybridForwardModel, robots, save_model
+from hybridkin import CrossFit, HybridForwardModel, robots, save_model
 from hybridkin.app.workflow.calibrated import Calibration, deviations
-from hybridkin.app.workflow.choices import auto_in_words, choice_in_words
+from hybridkin.app.workflow.choices import (
+    auto_in_words,
+    choice_in_words,
+    choices_by_fold,
+)
 from hybridkin.app.workflow.compare import (
     AUTO,
     DATA_QUADRATIC,
     DEFAULTS,
     NOMINAL,
-    Comparison,
     FitSettings,
     Mechanical,
-    columns_to_fit,
-    compare_by_group,
-    fit_to_all,
+    compare,
     with_hysteresis_detected,
 )
 from hybridkin.app.workflow.counts import Counts
-from hybridkin.app.workflow.errors import HeldOutErrors, Promise
+from hybridkin.app.workflow.errors import HeldOutErrors, Promise, marker_distances
 from hybridkin.app.workflow.explained import explained_in_words
 from hybridkin.app.workflow.fit_record import (
     FitRecord,
     add_error_figures,
     errors_of_markers,
+    errors_of_rows,
     largest_errors,
     training_notes,
     write_comparison,
@@ -43,8 +45,6 @@ from hybridkin.app.workflow.log import MeasuredLog, checked
 from hybridkin.app.workflow.model import log_unit, plane_in_words
 from hybridkin.app.workflow.report import Progress, Report, check_out, quiet
 from hybridkin.datasets import Log
-from hybridkin.hybrid.estimator import prepared, with_fit
-from hybridkin.hybrid.log_fit import fit_to_log
 
 _FILES = ("model.safetensors", "robot.toml", "held_out.png", "error_histogram.png")
 
@@ -70,7 +70,7 @@ def fit_log(
     ----------
     log : Log
         As from `read_log` or `datasets.load_log`.
-    robot : RobotDescription
+    robot : robots.RobotDescription
         As from `robots.read_description`.
     out : str or Path
         Folder to write into.
@@ -80,7 +80,7 @@ def fit_log(
         Fit even if the check of the log finds errors, and replace files of `out` that `fit` did
         not write.
     n_jobs, progress
-        As in `compare_by_group`.
+        As for `hybridkin.cross_fit`.
 
     Returns
     -------
@@ -108,24 +108,21 @@ def fit_log(
     settings = with_hysteresis_detected(settings, rows, mechanical)
     if not settings.follows_order:
         rows = measured
-    fitted = fit_to_all(rows, robot, settings, mechanical, progress)
-    compared = compare_by_group(
-        rows, robot, settings, fitted, n_jobs=n_jobs, progress=progress
+    compared = compare(
+        rows, robot, settings, mechanical, n_jobs=n_jobs, progress=progress
     )
     saved = AUTO if settings.auto else _best_to_save(compared)
-    model = fitted.models[saved]
-    fit = fitted.fits[saved]
-    if settings.coverage is not None and not settings.auto:
-        model.set_params(coverage=settings.coverage)
-        fit = fit_to_log(*prepared(model, *columns_to_fit(model, measured)))
-    fit = fit.of_all_rows(complete.q, complete.x)
-    model = with_fit(model, fit.expecting(float(compared.errors[saved].mean())))
+    model = compared.models[saved]
+    if model.calibrate == mechanical.geometry:
+        model.set_params(calibrate=robot.calibrate)
+    model.count_as_fitted(complete.q, complete.x)
     model.described(replace(model.description_, robot=robot))
     progress("writing the report", 0, 1)
     held_out = {}
-    for name, errors in compared.errors.items():
+    errors = errors_of_rows(compared)
+    for name, of_model in errors.items():
         held_out[name] = HeldOutErrors.of_motions(
-            errors, measured.motions, compared.fold
+            of_model, measured.motions, compared.fold
         )
     record = FitRecord(
         log=Path(log.source).name,
@@ -140,14 +137,16 @@ def fit_log(
         saved=saved,
         chosen=choice_in_words(model, rows.q_unit),
         held_out=held_out,
-        promise=Promise.of(compared.errors[saved], compared.distance),
+        promise=Promise.of(errors[saved], compared.distances_from_others),
         counts=None
         if robot.log is None
         else Counts.of_log(robot.log.to_log(complete.q)),
-        choices_by_fold=compared.choices,
+        choices_by_fold=choices_by_fold(compared, rows.q_unit),
         log_check=complete.report,
-        worst=largest_errors(compared, measured.motions),
-        markers=errors_of_markers(compared.markers[saved]),
+        worst=largest_errors(errors, measured.motions),
+        markers=errors_of_markers(
+            marker_distances(compared.tips[compared.names.index(saved)], compared.y)
+        ),
         auto=model.cv_results_,
         words=[
             explained_in_words(held_out, rows, model),
@@ -159,7 +158,7 @@ def fit_log(
     )
     report = Report(f"{robot.name}: hybrid model of {record.log}", record)
     write_comparison(report)
-    add_error_figures(report, compared.errors)
+    add_error_figures(report, errors)
     write_model(report)
     _add_model(report, model, robot)
     report.write(out)
@@ -194,12 +193,12 @@ def _suspicions(log: MeasuredLog, mechanical: Mechanical) -> list[str]:
     return [*misread, *deviations(mechanical.start, mechanical.result, log.q_unit)]
 
 
-def _best_to_save(compared: Comparison) -> str:
+def _best_to_save(compared: CrossFit) -> str:
     """Return the model of least mean error that stays near a mechanical or linear model."""
     means = {}
     for name, errors in compared.errors.items():
         if name not in (NOMINAL, DATA_QUADRATIC):
-            means[name] = errors.mean()
+            means[name] = errors.mean
     return min(means, key=means.__getitem__)
 
 
@@ -218,7 +217,7 @@ def _in_words(model: HybridForwardModel) -> list[str]:
     """Return what a model chose and expects, its error radius, and motions that its log lacks."""
     words = [
         *auto_in_words(model, log_unit(model)),
-        *model._fitted.error.structure_in_words(),
+        *model.structure_in_words(),
     ]
     if model.radius_ is not None:
         words.append(f"Estimated error radius: {model.radius_}.")

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import hybridkin
+from hybridkin import CrossFit
 from hybridkin.app import LogReport
 from hybridkin.app.workflow.calibrated import Calibration
 from hybridkin.app.workflow.compare import (
@@ -17,7 +18,6 @@ from hybridkin.app.workflow.compare import (
     CALIBRATED,
     DATA_LINEAR,
     HYBRID_ELM,
-    Comparison,
 )
 from hybridkin.app.workflow.counts import Counts
 from hybridkin.app.workflow.errors import Errors, HeldOutErrors, Promise
@@ -223,14 +223,19 @@ def shown_models(compared: Mapping[str, object]) -> list[str]:
     return [name for name in _SHOWN if name in compared]
 
 
-def largest_errors(compared: Comparison, motions: NDArray) -> list[MotionErrors]:
+def errors_of_rows(compared: CrossFit) -> dict[str, NDArray]:
+    """Return the error of each row (N,) by model [m]; for several markers their mean."""
+    return dict(zip(compared.names, compared.distances, strict=True))
+
+
+def largest_errors(
+    errors: Mapping[str, NDArray], motions: NDArray
+) -> list[MotionErrors]:
     """Return the motions with the largest errors of the last of the `shown_models`."""
     names, motion = np.unique(motions, return_inverse=True)
     counts = np.bincount(motion)
-    shown = shown_models(compared.errors)
-    means = {
-        name: np.bincount(motion, compared.errors[name]) / counts for name in shown
-    }
+    shown = shown_models(errors)
+    means = {name: np.bincount(motion, errors[name]) / counts for name in shown}
     entries = []
     for k in np.argsort(means[shown[-1]])[::-1][:_MOST]:
         of_motion = {name: float(means[name][k]) for name in shown}

@@ -1,27 +1,27 @@
 """What held-out motions may not change in the comparison of models, with the starts of its fits."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 
 from hybridkin import ConstantCurvatureChain, HybridForwardModel, datasets, robots
 from hybridkin.app.workflow import FitSettings
+from hybridkin.app.workflow.choices import choices_by_fold
 from hybridkin.app.workflow.compare import (
     AUTO,
     Mechanical,
-    _AutoOfFold,
-    _blended,
-    compare_by_group,
-    fit_to_all,
+    _models_for,
+    compare,
+    models_of,
     with_hysteresis_detected,
 )
 from hybridkin.app.workflow.log import checked
-from hybridkin.hybrid.estimator import prepared, with_fit
-from hybridkin.hybrid.held_out import Predictions
-from hybridkin.hybrid.log_fit import fit_to_log
+from hybridkin.hybrid.cross_fit import _held_out_anew, _WeightedLog
+from hybridkin.hybrid.log_fit import fit_once
 
 
 def measured(n_motions, n_rows=14):
@@ -38,12 +38,11 @@ def measured(n_motions, n_rows=14):
 
 
 def compared(robot, rows, **settings):
-    """Return the fit to all rows, the comparison, and its settings."""
+    """Return the calibration to all rows, the comparison, and its settings."""
     settings = FitSettings(**settings)
     mechanical = Mechanical.of(robot, rows, settings.loss)
     settings = with_hysteresis_detected(settings, rows, mechanical)
-    fitted = fit_to_all(rows, robot, settings, mechanical)
-    return fitted, compare_by_group(rows, robot, settings, fitted, n_jobs=1), settings
+    return mechanical, compare(rows, robot, settings, mechanical, n_jobs=1), settings
 
 
 @pytest.mark.slow
@@ -53,45 +52,29 @@ def compared(robot, rows, **settings):
 def test_a_held_out_motion_does_not_change_its_own_predictions(settings):
     """Only the starts of the searches know it; the blend has its own test."""
     robot, rows = measured(6)
-    fitted, before, settings = compared(robot, rows, n_folds=3, **settings)
-    x = rows.x.copy()
-    x[before.fold == 0] += [0.3, -0.2, 0.5]
-    after = compare_by_group(replace(rows, x=x), robot, settings, fitted, n_jobs=1)
+    mechanical, before, settings = compared(robot, rows, n_folds=3, **settings)
     held_out = before.fold == 0
-    assert before.tips.keys() == after.tips.keys()
-    for name in before.tips.keys() - {AUTO}:
-        assert_allclose(
-            before.tips[name][held_out], after.tips[name][held_out], rtol=0.0, atol=1e-12
-        )
-        assert np.abs(before.tips[name] - after.tips[name])[~held_out].max() > 1e-3
-    if settings.auto:
-        assert AUTO in before.tips
-        assert all(AUTO in choice for choice in before.choices)
-
-
-def test_the_weights_of_a_fold_are_chosen_by_the_other_folds():
-    """The model that is exact in the first fold, and wrong elsewhere, gets no weight there."""
-    _, rows = measured(6)
-    fold = np.arange(len(rows.q)) // 28
-    rng = np.random.default_rng(1)
-    predicted = rows.x + 1e-4 * rng.standard_normal((3, *rows.x.shape))
-    predicted[0] += 0.01  # as mechanical
-    predicted[1, fold != 0] += 0.005
-    predicted[1, fold == 0] = rows.x[fold == 0]
-    autos = []
-    for k in range(3):
-        places = np.flatnonzero(fold != k)[::4]
-        outside = Predictions(
-            predicted[:, places], rows.x[places], np.ones(len(places)), rows.motions[places]
-        )
-        autos.append(_AutoOfFold(["mechanical", "first", "all"], outside, None, ""))
-    blend, words = _blended(rows, fold, predicted, autos)
-    assert words[0] == "all"
-    assert_array_equal(blend[fold == 0], predicted[2, fold == 0])
+    train, test = np.flatnonzero(~held_out), np.flatnonzero(held_out)
     x = rows.x.copy()
-    x[fold == 0] += rng.standard_normal(3)
-    again, _ = _blended(replace(rows, x=x), fold, predicted, autos)
-    assert_array_equal(blend[fold == 0], again[fold == 0])
+    x[held_out] += [0.3, -0.2, 0.5]
+    starts = {}
+    for name, model in models_of(robot, mechanical, settings).items():
+        fit = fit_once(*_WeightedLog(rows, rows.counts).prepared(model))
+        starts[name] = (fit.fitted.error.settled, fit.starts)
+    of_fold = partial(_models_for, robot, settings, mechanical)
+    found = []
+    for log in (rows, replace(rows, x=x)):
+        weighted = _WeightedLog(log, log.counts)
+        found.append(_held_out_anew(of_fold, weighted, starts, train, test))
+    for name, predictions in found[0].items():
+        assert_allclose(predictions.tips, found[1][name].tips, rtol=0.0, atol=1e-12)
+        assert_allclose(
+            predictions.tips, before.tables[name].tips[:, held_out], rtol=0.0, atol=1e-12
+        )
+    assert before.names[-1] == AUTO or not settings.auto
+    words = choices_by_fold(before, rows.q_unit)
+    if settings.auto:
+        assert all(AUTO in choice for choice in words)
 
 
 @pytest.mark.slow
@@ -99,7 +82,7 @@ def test_the_weights_of_a_fold_are_chosen_by_the_other_folds():
 def test_few_motions_are_compared(n_motions, n_folds):
     robot, rows = measured(n_motions)
     _, comparison, _ = compared(robot, rows, n_folds=n_folds)
-    errors = {name: e.mean() for name, e in comparison.errors.items()}
+    errors = {name: e.mean for name, e in comparison.errors.items()}
     assert all(np.isfinite(error) for error in errors.values())
     assert errors[AUTO] <= 1.05 * errors["mechanical, calibrated"]
 
@@ -110,10 +93,9 @@ def test_a_fit_near_another_one_chooses_as_from_nothing():
     robot, rows = measured(6)
     for error_model in ("linear", "quadratic"):
         model = HybridForwardModel(robot.chain, error_model, coupling="serial")
-        spec, log = prepared(model, rows.q, rows.x, rows.motions)
-        fitted = fit_to_log(spec, log)
-        near = fit_to_log(spec.starting_at(fitted.start), log)
-        assert near.error.result.alphas == fitted.error.result.alphas
-        x = with_fit(model, fitted).predict(rows.q)
-        x_near = with_fit(model, near).predict(rows.q)
-        assert_allclose(x_near, x, rtol=0.0, atol=1e-7)
+        spec, log = model.prepared(rows.q, rows.x, groups=rows.motions)
+        fitted = fit_once(spec, log)
+        near = fit_once(spec.starting_at(fitted.fitted.error.settled, ()), log)
+        assert near.fitted.error.result.alphas == fitted.fitted.error.result.alphas
+        x = fitted.fitted.predict(rows.q)
+        assert_allclose(near.fitted.predict(rows.q), x, rtol=0.0, atol=1e-7)

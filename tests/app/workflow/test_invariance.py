@@ -18,7 +18,7 @@ from hybridkin import (
 )
 from hybridkin.app import workflow
 from hybridkin.app.workflow import FitSettings
-from hybridkin.app.workflow.compare import Mechanical, compare_by_group, fit_to_all
+from hybridkin.app.workflow.compare import Mechanical, compare
 from hybridkin.app.workflow.domain import Domain
 from hybridkin.app.workflow.errors import Errors, HeldOutErrors, Promise
 from hybridkin.app.workflow.fit_record import largest_errors
@@ -87,13 +87,8 @@ def test_a_promise_has_the_unit_of_its_errors_and_counts_rows():
     assert np.ptp(expected.mean) == pytest.approx(2.0 * plain["per_distance"])
 
 
-class Compared:
-    """Errors of two models, as a comparison has them."""
-
-    errors = {  # noqa: RUF012
-        "mechanical, calibrated": 1e-3 * np.ones(30),
-        "hybrid, auto": ERRORS,
-    }
+# Errors of two models, as a comparison has them.
+COMPARED = {"mechanical, calibrated": 1e-3 * np.ones(30), "hybrid, auto": ERRORS}
 
 
 def test_the_motions_of_largest_errors_are_those_of_largest_means():
@@ -101,7 +96,7 @@ def test_the_motions_of_largest_errors_are_those_of_largest_means():
     means = np.array([ERRORS[MOTIONS == k].mean() for k in range(5)])
     names = np.array([*"zaqmk"])
     for labels in (names[MOTIONS], MOTIONS):
-        entries = largest_errors(Compared, labels)
+        entries = largest_errors(COMPARED, labels)
         order = np.argsort(means)[::-1]
         shown = names if labels.dtype.kind == "U" else np.arange(5)
         assert [entry.motion for entry in entries] == [str(shown[k]) for k in order]
@@ -383,18 +378,17 @@ def test_a_comparison_does_not_depend_on_units_and_names(tmp_path, sign):
         log = Log(q / gains, x, labels, time=0.1 * np.arange(60.0) + 1e3 * (sign < 0.0))
         rows = checked(log, chain, base_is_free=True)
         mechanical = Mechanical.of(robot, rows, "linear")
-        fitted = fit_to_all(rows, robot, settings, mechanical)
-        found.append(compare_by_group(rows, robot, settings, fitted, n_jobs=1))
+        found.append(compare(rows, robot, settings, mechanical, n_jobs=1))
     ours, theirs = found
     assert_array_equal(ours.fold, theirs.fold)
     assert all(len({*ours.fold[motions == k]}) == 1 for k in range(4))  # whole motions
-    assert_allclose(theirs.distance, ours.distance, rtol=1e-6, atol=1e-9)
-    assert ours.errors.keys() == theirs.errors.keys()
-    for name in ours.errors:
+    assert_allclose(theirs.distances_from_others, ours.distances_from_others, rtol=1e-6, atol=1e-9)
+    assert ours.names == theirs.names
+    for name, error, other in zip(ours.names, ours.distances, theirs.distances, strict=True):
         if sign < 0.0 and "ELM" in name:
             continue  # its random features are other ones of mirrored inputs
         # Searches of the calibration end within 1e-8 of its unit.
-        assert_allclose(theirs.errors[name], ours.errors[name], rtol=0, atol=1e-6, err_msg=name)
+        assert_allclose(other, error, rtol=0, atol=1e-6, err_msg=name)
 
 
 def backlash(q):

@@ -18,10 +18,10 @@ from hybridkin import (
 )
 from hybridkin.app import workflow
 from hybridkin.app.cli.main import main
+from hybridkin.app.workflow.choices import choices_by_fold
 from hybridkin.app.workflow.compare import (
     Mechanical,
-    compare_by_group,
-    fit_to_all,
+    compare,
     with_hysteresis_detected,
 )
 from hybridkin.app.workflow.domain import Domain
@@ -78,10 +78,9 @@ def test_play_lowers_the_errors_of_auto_on_held_out_motions(playful):
     settings = workflow.FitSettings(n_folds=2, hysteresis=4e-4)
     log = checked(log, robot.chain, base_is_free=True)
     mechanical = Mechanical.of(robot, log, settings.loss)
-    fitted = fit_to_all(log, robot, settings, mechanical)
-    compared = compare_by_group(log, robot, settings, fitted, n_jobs=1)
-    errors, choices = compared.errors, compared.choices
-    assert errors["hybrid, auto"].mean() < 0.1 * errors["mechanical, calibrated"].mean()
+    compared = compare(log, robot, settings, mechanical, n_jobs=1)
+    errors, choices = compared.errors, choices_by_fold(compared, log.q_unit)
+    assert errors["hybrid, auto"].mean < 0.1 * errors["mechanical, calibrated"].mean
     assert all(choice["hybrid, auto"].endswith("backlash of 0.4 mm") for choice in choices)
 
 
