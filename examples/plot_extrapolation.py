@@ -27,14 +27,13 @@ def hybrid(guard):
 
 guards = {
     "hybrid, no guard": None,
-    "hybrid, box": "box",
     "hybrid, leverage (default)": "leverage",
 }
 models = {name: hybrid(guard) for name, guard in guards.items()}
 
 # %%
-# The test rows hardly leave the range of any chamber, which is all that the guard "box" checks. The
-# guard "leverage" also checks which combinations of lengths are in the training data.
+# The test rows hardly leave the range of any chamber. The guard "leverage" also checks which
+# combinations of lengths are in the training data.
 
 predictions = {
     "mechanical, calibrated": models["hybrid, no guard"].predict_mechanical(
@@ -61,7 +60,7 @@ figure, axes = plt.subplots(
     1, 2, figsize=(11, 4.2), width_ratios=(1, 1.1), layout="constrained"
 )
 for (name, model), color in zip(
-    models.items(), ("0.6", "black", plots.model_color("hybrid")), strict=True
+    models.items(), ("0.6", plots.model_color("hybrid")), strict=True
 ):
     length = 1e3 * np.linalg.norm(model.predict_error(ways), axis=1).reshape(41, 60)
     low, median, high = np.quantile(length, [0.1, 0.5, 0.9], axis=1)

@@ -20,7 +20,6 @@ EVALUATED = (
     "backlash and creep",
     "blend",
     "hybrid, quadratic",
-    "hybrid, polynomial",
     "hybrid, kernel ridge",
     "serial, network",
     "hybrid of a rigid arm",

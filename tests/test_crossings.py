@@ -112,7 +112,7 @@ FACTORS = {
     "coupling": ("parallel", "serial"),
     "output": ("position", "pose"),
     "calibrate": ("as it is", "base", "gain"),
-    "guard": ("leverage", "box", None),
+    "guard": ("leverage", None),
     "groups": (True, False),
     "change": ("none", "adapted", "drifted", "adapted and drifted"),
 }

@@ -121,7 +121,7 @@ WORK = {
     ],
     "elm": lambda _: [*NETWORK.fit(Q, X).partial_fit(Q, X).predict(Q, return_std=True)],
     "parallel elm": lambda _: hybrid(error_model=NETWORK, coverage=0.8),
-    "parallel linear": lambda _: hybrid(error_model="linear", guard="box", hysteresis=0.01),
+    "parallel linear": lambda _: hybrid(error_model="linear", hysteresis=0.01),
     "serial quadratic": lambda _: hybrid(error_model="quadratic", coupling="serial"),
     "pose output": lambda _: hybrid(error_model=NETWORK, output="pose"),
     "chosen": lambda _: hybrid(error_model=ELMRegressorCV(8, cv=3, random_state=0)),

@@ -263,7 +263,6 @@ ENTRIES = {
         Hysteresis.friction([0.0, 0.1], [0.3]).command,
         {"y": Q, "state": np.tile(Q[0], (4, 1))},
     ),
-    "robots.from_toml": (robots.from_toml, {"path": ROBOT}),
     "robots.read_description": (robots.read_description, {"path": ROBOT}),
     "trajectories.min_jerk": (trajectories.min_jerk, {"s": np.linspace(0, 1, 5)}),
     "trajectories.figure_eight": (trajectories.figure_eight, {"size": (0.3, 0.2), **ROUND}),

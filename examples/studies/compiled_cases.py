@@ -7,9 +7,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.linear_model import Ridge
-from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import MinMaxScaler, PolynomialFeatures
 
 from hybridkin import (
     ConstantCurvatureChain,
@@ -77,10 +74,6 @@ def _data_alone() -> Case:
     return Case(model.module_, data.q.min(0), data.q.max(0))
 
 
-def _polynomial() -> Any:
-    return make_pipeline(MinMaxScaler((-1, 1)), PolynomialFeatures(3), Ridge(0.1))
-
-
 CASES: dict[str, Callable[[], Case]] = {
     "trunk": lambda: limited(robots.bionic_handling_assistant(), 0.1, 0.4),
     "tendons": lambda: _tendons(0.02),
@@ -91,14 +84,12 @@ CASES: dict[str, Callable[[], Case]] = {
     "rigid arm": _arm,
     "ELM, no guard": lambda: _hybrid(guard=None),
     "ELM, leverage guard": lambda: _hybrid(),
-    "ELM, box guard": lambda: _hybrid(guard="box"),
     "ELM, drift": lambda: _hybrid(drifts=True),
     "serial quadratic": lambda: _hybrid("quadratic", coupling="serial"),
     "serial hidden": lambda: _hybrid(ELMRegressor(random_state=0), coupling="serial"),
     "pose features": lambda: _hybrid("pose"),
     "serial pose features": lambda: _hybrid("pose", coupling="serial"),
     "kernel ridge": lambda: _hybrid("kernel"),
-    "polynomial of degree 3": lambda: _hybrid(_polynomial()),
     "data alone, ELM": _data_alone,
     "blend": lambda: _hybrid("auto", calibrate="default"),
     "blend, drift": lambda: _hybrid("auto", calibrate="default", drifts=True),

@@ -10,8 +10,6 @@ import torch
 from numpy.typing import NDArray
 from sklearn.kernel_ridge import KernelRidge
 from sklearn.linear_model import LinearRegression
-from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import PolynomialFeatures
 from sklearn.tree import DecisionTreeRegressor
 from torch import Tensor
 
@@ -280,23 +278,14 @@ LEARNED: dict[str, Callable[[], Kind]] = {
         hybrid(KernelRidge(kernel="rbf", gamma=100.0).set_params(alpha=0.01)),
         *_CHAMBERS,
     ),
-    "hybrid, regression, box guard": lambda: Kind(
-        hybrid(LinearRegression(), guard="box"), *_CHAMBERS
-    ),
-    "hybrid, polynomial": lambda: Kind(
-        hybrid(make_pipeline(PolynomialFeatures(2), LinearRegression())),
-        *_CHAMBERS,
-        is_saved=False,
-    ),
+    "hybrid, regression": lambda: Kind(hybrid(LinearRegression()), *_CHAMBERS),
     "hybrid, no guard": lambda: Kind(hybrid(network(), guard=None), *_CHAMBERS),
     "hybrid, tree by differences": lambda: Kind(
         hybrid(DecisionTreeRegressor(max_depth=3, random_state=0)),
         *_CHAMBERS,
         is_saved=False,
     ),
-    "serial, linear, box guard": lambda: Kind(
-        hybrid("linear", coupling="serial", guard="box"), *_CHAMBERS
-    ),
+    "serial, linear": lambda: Kind(hybrid("linear", coupling="serial"), *_CHAMBERS),
     "serial, quadratic": lambda: Kind(
         hybrid("quadratic", coupling="serial"), *_CHAMBERS
     ),

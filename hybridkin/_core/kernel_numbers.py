@@ -15,11 +15,9 @@ KINDS = (
     "structural",
     "affine",
     "elm",
-    "polynomial",
     "kernel",
     "readout",
     "leverage_guard",
-    "box_guard",
     "quadratic_leverage",
     "hybrid",
     "ik",
@@ -40,7 +38,6 @@ HK_MAX_N = 64  # actuators
 HK_MAX_S = 16  # segments
 HK_MAX_M = 64  # outputs of a regressor, or inner coordinates
 HK_MAX_F = 2048  # features whose leverage is taken
-HK_MAX_P = 1024  # powers of the inputs of a polynomial
 HK_MAX_R = 12  # rows of a task of inverse kinematics
 HK_GROUP = 8  # hidden units, or columns of a leverage, stored together
 
@@ -56,10 +53,8 @@ HK_MOST_TURNS = 12  # 2 to this power bounds the steps if rounding prevents the 
 HK_LEAST_LENGTH = 0.1
 
 # Guards of a correction.
-HK_FULL = 1.0  # distance from the training rows up to which the weight is 1
-HK_FULL_LEVERAGE = 3.0  # the same for a leverage
+HK_FULL = 3.0  # distance from the training rows up to which the weight is 1
 HK_LONGEST = 1.5  # bound of a correction, relative to the longest one of a training row
-HK_BOX_STEEPNESS = 100.0  # of the distance outside a box, per squared width of it
 
 HK_J, HK_DISTANCE = 1, 2  # asked for besides x
 HK_IF_SAME = 4  # only if what the plan was made of has not changed

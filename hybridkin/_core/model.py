@@ -20,7 +20,7 @@ from hybridkin._core.blocks import check_tensor, check_vectors, in_blocks
 from hybridkin._core.frames import Frames, Marker
 from hybridkin._core.html import html_table
 from hybridkin._core.plan import NoKernel, Plan
-from hybridkin._core.plausible import PlausibleRows, UnknownRows
+from hybridkin._core.plausible import PlausibleRows
 from hybridkin._core.portable import PortableModule
 from hybridkin._core.stored import Layout, Stored
 
@@ -251,7 +251,7 @@ class ForwardModel(PortableModule):
 
     def plausible_rows(self) -> PlausibleRows:
         """Return bounds of rows that need no warning about units or contradictions."""
-        return UnknownRows.of(self.n_actuators)
+        return PlausibleRows.all_of(self.n_actuators)
 
     @property
     def size(self) -> float:
@@ -620,6 +620,24 @@ def moved_points(x: Tensor, motion: Tensor) -> Tensor:
 def _turned(v: Tensor, motion: Tensor) -> Tensor:
     """Return vectors (..., 3), or several of them in (..., m), rotated by a motion (4, 4)."""
     return (v.unflatten(-1, (-1, 3)) @ motion[:3, :3].to(v).mT).flatten(-2)
+
+
+class ZeroModel(ForwardModel):
+    """The model x = 0 of n actuators: no mechanics, so that all of x is the residual."""
+
+    def __init__(self, n_actuators: int, n_outputs: int) -> None:
+        super().__init__()
+        self.n_actuators = n_actuators
+        self.n_outputs = n_outputs
+
+    def forward(self, q: Tensor) -> Tensor:
+        """Return zeros (..., m)."""
+        return q.new_zeros(*q.shape[:-1], self.n_outputs)
+
+    def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return zeros (..., m) and (..., m, n)."""
+        x = self(q)
+        return x, x.new_zeros(*x.shape, self.n_actuators)
 
 
 class FunctionModel(ForwardModel):

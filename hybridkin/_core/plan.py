@@ -14,7 +14,6 @@ from hybridkin._core.kernel_numbers import (
     HK_MAX_F,
     HK_MAX_M,
     HK_MAX_N,
-    HK_MAX_P,
     HK_MAX_R,
     HK_MAX_S,
     KINDS,
@@ -28,7 +27,6 @@ MOST = {
     "segments": HK_MAX_S,
     "outputs": HK_MAX_M,
     "features": HK_MAX_F,
-    "powers": HK_MAX_P,
     "rows of a task": HK_MAX_R,
 }
 _LARGE = 4096  # numbers of an array that is worth sharing

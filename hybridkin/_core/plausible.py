@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Self
 
+from hybridkin._core.arrays import LARGEST
+
 _FLOAT64 = np.dtype(np.float64)
 
 
@@ -30,6 +32,11 @@ class PlausibleRows:
 
     rest: NDArray
     weights: NDArray
+
+    @classmethod
+    def all_of(cls, n: int) -> Self:
+        """Return bounds that hold all rows of n numbers that count as finite."""
+        return cls(np.zeros(n), np.eye(n) / LARGEST)
 
     def hold(self, q: NDArray) -> bool:
         """Return whether all rows of q (N, n) lie within the bounds."""

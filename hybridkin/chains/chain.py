@@ -13,6 +13,7 @@ from hybridkin._core.blocks import check_tensor, check_vectors, in_blocks
 from hybridkin._core.derived import KEPT, entries_of
 from hybridkin._core.html import numbers
 from hybridkin._core.model import ForwardModel, PoseModel, is_at_rest
+from hybridkin._core.plausible import PlausibleRows, UnknownRows
 from hybridkin._core.units import motion_message, span_message
 from hybridkin.chains.body import Body
 from hybridkin.chains.calibratable import Part, Scale
@@ -127,8 +128,11 @@ class Chain(PoseModel):
         return set()
 
     def unit_of(self, name: str) -> str:
-        """Return the unit of an entry of the geometry: "m", "rad", "-" or another one."""
-        return self._units.get(name, "m")
+        """Return the unit of an entry of the geometry, or of a parameter of `calibrate`.
+
+        It is "m", "rad", "-" or another one.
+        """
+        return self._units.get(self.aliases.get(name, name), "m")
 
     def html_rows(self) -> dict[str, object]:
         """Return names and values that a notebook shows of the chain."""
@@ -275,6 +279,13 @@ class Chain(PoseModel):
             )
         self._check_rows(rows, name)
         return self.unit_messages(rows, name)
+
+    def plausible_rows(self) -> PlausibleRows:
+        """Return bounds of rows that need no warning about units or contradictions.
+
+        By default none are known, and the chain checks all rows.
+        """
+        return UnknownRows.of(self.n_actuators)
 
     def _why_shape(self) -> str:
         """Return why q must have its shape, for messages."""

@@ -24,7 +24,6 @@ __all__ = [
     "LogFormat",
     "RobotDescription",
     "bionic_handling_assistant",
-    "from_toml",
     "read_description",
 ]
 
@@ -254,46 +253,8 @@ class RobotDescription:
         return self.calibrate == "auto" or "base" in self.calibrate
 
 
-def from_toml(path: str | Path) -> ArcChain:
-    r"""Return the chain that a TOML file describes.
-
-    Parameters
-    ----------
-    path : str or Path
-        A robot description; for its format, and its other entries, see `read_description`.
-
-    Returns
-    -------
-    ConstantCurvatureChain, ElasticTendonChain or ForceTendonChain
-        The nominal model, lengths in metres.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If the file is not TOML, lacks a key, or has an unknown key or a wrong value; the message
-        names the key.
-
-    Examples
-    --------
-    >>> import pathlib, tempfile
-    >>> from hybridkin import robots
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     path = pathlib.Path(folder) / "robot.toml"
-    ...     _ = path.write_text("[[segment]]\nradius = 0.005\nlength = 0.1\nrepeat = 2\n")
-    ...     chain = robots.from_toml(path)
-    >>> chain.n_actuators
-    6
-    """
-    chain = read_description(path).chain
-    if chain is None:
-        raise ValueError(f"{path} describes no chain: it has no [[segment]] table.")
-    return chain
-
-
 def read_description(path: str | Path) -> RobotDescription:
-    """Return the robot that a TOML file describes.
+    r"""Return the robot that a TOML file describes.
 
     Parameters
     ----------
@@ -379,6 +340,17 @@ def read_description(path: str | Path) -> RobotDescription:
     ValueError
         If the file is not TOML, lacks a key, or has an unknown key or a wrong value; the message
         names the key.
+
+    Examples
+    --------
+    >>> import pathlib, tempfile
+    >>> from hybridkin import robots
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = pathlib.Path(folder) / "robot.toml"
+    ...     _ = path.write_text("[[segment]]\nradius = 0.005\nlength = 0.1\nrepeat = 2\n")
+    ...     robot = robots.read_description(path)
+    >>> robot.chain.n_actuators
+    6
     """
     path = as_path(path)
     if not path.is_file():

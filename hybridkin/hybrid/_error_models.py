@@ -22,7 +22,7 @@ from torch import Tensor
 from typing_extensions import Self
 
 from hybridkin._core.directions import Directions
-from hybridkin._core.model import ForwardModel
+from hybridkin._core.model import ForwardModel, ZeroModel
 from hybridkin._core.turns import TURNS
 from hybridkin.calibration.measured import points
 from hybridkin.hybrid._drift import too_far
@@ -198,17 +198,19 @@ class FeatureModel(TipModel):
 
     def fit_tip(self, rows: Rows, spec: Spec) -> FittedError:
         """Return the fitted readout; without motion of the rows there is nothing to learn."""
-        if not rows.directions.moved.size:
+        if spec.mechanical is not None and not rows.directions.moved.size:
             return _nothing(self, rows)
         return self._with_correction(self.read_out(rows, spec), rows)
 
     def read_out(self, rows: Rows, spec: Spec) -> ReadoutFit:
         """Return the readout of least tip error."""
-        assert spec.mechanical is not None
+        mechanical = spec.mechanical
+        if mechanical is None:
+            mechanical = ZeroModel(rows.q.shape[1], rows.tips.shape[1])
         try:
             return fit_readout(
-                spec.mechanical,
-                self.features(rows.q, spec.mechanical),
+                mechanical,
+                self.features(rows.q, mechanical),
                 rows,
                 self.coupling,
                 self.alphas,
@@ -247,6 +249,8 @@ class FeatureModel(TipModel):
 class LinearModel(FeatureModel):
     """A linear function of q."""
 
+    needs_mechanical = False
+
     def features(self, q: Tensor, mechanical: ForwardModel) -> Features:
         """Return the features for training rows q (N, n)."""
         return Features.of_range(q)
@@ -255,6 +259,8 @@ class LinearModel(FeatureModel):
 @named("quadratic")
 class QuadraticModel(FeatureModel):
     """A quadratic function of q."""
+
+    needs_mechanical = False
 
     def features(self, q: Tensor, mechanical: ForwardModel) -> Features:
         """Return the features for training rows q (N, n)."""

@@ -1,4 +1,4 @@
-"""Guards: smooth weights, from a leverage or a box, that fade a learned correction out."""
+"""Guards: smooth weights, from a leverage, that fade a learned correction out."""
 
 from __future__ import annotations
 
@@ -12,9 +12,7 @@ from hybridkin._core.arrays import identity
 from hybridkin._core.blocks import in_blocks
 from hybridkin._core.directions import Directions, moved_directions
 from hybridkin._core.kernel_numbers import (
-    HK_BOX_STEEPNESS,
     HK_FULL,
-    HK_FULL_LEVERAGE,
     HK_GROUP,
     HK_LONGEST,
 )
@@ -31,7 +29,7 @@ from hybridkin.learning.network import (
     write_network,
 )
 
-GUARDS = ("leverage", "box", None)
+GUARDS = ("leverage", None)
 _AS_IF = 0.1  # of half the range: the spread assumed in a direction that the log does not move
 _ROWS = 128  # number of rows that represent the training rows
 _BLOCK = 4096  # training rows whose distances are computed at once
@@ -158,7 +156,6 @@ class LeverageGuard(Guard):
         parts=("model",),
         write_plan=_write_leverage_guard,
     )
-    FULL = HK_FULL_LEVERAGE
 
     def __init__(self, model: LeverageModule, limit: Tensor, largest: Tensor) -> None:
         super().__init__(largest)
@@ -228,46 +225,6 @@ def _rows_beside(q: Tensor) -> Tensor:
     far = random.uniform(0.0, _BEYOND, (_BESIDE, 1))
     beside = start + far * direction * np.ptp(rows, axis=0)
     return torch.from_numpy(np.concatenate([rows, beside]))
-
-
-def _write_box_guard(plan: Plan, stored: Stored) -> int:
-    low = stored.array("low")
-    high = stored.array("high")
-    width = np.where(high > low, high - low, 1.0)
-    return plan.node(
-        "box_guard", len(low), 0, [stored.array("largest"), low, high, 1.0 / width]
-    )
-
-
-class BoxGuard(Guard):
-    """Distance from the training rows: how far q is outside a box, in tenths of its width.
-
-    Parameters
-    ----------
-    low, high : Tensor of shape (n,)
-        Corners of the box.
-    largest : Tensor of shape ()
-        The longest correction of a training row [m].
-    """
-
-    layout = Layout(
-        "box_guard",
-        {"low": "n", "high": "n", "largest": ""},
-        write_plan=_write_box_guard,
-    )
-
-    def __init__(self, low: Tensor, high: Tensor, largest: Tensor) -> None:
-        super().__init__(largest)
-        self.register_buffer("low", low)
-        self.register_buffer("high", high)
-
-    def domain_distance(self, q: Tensor) -> Tensor:
-        """Return 1 inside the box, more outside, shape (...)."""
-        low = self.low.to(q)
-        high = self.high.to(q)
-        width = torch.where(high > low, high - low, torch.ones_like(low))
-        outside = (low - q).clamp(min=0.0) + (q - high).clamp(min=0.0)
-        return 1.0 + (HK_BOX_STEEPNESS * (outside / width).square()).sum(-1)
 
 
 def _write_quadratic_leverage(plan: Plan, stored: Stored) -> int:
@@ -346,7 +303,7 @@ def fit_guard(
 
     Parameters
     ----------
-    kind : {"leverage", "box", None}
+    kind : {"leverage", None}
         The guard.
     corrections : Tensor of shape (N, m)
         Output of the error model for these rows [m].
@@ -360,8 +317,6 @@ def fit_guard(
     if kind is None:
         return None
     largest = corrections.norm(dim=-1).max()
-    if kind == "box":
-        return BoxGuard(q.amin(0), q.amax(0), largest)
     times = torch.from_numpy(counts)
     with torch.no_grad():
         if not isinstance(model, LeverageModule):

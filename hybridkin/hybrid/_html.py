@@ -54,8 +54,6 @@ def _domain(model: HybridPredictor) -> str:
     domain = "close to the training rows (guard by leverage)"
     if model.guard is None:
         domain = "everywhere (no guard)"
-    elif model.guard == "box":
-        domain = "the training range of q"
     if model.fitted_module_.tested is None:
         return domain
     return f"{domain}, as far as held-out groups tested it"

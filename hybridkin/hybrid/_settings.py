@@ -31,7 +31,7 @@ CONSTRAINTS = {
         "array-like",
         None,
     ],
-    "guard": [StrOptions({"leverage", "box"}), None],
+    "guard": [StrOptions({"leverage"}), None],
     "hysteresis": [StrOptions({"auto"}), Real, "array-like", Hysteresis],
     "coverage": [Interval(Real, 0, 1, closed="neither"), None],
     "output": [StrOptions({"position", "pose"})],

@@ -98,15 +98,14 @@ class HybridForwardModel(HybridPredictor):
         of a `ConstantCurvatureChain` contradict each other, it also tries an `ElasticTendonChain`.
         So does error_model="auto" with a list. "default": the chain's own list. None: "auto" for a
         chain with error_model="auto", else nothing.
-    guard : {"leverage", "box", None}, default="leverage"
+    guard : {"leverage", None}, default="leverage"
         Where eps is used. "leverage": the domain is where inputs are as close to the training rows
         as these are to each other, in the hidden features of a network at the tip, or in the inputs
         and their squares for other error models. From three times this distance eps fades out and
-        f_mech remains. "box": the domain is the training range, and eps fades out outside it.
-        None: everywhere. With `groups`, the domain (`in_domain`) also excludes rows where no
-        held-out group has tested the model. With a guard, f_hyb differs from f_mech by at most 1.5
-        times the longest correction of a training row. f_mech has the errors of its structure, if
-        these are learned; they have no guard.
+        f_mech remains. None: everywhere. With `groups`, the domain (`in_domain`) also excludes rows
+        where no held-out group has tested the model. With a guard, f_hyb differs from f_mech by at
+        most 1.5 times the longest correction of a training row. f_mech has the errors of its
+        structure, if these are learned; they have no guard.
     hysteresis : float, array-like of shape (n,), Hysteresis or "auto", default=0.0
         Backlash (also called play) of the actuators [unit of q]. Rows are then commands in order of
         time, see `Commands`, and the model maps the motion of the actuators. "auto" chooses by the

@@ -32,7 +32,7 @@ class WidthSearch(NamedTuple):
     tried : list of Candidate
         Those of the widths asked for, ascending from no backlash.
     best : Candidate
-        The one with the least held-out error; its width may be a refined one.
+        The one with the least held-out error.
     """
 
     tried: list[Candidate]
@@ -44,9 +44,7 @@ class WidthSearch(NamedTuple):
         return gain(self.tried[0], self.best)
 
 
-def search_width(
-    log: HysteresisLog, widths: list[float], *, refine: bool = False
-) -> WidthSearch:
+def search_width(log: HysteresisLog, widths: list[float]) -> WidthSearch:
     """Return one backlash of several widths, and the one with the least held-out error.
 
     Parameters
@@ -54,18 +52,12 @@ def search_width(
     log : HysteresisLog
         The measured rows.
     widths : list of float
-        Widths to try, ascending from zero. While the largest is the best, twice that width is tried
-        too, up to the largest range of q.
-    refine : bool, default=False
-        Whether to minimise the error between the neighbours of the best width.
+        Widths to try, ascending from zero. The error is minimised between the neighbours of the
+        best one.
     """
-    widest = float(np.ptp(log.q, axis=0).max())
     tried = [Candidate.of(log, width, _NONE) for width in widths]
     best = min(tried, key=Candidate.error)
-    while best is tried[-1] and 0.0 < best.width < widest:
-        tried.append(Candidate.of(log, min(2.0 * best.width, widest), _NONE))
-        best = min(tried, key=Candidate.error)
-    if refine and best.width > 0.0:
+    if best.width > 0.0:
         place = tried.index(best)
         following = tried[min(place + 1, len(tried) - 1)]
         bounds = tried[place - 1].width, following.width
@@ -96,7 +88,7 @@ def find_hysteresis(log: HysteresisLog) -> Hysteresis:
         least = _LEAST * np.median(strokes[strokes > 0.0])
         doubled = least * 2.0 ** np.arange(20)
         widths[1:1] = doubled[doubled < widest].tolist()
-    search = search_width(log, widths, refine=True)
+    search = search_width(log, widths)
     none = search.tried[0]
     creep = Candidate.of(log, 0.0, _CREEP)
     candidates = [creep]

@@ -170,10 +170,16 @@ class Lead:
     def _commanded(self, dq: Tensor, seconds: float) -> Tensor:
         """Return the commands for a step of the actuators (1, n).
 
-        One that would move far for almost nothing, such as through a backlash for rounding, stays.
+        One that would move far for almost nothing, such as through a backlash for rounding, is that
+        of an actuator that stays, or stays itself.
         """
         goal = self.effective + dq
         command, _ = self._hysteresis.command(goal, self.state, seconds)
+        if (dq.abs() < IK_AT_REST_SHARE * (command - self.command).abs()).any():
+            still, _ = self._hysteresis.command(self.effective, self.state, seconds)
+            nothing = dq.abs() < IK_AT_REST_SHARE * (command - still).abs()
+            command = torch.where(nothing, still, command)
+            goal = torch.where(nothing, self.effective, goal)
         moved = (goal - self._after(self.command, seconds)).abs()
         stays = moved < IK_AT_REST_SHARE * (command - self.command).abs()
         return torch.where(stays, self.command, command)

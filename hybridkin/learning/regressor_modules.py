@@ -12,7 +12,7 @@ from sklearn.compose import TransformedTargetRegressor
 from sklearn.kernel_ridge import KernelRidge
 from sklearn.linear_model import ElasticNet, LinearRegression, Ridge, RidgeCV
 from sklearn.pipeline import Pipeline
-from sklearn.preprocessing import MinMaxScaler, PolynomialFeatures, StandardScaler
+from sklearn.preprocessing import MinMaxScaler, StandardScaler
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
@@ -25,7 +25,6 @@ from hybridkin._core.stored import Layout, Stored
 from hybridkin.learning.network import write_units
 
 _LINEAR = (LinearRegression, Ridge, RidgeCV, ElasticNet)
-_MOST_POWER = 100
 _LARGEST = float(np.finfo(np.float32).max)
 _KERNEL_BLOCK = 2**20  # numbers in the kernel matrix of a block of rows
 
@@ -44,9 +43,9 @@ def error_module(regressor: Regressor, q: Tensor) -> ForwardModel:
     Parameters
     ----------
     regressor : estimator
-        In closed form: a regressor with a torch ``module_``, a linear model (also on
-        `PolynomialFeatures`), and a `KernelRidge` with an RBF kernel, each also after standard or
-        min-max scalers. Others: finite differences of ``predict``.
+        In closed form: a regressor with a torch ``module_``, a linear model, and a `KernelRidge`
+        with an RBF kernel, each also after standard or min-max scalers. Others: finite differences
+        of ``predict``.
     q : Tensor of shape (N, n)
         The training rows.
     """
@@ -63,16 +62,10 @@ def error_module(regressor: Regressor, q: Tensor) -> ForwardModel:
         center = center + scale * offset
         scale = scale * slope
     *before, readout = steps
-    if isinstance(readout, _LINEAR):
+    if not before and isinstance(readout, _LINEAR):
         coef, intercept = _line(readout)
-        if not before:
-            coef = coef / scale
-            return AffineModule(coef, intercept - coef @ center)
-        if len(before) == 1 and isinstance(before[0], PolynomialFeatures):
-            # The intercept is a monomial.
-            powers = np.pad(before[0].powers_, ((1, 0), (0, 0)))
-            weights = np.vstack([intercept, coef.T])
-            return PolynomialModule(powers, weights, center, scale)
+        coef = coef / scale
+        return AffineModule(coef, intercept - coef @ center)
     if not before and type(readout) is KernelRidge and readout.kernel == "rbf":
         return _kernel_module(readout, center, scale)
     return RegressorModule(regressor, q)
@@ -154,7 +147,7 @@ def _rescaled(module: ForwardModel, scaling: UnitSpread) -> ForwardModel:
     """Return the model of the residual [m] from that of the scaled residual."""
     mean = torch.from_numpy(scaling.mean)
     spread = mean.new_tensor(scaling.spread)
-    if isinstance(module, (AffineModule, PolynomialModule, KernelModule)):
+    if isinstance(module, (AffineModule, KernelModule)):
         return module.rescaled(mean, spread)
     return RescaledModule(module, mean, spread)
 
@@ -239,131 +232,6 @@ class AffineModule(ForwardModel):
     def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return the value (..., m), and the constant matrix for every row (..., m, n)."""
         return self(q), self.coef.to(q).expand(*q.shape[:-1], *self.coef.shape)
-
-
-def _write_polynomial(plan: Plan, stored: Stored) -> int:
-    """Write the node of a polynomial: for each monomial the places of its powers in a table."""
-    powers = stored.derived["monomials"]
-    readouts = stored.derived["readouts"]
-    n_monomials, n = powers.shape
-    degrees = int(powers.max()) + 1
-    plan.limit("powers", n * degrees)
-    factors = []
-    for exponents in powers:
-        (inputs,) = exponents.nonzero()
-        factors += [len(inputs), *(inputs * degrees + exponents[inputs])]
-    scaling = stored.array("center"), 1.0 / stored.array("scale")
-    n_outputs = stored.array("readout").shape[1]
-    numbers = [*scaling, readouts]
-    return plan.node(
-        "polynomial", n, n_outputs, numbers, n_monomials, degrees, *factors
-    )
-
-
-class PolynomialModule(ForwardModel):
-    """A polynomial ``phi(u) @ readout`` of ``u = (q - center) / scale``.
-
-    The derivative of a monomial is a monomial, so the Jacobian is a second readout of the same
-    features.
-
-    Parameters
-    ----------
-    powers : array-like of int of shape (P, n)
-        Exponents of the monomials.
-    readout : array-like of shape (P, m)
-        Their coefficients; coefficients of equal monomials are added.
-    center, scale : array-like of shape (n,)
-        Map of the inputs [unit of q].
-    """
-
-    layout = Layout(
-        "polynomial",
-        {"powers": "pn", "readout": "pm", "center": "n", "scale": "n"},
-        derived=("monomials", "readouts"),
-        write_plan=_write_polynomial,
-    )
-    computed = ("slope",)
-
-    def __init__(
-        self, powers: ArrayLike, readout: ArrayLike, center: ArrayLike, scale: ArrayLike
-    ) -> None:
-        super().__init__()
-        _register(self, powers=powers, readout=readout, center=center, scale=scale)
-        self.n_actuators = self.powers.shape[1]
-        self.n_outputs = self.readout.shape[1]
-        self._monomials_and_readouts()  # checks the powers
-
-    @derived("powers", "readout", "scale")
-    def _monomials_and_readouts(self) -> tuple[Tensor, Tensor]:
-        """Return the exponents (D, n) of all monomials, and their readouts (D, m + m n).
-
-        These are the distinct monomials of the polynomial and of its derivatives. The readouts are
-        that of the polynomial, then that of its Jacobian.
-        """
-        exponents = self.powers.numpy(force=True)
-        if not np.isin(exponents, range(_MOST_POWER)).all():
-            raise ValueError(f"'powers' must hold whole numbers below {_MOST_POWER}")
-        # Monomial k has a derivative along input j: another monomial.
-        k, j = np.nonzero(exponents)
-        lower = exponents[k] - np.eye(self.n_actuators)[j]
-        both = np.vstack([exponents, lower]).astype(int)
-        distinct, place = np.unique(both, axis=0, return_inverse=True)
-        places = torch.from_numpy(place.reshape(-1)).to(self.readout.device)
-        of_monomial, of_slope = places.split([len(exponents), len(k)])
-
-        none = self.readout.new_zeros(len(distinct), self.n_outputs)
-        values = none.index_add(0, of_monomial, self.readout)
-        each = torch.eye(self.n_actuators, dtype=none.dtype, device=none.device)
-        by_input = (self.powers[k, j, None] * each[j] / self.scale)[:, None]
-        by_monomial = (self.readout[k, :, None] * by_input).flatten(1)
-        slopes = none.new_zeros(len(distinct), by_monomial.shape[1])
-        slopes = slopes.index_add(0, of_slope, by_monomial)
-        monomials = torch.from_numpy(distinct).to(none.device)
-        return monomials, torch.cat([values, slopes], dim=1)
-
-    @property
-    def monomials(self) -> Tensor:
-        """Exponents of the distinct monomials of the polynomial and its derivatives, (D, n)."""
-        return self._monomials_and_readouts()[0]
-
-    @property
-    def readouts(self) -> Tensor:
-        """Readouts (D, m + m n) of these monomials: of the polynomial, then of its Jacobian."""
-        return self._monomials_and_readouts()[1]
-
-    def rescaled(self, mean: Tensor, spread: Tensor) -> PolynomialModule:
-        """Return mean (m,) + spread times this module."""
-        powers = nn.functional.pad(self.powers, (0, 0, 1, 0))  # the monomial 1
-        readout = torch.vstack([mean, spread * self.readout])
-        return PolynomialModule(powers, readout, self.center, self.scale)
-
-    def forward(self, q: Tensor) -> Tensor:
-        """Return the polynomial, shape (..., m)."""
-        monomials, readouts = self._monomials_and_readouts()
-        return self._features(q, monomials) @ readouts[:, : self.n_outputs].to(q)
-
-    def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the polynomial (..., m) and its Jacobian (..., m, n) from the same features."""
-        x, J = in_blocks(self._forward_and_jacobian, q)
-        return x, J
-
-    def _forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        monomials, readouts = self._monomials_and_readouts()
-        phi = self._features(q, monomials)
-        value, slope = (phi @ readouts.to(q)).tensor_split([self.n_outputs], dim=-1)
-        return value, slope.unflatten(-1, (-1, q.shape[-1]))
-
-    def _features(self, q: Tensor, monomials: Tensor) -> Tensor:
-        u = (q - self.center.to(q)) / self.scale.to(q)
-        monomials = monomials.to(q.device)
-        phi = torch.ones_like(u[..., :1]).expand(*u.shape[:-1], len(monomials))
-        of_each = [torch.ones_like(u)]
-        for _ in range(int(monomials.max())):
-            of_each.append(of_each[-1] * u)
-        table = torch.stack(of_each, dim=-1)
-        for j in range(u.shape[-1]):
-            phi = phi * table[..., j, :].index_select(-1, monomials[:, j])
-        return phi
 
 
 def _write_kernel(plan: Plan, stored: Stored) -> int:

@@ -50,7 +50,7 @@ _RANGES = (
     ("center", "scale"),
     ("center", "half_width"),
 )
-_SIZES = dict(N="actuators", S="segments", M="outputs", F="features", P="powers")
+_SIZES = dict(N="actuators", S="segments", M="outputs", F="features")
 _SIZES["R"] = "rows of a task"
 _NO_LIMITS = np.array([[-math.inf], [math.inf], [math.inf], [math.inf]])
 _MOST_STACK = 56 * 1024  # bytes to compute in; small arrays come on top
@@ -386,8 +386,8 @@ def leads(plan: Plan) -> bool:
 
 def _check_stack(plan: Plan, dtype: str) -> None:
     """Raise if the code would need more than 64 KiB of stack; bounds the HK_MODEL_WORK of src."""
-    n, segments, m, features, powers, rows = plan.code[:6].tolist()
-    numbers = 2 * (features + powers)
+    n, segments, m, features, rows = plan.code[:5].tolist()
+    numbers = 2 * features
     numbers += max(n, 3 * segments, m) * (n + 41) + 200 * segments + 30
     if "structural" in map(plan.kind, plan.places):
         numbers += 2 * (103 * segments + 51)

@@ -10,7 +10,6 @@ every figure: that of `model_color` for its name.
 from hybridkin.plots._canvas import model_color, new_figure
 from hybridkin.plots.animation import TrackAnimation
 from hybridkin.plots.errors import ErrorBoxDisplay, ErrorHistogramDisplay
-from hybridkin.plots.learning import LearningCurveDisplay
 from hybridkin.plots.space import BackboneDisplay, WorkspaceDisplay
 from hybridkin.plots.tracking import ActuatorDisplay, TrackingDisplay
 
@@ -19,7 +18,6 @@ __all__ = [
     "BackboneDisplay",
     "ErrorBoxDisplay",
     "ErrorHistogramDisplay",
-    "LearningCurveDisplay",
     "TrackAnimation",
     "TrackingDisplay",
     "WorkspaceDisplay",

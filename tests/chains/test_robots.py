@@ -90,7 +90,6 @@ def test_description_is_the_chain_it_describes(write):
     )
     q = 1e-3 * torch.arange(10, dtype=torch.float64)
     assert_close(robot.chain(q), expected(q), rtol=1e-13, atol=1e-15)
-    assert_close(robots.from_toml(write(TENDONS))(q), expected(q), rtol=1e-13, atol=1e-15)
     assert robot.name == "three by three"
     assert robot.calibrate == ("radii", "base")
     log = robots.LogFormat(tuple("abcdefghij"), ("x", "y", "z"), "mm", "m", -1, "", "motion", "t")
@@ -131,7 +130,7 @@ def test_elastic_tendons(write):
     assert robot.calibrate == "auto"
     assert robot.base_is_free
     q = 1e-3 * torch.arange(-4, 4, dtype=torch.float64)
-    assert_close(robots.from_toml(write(ELASTIC))(q), expected(q), rtol=1e-13, atol=1e-15)
+    assert_close(robot.chain(q), expected(q), rtol=1e-13, atol=1e-15)
 
 
 def test_pairs_mixed_segments_and_stages(write):
@@ -160,18 +159,20 @@ def test_pairs_mixed_segments_and_stages(write):
         stage="rotation",
     )
     q = torch.tensor([1.0, 0.2, -0.003, 0.003, 0.001, -0.001], dtype=torch.float64)
-    chain = robots.from_toml(write(text))
+    chain = robots.read_description(write(text)).chain
     assert_close(chain.pose(q), expected.pose(q), rtol=1e-14, atol=1e-15)
     assert repr(chain) == repr(expected)
     every = "[[segment]]\nstage = 'insertion'\noffset = 0.1\nzeros = [0.02]\ngain = 0.5\n"
-    slid = robots.from_toml(write(every + SEGMENT + "gain = 1.0\n"))
+    slid = robots.read_description(write(every + SEGMENT + "gain = 1.0\n")).chain
     q = torch.tensor([0.3, 0.0, 0.0, 0.0], dtype=torch.float64)
     assert_close(slid(q)[2] - slid(0.0 * q)[2], torch.tensor(0.15).double(), rtol=1e-7, atol=0)
-    mixed = robots.from_toml(write("[[segment]]\nradius = 0.02\n" + SEGMENT.replace("0.1", "0.02")))
+    mixed = robots.read_description(
+        write("[[segment]]\nradius = 0.02\n" + SEGMENT.replace("0.1", "0.02"))
+    ).chain
     assert mixed.extensible == (True, False)
     counts = "[log]\nq = ['a', 'b', 'c', 'd']\nx = ['x', 'y', 'z']\nq_unit = 'deg'\n"
     stage = "[[segment]]\nstage = 'rotation'\ngain = 0.5\n" + SEGMENT + "spool_radius = 0.01\n"
-    turned = robots.from_toml(write(stage + counts))
+    turned = robots.read_description(write(stage + counts)).chain
     q = torch.tensor([2.0, 0.0, 0.0, 0.0], dtype=torch.float64)
     assert_close(turned.metres(q)[0], torch.tensor(math.degrees(1.0)).double(), rtol=1e-7, atol=0)
 
@@ -332,11 +333,11 @@ def test_gains_of_counts_and_pressures(write):
     assert robot.chain.actuator_zeros.tolist() == [1.0, 2.0, 3.0]
     limited = text + "[limits]\nunit = 'log'\nq_min = -500\nq_max = 800\n"
     assert robots.read_description(write(limited)).limits.q_max.tolist() == [800.0] * 3
-    degrees = robots.from_toml(write(GAIN + LOG + "q_unit = 'deg'"))
+    degrees = robots.read_description(write(GAIN + LOG + "q_unit = 'deg'")).chain
     assert degrees.gains.tolist() == pytest.approx([2e-5 * 180 / math.pi] * 3)
-    assert robots.from_toml(write(SPOOL)).gains.tolist() == [0.006] * 3  # per radian
+    assert robots.read_description(write(SPOOL)).chain.gains.tolist() == [0.006] * 3  # per radian
     elastic = "model = 'elastic-tendon'\n" + GAIN + "zeros = [1e-4, 0, 0]\n" + LOG
-    assert robots.from_toml(write(elastic)).tendon_zeros.tolist() == [1e-4, 0.0, 0.0]
+    assert robots.read_description(write(elastic)).chain.tendon_zeros.tolist() == [1e-4, 0.0, 0.0]
 
 
 def test_a_robot_of_a_log_alone(write):
@@ -345,5 +346,3 @@ def test_a_robot_of_a_log_alone(write):
     assert (robot.chain, robot.calibrate, robot.n_actuators) == (None, (), 3)
     assert robot.limits.q_min == pytest.approx([-math.pi / 2] * 3)
     assert robot.limits.q_max is None
-    with pytest.raises(ValueError, match=r"describes no chain: it has no \[\[segment\]\] table"):
-        robots.from_toml(robot.path)

@@ -8,7 +8,6 @@ import pandas as pd
 import pytest
 import torch
 from sklearn.inspection import permutation_importance
-from sklearn.linear_model import Ridge
 from sklearn.model_selection import (
     GroupKFold,
     cross_validate,
@@ -25,7 +24,6 @@ from hybridkin import (
     calibrate,
     choose_rows,
     datasets,
-    plots,
 )
 from hybridkin._core.arrays import labels
 
@@ -115,8 +113,6 @@ def refusals(missing):
     yield "groups", lambda: calibrate(CHAIN, Q, X, groups=missing)
     yield "groups", lambda: choose_rows(CHAIN, Q, 2, groups=missing)
     yield "groups", lambda: Hysteresis.backlash(0.01).apply_by_group(Q, missing)
-    curve = plots.LearningCurveDisplay.from_estimator
-    yield "groups", lambda: curve(Ridge(), Q, X, groups=missing)
 
 
 @pytest.mark.parametrize("entry", [None, pd.NA, pd.NaT, np.nan])

@@ -39,7 +39,6 @@ from hybridkin.hybrid.description import restorer
 from hybridkin.learning.regressor_modules import (
     AffineModule,
     KernelModule,
-    PolynomialModule,
     RescaledModule,
 )
 from hybridkin.saving._file import packed, unpacked
@@ -48,16 +47,14 @@ IN_FULL = "EXAMPLES" in os.environ  # in the examination
 pytestmark = pytest.mark.filterwarnings("ignore:.*torch.jit.script:DeprecationWarning")
 
 FORCES = np.linspace(0.1, 0.5, 3)[None]
-POWERS = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [2, 0, 1], [0, 1, 3], [2, 0, 1]]
 
 
 def smooth():
     rng = np.random.default_rng(0)
     range_of = [0.2, 0.25, 0.3], [0.1, 0.12, 0.2]
-    polynomial = PolynomialModule(POWERS, rng.normal(size=(6, 2)), *range_of)
     kernel = KernelModule(rng.normal(size=(7, 3)), rng.normal(size=(7, 2)), 0.1, *range_of)
     q = rng.uniform(0.2, 0.3, (3, 3))
-    return {"polynomial": (polynomial, q), "kernel": (kernel, q)}
+    return {"kernel": (kernel, q)}
 
 
 def rescaled():
@@ -107,16 +104,14 @@ def all_models():
     return found
 
 
-SMALL = ["trunk", "polynomial", "kernel"]  # the others are drawn from
+SMALL = ["trunk", "kernel"]  # the others are drawn from
 
 
 def changed(name, entry, rng):
-    """Return another valid value of an entry: poses stay rigid, powers whole."""
+    """Return another valid value of an entry: poses stay rigid."""
     if entry.shape[-2:] == (4, 4) and name.endswith(("base", "tip", "origins", "motion")):
         motion = [[0.8, -0.6, 0, 0.01], [0.6, 0.8, 0, 0.02], [0, 0, 1, -0.03], [0, 0, 0, 1]]
         return entry @ torch.tensor(motion, dtype=entry.dtype)
-    if name.endswith("powers"):
-        return entry.flip(1)
     relative = torch.from_numpy(rng.uniform(-0.03, 0.0, entry.shape)).to(entry)
     return torch.where(entry == 0.0, 1e-4 * (1.0 + relative), entry * (1.0 + relative))
 

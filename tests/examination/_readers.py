@@ -164,7 +164,9 @@ READERS = {
     "toml": Reader(
         [TOML],
         [hostile.damaged, hostile.renumbered, hostile.described],
-        lambda path, k: _read_chain(open_model(path).model if k % 2 else robots.from_toml(path)),
+        lambda path, k: _read_chain(
+            open_model(path).model if k % 2 else robots.read_description(path).chain
+        ),
         "robot.toml",
     ),
     "urdf": Reader(

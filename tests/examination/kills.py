@@ -86,7 +86,9 @@ def write_log() -> None:
     turns = np.linspace(0, 6, 20)[:, None] * rng.uniform(0.5, 1, (6, 1, 3))
     q = 0.004 * np.sin(turns + rng.uniform(0, 6, (6, 1, 3))).reshape(-1, 3)
     Path("robot.toml").write_text(ROBOT)
-    x = robots.from_toml("robot.toml")(torch.from_numpy(q)).numpy() + 2e-4 * np.sin(300 * q)
+    x = robots.read_description("robot.toml").chain(torch.from_numpy(q)).numpy() + 2e-4 * np.sin(
+        300 * q
+    )
     table = np.column_stack([0.1 * np.arange(120), q, x, np.arange(120) // 20])
     np.savetxt("log.csv", table, delimiter=",", header="t,a,b,c,x,y,z,motion", comments="")
 

@@ -189,7 +189,7 @@ def of_robot(rng: np.random.Generator, home: Path) -> int:
     )
     steps = np.linspace(0, 6, 20)[:, None] + np.arange(3)
     commands = np.concatenate([4.0 * size * np.sin(steps) for size in (1.0, 0.8, 0.6, 0.5)])
-    tips = robots.from_toml(home / "robot.toml")(torch.from_numpy(commands)).numpy()
+    tips = robots.read_description(home / "robot.toml").chain(torch.from_numpy(commands)).numpy()
     with open(log, "w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
         writer.writerow([*q, *x, groups])
@@ -233,7 +233,7 @@ def judge(home: Path, columns: list[str]) -> None:
         archive.extractall(home / "unit")
     assert texts.visible(columns[0]) in str(root.get("description"))
     harmless = home / "harmless"
-    native.export_c(robots.from_toml(home / "robot.toml"), harmless, about_q="q")
+    native.export_c(robots.read_description(home / "robot.toml").chain, harmless, about_q="q")
     for options in checks.STANDARDS:
         for file in ("model.c", "model.h"):
             wanted = checks.tokens((harmless / file).read_text(), [*options, f"-I{harmless}"])

@@ -31,7 +31,6 @@ from hybridkin.hybrid.description import restorer
 from hybridkin.learning.regressor_modules import (
     AffineModule,
     KernelModule,
-    PolynomialModule,
     RescaledModule,
 )
 
@@ -161,10 +160,9 @@ def test_closed_forms_stay_closed_and_compiled():
     rng = np.random.default_rng(0)
     mean, spread = torch.from_numpy(rng.normal(size=3)), torch.tensor(0.01).double()
     kernel = KernelModule(rng.normal(size=(5, 3)), rng.normal(size=(5, 3)), 0.1, q[0], q[1])
-    polynomial = PolynomialModule(rng.integers(0, 3, (6, 3)), rng.normal(size=(6, 3)), q[0], q[1])
     affine = AffineModule(rng.normal(size=(3, 3)), 0.3)
     rows = torch.from_numpy(q)
-    for module in (kernel, polynomial, affine):
+    for module in (kernel, affine):
         folded = module.rescaled(mean, spread).forward_and_jacobian(rows)
         around = RescaledModule(module, mean, spread)
         for one, other in zip(folded, around.forward_and_jacobian(rows), strict=True):

@@ -211,10 +211,10 @@ def cases(log):
     return torch.cat([STRAIGHT, torch.from_numpy(log[0][:10]), edge, far])
 
 
-@pytest.mark.parametrize("kind", ["drop", "network", "shortened", "box", "no guard", "drifted"])
+@pytest.mark.parametrize("kind", ["drop", "network", "shortened", "no guard", "drifted"])
 def test_pose_jacobian_is_the_derivative(log, kind):
     error_models = {"drop": "drop", "network": ELMRegressor(random_state=0)}
-    guard = {"box": "box", "no guard": None}.get(kind, "leverage")
+    guard = None if kind == "no guard" else "leverage"
     model = pose_model(error_models.get(kind, quadratic()), guard=guard).fit(*log)
     if kind == "drifted":
         model.partial_fit(log[0][:20], log[1][:20] + 0.02)
@@ -224,7 +224,7 @@ def test_pose_jacobian_is_the_derivative(log, kind):
     module = model.module_
     q = cases(log)
     J = module.pose_jacobian(q)
-    if kind in ("network", "shortened", "box", "drifted"):
+    if kind in ("network", "shortened", "drifted"):
         weight = module.error_weight(q)
         assert weight.min() < 0.1
         assert ((weight > 0.1) & (weight < 0.9)).any()

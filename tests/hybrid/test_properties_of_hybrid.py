@@ -38,7 +38,7 @@ def hybrid(error_model="linear", **options):
 FITTED = {
     "linear": hybrid().fit(Q, X, groups=GROUPS),
     "network": hybrid(SMALL, coverage=0.5).fit(Q, X, groups=GROUPS),
-    "box": hybrid("quadratic", guard="box").fit(Q, X),
+    "quadratic": hybrid("quadratic").fit(Q, X),
     "serial": hybrid("quadratic", coupling="serial").fit(Q, X, groups=GROUPS),
     "kernel": hybrid("kernel", guard=None).fit(Q, X),
     "regression": hybrid(LinearRegression()).fit(Q, X),
@@ -69,7 +69,7 @@ def test_a_fit_is_finite_or_its_rows_are_refused(data, log):
     model = hybrid(
         data.draw(st.sampled_from(INSIDE if serial else ERROR_MODELS)),
         coupling="serial" if serial else "parallel",
-        guard=data.draw(st.sampled_from(["leverage", "box", None])),
+        guard=data.draw(st.sampled_from(["leverage", None])),
         hysteresis=data.draw(st.sampled_from([None, None, 0.001, 0.0, [0.0, 0.01, 5e-324], 1e300])),
         coverage=data.draw(st.sampled_from([None, None, 0.5])),
         calibrate=data.draw(st.sampled_from([None, None, ["radii"], ["base"]])),
@@ -109,7 +109,7 @@ def test_rows_are_answered_each_alone_or_refused(name, q, method):
 @given(st.data(), logs())
 def test_a_stream_follows_or_is_refused(data, log):
     model = copy.deepcopy(
-        FITTED[data.draw(st.sampled_from(["linear", "network", "box", "serial"]))]
+        FITTED[data.draw(st.sampled_from(["linear", "network", "quadratic", "serial"]))]
     )
     before = model.predict(Q)
     odd = st.sampled_from([0.98, 1.0, 0.0, 5e-324, 1e-300, np.nan, -1.0, 1e300, "a", None])

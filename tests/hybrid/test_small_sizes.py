@@ -43,9 +43,9 @@ def log_of(n, m, n_rows=50):
 @pytest.mark.parametrize(
     ("n", "m", "options"),
     [
-        (1, 1, {"guard": "box"}),
-        (3, 1, {"guard": "box"}),
-        (1, 3, {"guard": "box"}),
+        (1, 1, {}),
+        (3, 1, {}),
+        (1, 3, {}),
         pytest.param(3, 1, {"hysteresis": 0.01, "coverage": 0.8}, **SLOW),
     ],
 )

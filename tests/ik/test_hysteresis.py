@@ -188,6 +188,16 @@ def test_a_tracker_goes_on_from_a_state(kind):
         ik_of(None).tracker(HOME).reset(HOME, state)
 
 
+@KINDS
+def test_commands_at_rest_do_not_cross_a_backlash_for_rounding(kind):
+    """Creep goes on at rest, in any order of the stages."""
+    tracker = ik_of(OPERATORS[kind], dq_max=0.2, beta=0.0).tracker(HOME)
+    target = targets(2)[0]
+    commands = [tracker.step(target) for _ in range(200)]
+    assert tracker.error < 1e-8
+    assert np.abs(np.diff(commands[50:], axis=0)).max() < 1e-4
+
+
 @pytest.mark.parametrize("convert", [np.asarray, torch.from_numpy])
 def test_a_pause_with_creep_is_part_of_the_state(convert):
     operator = OPERATORS["plays, creep"]

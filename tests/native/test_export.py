@@ -126,7 +126,7 @@ def test_the_code_leads_by_the_hysteresis(tmp_path, kind, dtype):
 
 @needs_cc
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["play", "plays", "creep", "plays, creep"])
+@pytest.mark.parametrize("kind", ["play", "plays", "creep", "plays, creep", "creep, play, plays"])
 def test_commands_of_the_code_are_those_of_the_tracker(tmp_path, kind):
     n = trunk().n_actuators
     model = with_hysteresis(trunk(), operators(n, 1e-3)[kind])

@@ -34,12 +34,7 @@ def paths(names, ax):
     return [to_hex(line.get_color()).upper() for line in ax.lines[: len(names)]]
 
 
-def curves(names, ax):
-    plots.LearningCurveDisplay([10, 20], {name: [0.2, 0.1] for name in names}).plot(ax)
-    return [to_hex(line.get_color()).upper() for line in ax.lines]
-
-
-@pytest.mark.parametrize("draw", [boxes, outlines, paths, curves])
+@pytest.mark.parametrize("draw", [boxes, outlines, paths])
 def test_a_model_has_the_same_colour_in_every_figure(draw):
     expected = [plots.model_color(name) for name in NAMES]
     assert len({*expected}) == len(NAMES)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from sklearn.base import BaseEstimator, RegressorMixin
 
 from hybridkin import (
     ConstantCurvatureChain,
@@ -112,58 +111,6 @@ def test_tendons_of_a_heavy_body_are_drawn_as_long_as_they_are():
         arcs = chain._arcs_of_rows(torch.from_numpy(q))[:, 0]
         lengths = chain._statics().readings @ arcs
     np.testing.assert_allclose(drawn, lengths, rtol=1e-5)
-
-
-# Learning curves
-
-
-class Watcher(RegressorMixin, BaseEstimator):
-    """Predicts zero, and keeps what it was fitted on."""
-
-    seen = []  # noqa: RUF012
-
-    def fit(self, X, y, groups=None):
-        self.seen.append((X[:, 0].astype(int), groups))
-        self.shape_ = y.shape[1:]
-        return self
-
-    def predict(self, X):
-        return np.zeros((len(X), *self.shape_))
-
-
-def test_learning_curve_holds_out_and_adds_whole_motions(x):
-    Watcher.seen.clear()
-    q = np.arange(50.0)[:, None]  # the row itself
-    groups = np.repeat([*"abcde"], 10)[np.random.default_rng(1).permutation(50)]
-    display = plots.LearningCurveDisplay.from_estimator(
-        Watcher(), q, x, groups=groups, sizes=[15, 40], random_state=0
-    )
-    assert display.errors["Watcher"].shape == (2, 5)
-    assert sorted(len(rows) for rows, _ in Watcher.seen) == [15] * 5 + [40] * 5
-    for rows, given in Watcher.seen:
-        np.testing.assert_array_equal(given, groups[rows])
-        sizes = sorted(np.unique(given, return_counts=True)[1])
-        assert sizes == ([5, 10] if len(rows) == 15 else [10] * 4)
-    # Every motion is held out once, so that the errors with all rows average to that of all rows.
-    expected = np.linalg.norm(x, axis=1).mean()
-    np.testing.assert_allclose(display.errors["Watcher"].mean(axis=1), expected)
-
-
-def test_learning_curve_draws_mean_and_band(tmp_path):
-    figure, ax = plots.new_figure(4, 3)
-    curves = {"a": [[0.02, 0.04], [0.01, 0.02], [np.nan, np.nan]], "b": [0.03, 0.02, 0.01]}
-    display = plots.LearningCurveDisplay([25, 50, 100], curves)
-    display.plot(ax, unit="mm", styles={"b": ("black", "--")})
-    np.testing.assert_allclose(ax.lines[0].get_xydata(), [[25, 30], [50, 15]])
-    np.testing.assert_allclose(ax.lines[1].get_ydata(), [30, 20, 10])
-    assert (ax.lines[1].get_color(), ax.lines[1].get_linestyle()) == ("black", "--")
-    (band,) = ax.collections
-    corners = band.get_paths()[0].vertices
-    assert {(25.0, 20.0), (25.0, 40.0), (50.0, 10.0), (50.0, 20.0)} <= set(map(tuple, corners))
-    assert (ax.get_xscale(), ax.get_yscale()) == ("log", "log")
-    assert ax.get_ylabel() == "mean tip error [mm]"
-    assert [t.get_text() for t in ax.get_xticklabels()] == ["25", "50", "100"]
-    assert drawn(figure, tmp_path)
 
 
 # Space
@@ -327,11 +274,6 @@ def displays(x, track, film):
     return {
         "histogram": (plots.ErrorHistogramDisplay(errors).plot, False, "x"),
         "boxes": (plots.ErrorBoxDisplay(errors).plot, False, "x"),
-        "curve": (
-            plots.LearningCurveDisplay([9, 40], {"a": [[0.1, 0.2], [0.03, 0.04]]}).plot,
-            False,
-            "y",
-        ),
         "workspace": (plots.WorkspaceDisplay(x, 1.1 * x).plot, True, "xyz"),
         "body": (body.plot, True, "xyz"),
         "film": (film.plot, True, "xyz"),

@@ -60,7 +60,7 @@ class Body:
                 point_shape="circle",
             )
         self._disks = None
-        if body.disks is not None:
+        if body.disks is not None and body.disks.size:
             self._disks = scene.add_line_segments(
                 "/robot/disks",
                 _rims(body.disks),

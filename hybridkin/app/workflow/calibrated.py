@@ -138,7 +138,7 @@ def _unit(start: Chain, name: str, k: int, q_unit: LogUnit) -> _Unit:
     """Return the unit of the k-th number of a parameter."""
     if name == "base" and k < 3:
         return _DEGREES
-    unit = start.unit_of(start.part_of(name).entry)
+    unit = start.unit_of(name)
     if unit.endswith(_PER_UNIT):
         of_what = unit.removesuffix(_PER_UNIT)
         scale, symbol = _SHOWN.get(of_what, (1.0, of_what))
@@ -236,8 +236,9 @@ def deviations(
             "are slack."
         )
     if "turns" in result.values or "angles" in result.values:
-        before = start.geometry()["angles"].numpy(force=True)
-        change = result.chain.geometry()["angles"].numpy(force=True) - before
+        before = start.geometry()["angles"]
+        after = result.chain.geometry()["angles"]
+        change = (after - before).numpy(force=True)
         turned = (change - change[0] + np.pi) % (2.0 * np.pi) - np.pi
         most = np.degrees(np.abs(turned).max())
         if most > _TURN:

@@ -11,8 +11,6 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 from sklearn.linear_model import LinearRegression
-from sklearn.pipeline import Pipeline, make_pipeline
-from sklearn.preprocessing import MinMaxScaler, PolynomialFeatures
 
 from hybridkin import (
     CalibrationResult,
@@ -182,13 +180,6 @@ class Mechanical:
             yield from calibrated_parameters(rival.chain, result, rows.q_unit)
 
 
-def quadratic() -> Pipeline:
-    """Return a plain quadratic polynomial by least squares."""
-    return make_pipeline(
-        MinMaxScaler((-1, 1)), PolynomialFeatures(2), LinearRegression()
-    )
-
-
 def models_of(
     robot: robots.RobotDescription, mechanical: Mechanical, settings: FitSettings
 ) -> dict[str, HybridForwardModel]:
@@ -200,7 +191,7 @@ def models_of(
         without_error_model = CALIBRATED
         models[NOMINAL] = HybridForwardModel(mechanical.nominal, "drop")
     models[without_error_model] = HybridForwardModel(model, "drop")
-    models[DATA_QUADRATIC] = HybridForwardModel(None, quadratic())
+    models[DATA_QUADRATIC] = HybridForwardModel(None, "quadratic")
     network = growing_network(0)
     if settings.auto:
         models[DATA_ELM] = HybridForwardModel(None, network)

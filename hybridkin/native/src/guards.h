@@ -1,4 +1,4 @@
-/* Where a correction is trusted: leverage and box, weights, and the longest correction. */
+/* Where a correction is trusted: leverage, weights, and the longest correction. */
 
 /* The features of a row and their share of the leverage; guards of one hybrid often share them. */
 typedef struct {
@@ -166,44 +166,23 @@ static inline void HK(leverage_slope_at)(const hk_plan *p, int at, const V *q, H
    at most `enough`. */
 static inline V HK(guard_distance)(const hk_plan *p, int at, real enough, const V *q,
                                    HK(seen) * seen, V *work) {
-    const int n = p->code[at + HK_N];
-    const real *numbers = hk_numbers(p, at), *low = numbers + 1, *high = low + n;
-    if (HK_IS(p, at, HK_LEVERAGE_GUARD))
-        return HK(leverage_at)(p, p->code[at + HK_MORE], enough * numbers[1], q, seen, work) /
-               numbers[1];
-    V sum = SPLAT(1.0);
-    for (int j = 0; j < n; j++) {
-        const V below = HK(max)(low[j] - q[j], SPLAT(0.0)),
-                above = HK(max)(q[j] - high[j], SPLAT(0.0));
-        const V out = (below + above) * high[n + j];
-        sum = sum + HK_BOX_STEEPNESS * out * out;
-    }
-    return sum;
+    const real farthest = hk_numbers(p, at)[1];
+    return HK(leverage_at)(p, p->code[at + HK_MORE], enough * farthest, q, seen, work) / farthest;
 }
 
 /* Its slope (n), after `guard_distance`. */
 static inline void HK(guard_slope)(const hk_plan *p, int at, const V *q, HK(seen) * seen, V *slope,
                                    V *work) {
-    const int n = p->code[at + HK_N];
-    const real *numbers = hk_numbers(p, at), *low = numbers + 1, *high = low + n;
-    if (HK_IS(p, at, HK_LEVERAGE_GUARD)) {
-        HK(leverage_slope_at)(p, p->code[at + HK_MORE], q, seen, slope, work);
-        for (int j = 0; j < n; j++) slope[j] = slope[j] / numbers[1];
-        return;
-    }
-    for (int j = 0; j < n; j++) {
-        const V below = HK(max)(low[j] - q[j], SPLAT(0.0)),
-                above = HK(max)(q[j] - high[j], SPLAT(0.0));
-        slope[j] = R(2.0) * HK_BOX_STEEPNESS * (above - below) * high[n + j] * high[n + j];
-    }
+    const real farthest = hk_numbers(p, at)[1];
+    HK(leverage_slope_at)(p, p->code[at + HK_MORE], q, seen, slope, work);
+    for (int j = 0; j < p->code[at + HK_N]; j++) slope[j] = slope[j] / farthest;
 }
 
-/* The weight g = 1 / (1 + excess^3) of a guard, and its slope (n) where not NULL. By a leverage the
-   excess begins farther out than by a box. Returns whether any row fades; else g is 1
-   and the slope is not written, and the distance may be an upper bound if not `exact`, see hk_plan. */
+/* The weight g = 1 / (1 + excess^3) of a guard, and its slope (n) where not NULL. The excess begins
+   at the distance HK_FULL. Returns whether any row fades; else g is 1 and the slope is not written, and the distance may be an upper bound if not `exact`, see hk_plan. */
 static inline int HK(fading)(const hk_plan *p, int at, int exact, const V *q, HK(seen) * seen,
                              V *distance, V *g, V *slope, V *work) {
-    const real full = HK_IS(p, at, HK_LEVERAGE_GUARD) ? HK_FULL_LEVERAGE : HK_FULL;
+    const real full = HK_FULL;
     const real enough = exact ? p->enough : full * (R(1.0) - R(8.0) * HK_EPS);
     *g = SPLAT(1.0);
     *distance = HK(guard_distance)(p, at, enough, q, seen, work);
@@ -290,5 +269,5 @@ static inline V HK(group_distance)(const hk_plan *p, int at, const V *q, V *slop
 }
 
 /* What the functions of guards take at most besides `seen`. */
-#define HK_GUARD_WORK(n, S, m, powers)                                                             \
-    (HK_USES(HK_GROUP_DISTANCE) * 2 * (n) + (m) + HK_REGRESS_WORK(n, S, powers))
+#define HK_GUARD_WORK(n, S, m)                                                                     \
+    (HK_USES(HK_GROUP_DISTANCE) * 2 * (n) + (m) + HK_REGRESS_WORK(n, S))

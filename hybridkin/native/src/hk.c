@@ -65,7 +65,7 @@ typedef struct {
 /* Numbers of memory to compute in. */
 HK_API int64_t hk_work(const int32_t *code, int32_t at) {
     const int n = code[HK_MOST_N], S = code[HK_MOST_S], m = code[HK_MOST_M];
-    const int model = HK_MODEL_WORK(n, S, m, code[HK_MOST_F], code[HK_MOST_P]);
+    const int model = HK_MODEL_WORK(n, S, m, code[HK_MOST_F]);
     const int of_units = (m + m * n) * HK_LANES; /* see hkr_units */
     int around = n + m + m * n, slots = 0;
     if (code[at + HK_KIND] == HK_IK) {

@@ -22,9 +22,9 @@ typedef struct {
     ((m) * ((n) + 2) > HK_MOST_Z(n, S) * ((n) + 4) + 3 * (n) + 3                                   \
          ? (m) * ((n) + 2)                                                                         \
          : HK_MOST_Z(n, S) * ((n) + 4) + 3 * (n) + 3)
-#define HK_HYBRID_WORK(n, S, m, features, powers)                                                  \
+#define HK_HYBRID_WORK(n, S, m, features)                                                          \
     (HK_USES(HK_HYBRID) * (HK_SUM_WORK(n, S, m, features) + HK_TERM_WORK(n, S, m) + (n) +          \
-                           HK_GUARD_WORK(n, S, m, powers)))
+                           HK_GUARD_WORK(n, S, m)))
 
 /* df/dz, computed once. */
 static inline const V *HK(base_slope)(const hk_plan *p, int base, HK(total) * sum, V *work) {

@@ -828,18 +828,34 @@ static inline void ik_try_ends(const ik_settings *ik, const ik_state *now, real 
     }
 }
 
+/* `goal` (n), what the actuators are to do, becomes the commands for it. */
+static inline void ik_commands_for(const ik_settings *ik, const ik_state *now, real seconds,
+                                   real *goal) {
+    for (int i = 0; i < ik->hysteresis.code[HK_STATE_ROWS] * ik->n; i++)
+        now->tried[i] = now->lead[i];
+    hk_hysteresis_command(&ik->hysteresis, seconds, goal, now->tried);
+}
+
 /* Commands (n) for a step dq of the actuators. One that would move far for almost nothing, such as
-   through a backlash for rounding, stays; `kept` (n) is what they do without a new command. */
+   through a backlash for rounding, is that of an actuator that stays, or stays itself; `kept` (n) is
+   what they do without a new command. */
 static inline void ik_command(const ik_settings *ik, const ik_state *now, real seconds,
                               const real *kept, const real *dq, real *command) {
-    const int n = ik->n, rows = ik->hysteresis.code[HK_STATE_ROWS];
-    const real *y = now->lead + (rows - 1) * n;
-    for (int i = 0; i < rows * n; i++) now->tried[i] = now->lead[i];
-    for (int j = 0; j < n; j++) command[j] = y[j] + dq[j];
-    hk_hysteresis_command(&ik->hysteresis, seconds, command, now->tried);
+    const int n = ik->n;
+    const real *y = now->lead + (ik->hysteresis.code[HK_STATE_ROWS] - 1) * n;
+    real still[HK_MAX_N];
+    int tiny = 0;
+    for (int j = 0; j < n; j++) command[j] = y[j] + dq[j], still[j] = y[j];
+    ik_commands_for(ik, now, seconds, command);
+    for (int j = 0; j < n; j++)
+        tiny |= ik_abs(dq[j]) < IK_AT_REST_SHARE * ik_abs(command[j] - now->q[j]);
+    if (tiny) ik_commands_for(ik, now, seconds, still);
     for (int j = 0; j < n; j++) {
-        const real moved = y[j] + dq[j] - kept[j], way = command[j] - now->q[j];
-        if (ik_abs(moved) < IK_AT_REST_SHARE * ik_abs(way)) command[j] = now->q[j];
+        real moved = y[j] + dq[j] - kept[j];
+        if (tiny && ik_abs(dq[j]) < IK_AT_REST_SHARE * ik_abs(command[j] - still[j]))
+            command[j] = still[j], moved = y[j] - kept[j];
+        if (ik_abs(moved) < IK_AT_REST_SHARE * ik_abs(command[j] - now->q[j]))
+            command[j] = now->q[j];
     }
 }
 

@@ -13,9 +13,8 @@
 #include "guards.h"
 #include "hybrid.h"
 
-#define HK_MODEL_WORK(n, S, m, features, powers)                                                   \
-    (2 * (n) + HK_CHAIN_WORK(n, S) + HK_REGRESS_WORK(n, S, powers) +                               \
-     HK_HYBRID_WORK(n, S, m, features, powers) +                                                   \
+#define HK_MODEL_WORK(n, S, m, features)                                                           \
+    (2 * (n) + HK_CHAIN_WORK(n, S) + HK_REGRESS_WORK(n, S) + HK_HYBRID_WORK(n, S, m, features) +   \
      (HK_USES(HK_WITH_POSE) ? 6 + 6 * (n) : 0) + HK_POSES * HK_CHAIN_POSE_WORK(n, S))
 
 /* q + shift (n), where the actuator zeros have shifted, and the place of the model within. */

@@ -46,7 +46,7 @@ typedef int64_t hk_bits;
 #define HK_MOST_Z(n, S) (3 * (S) > (n) ? 3 * (S) : (n)) /* inner coordinates */
 
 /* A plan begins with its largest sizes. */
-enum { HK_MOST_N, HK_MOST_S, HK_MOST_M, HK_MOST_F, HK_MOST_P, HK_MOST_R };
+enum { HK_MOST_N, HK_MOST_S, HK_MOST_M, HK_MOST_F, HK_MOST_R };
 
 /* A node of a plan: code[at] is its kind, then the lengths of its input and output, where its
    numbers begin in `data`, and what else its kind needs: sizes, and where its parts stand. */

@@ -179,27 +179,6 @@ static inline void HK(elm)(const hk_plan *p, int at, const V *q, V *x, V *J, V *
         for (int j = 0; j < n; j++) features[n_hidden + j] = u[j];
 }
 
-/* Sums of products of powers of u. Their factors stand as places in the table of powers. */
-static inline void HK(polynomial)(const hk_plan *p, int at, const V *q, V *x, V *J, V *work) {
-    const int32_t *node = p->code + at, *factor = node + HK_MORE + 2;
-    const int n = node[HK_N], m = node[HK_M], terms = node[HK_MORE], powers = node[HK_MORE + 1];
-    const real *center = hk_numbers(p, at), *readout = center + 2 * n;
-    V *u = HK(take)(&work, n), *power = HK(take)(&work, n * powers);
-    HK(scaled)(n, center, q, u);
-    for (int j = 0; j < n; j++) {
-        power[j * powers] = SPLAT(1.0);
-        for (int k = 1; k < powers; k++) power[j * powers + k] = power[j * powers + k - 1] * u[j];
-    }
-    for (int o = 0; o < m; o++) x[o] = SPLAT(0.0);
-    for (int k = 0; J && k < m * n; k++) J[k] = SPLAT(0.0);
-    for (int t = 0; t < terms; t++, readout += m + m * n) {
-        V phi = SPLAT(1.0);
-        for (int left = *factor++; left > 0; left--) phi = phi * power[*factor++];
-        for (int o = 0; o < m; o++) x[o] = x[o] + phi * readout[o];
-        for (int k = 0; J && k < m * n; k++) J[k] = J[k] + phi * readout[m + k];
-    }
-}
-
 /* value = c + D u + u' A u / 2 with symmetric A, output by output; its slope by u is D + A u. */
 HK_INLINE void HK(quadratic_of)(int n, int m, const real *c, const real *inverse,
                                 const V *restrict u, V *restrict x, V *restrict J) {
@@ -237,16 +216,13 @@ static inline void HK(readout)(const hk_plan *p, int at, const V *q, V *x, V *J,
 /* A regressor of q itself. `features` is for networks alone. */
 static inline void HK(regress_all)(const hk_plan *p, int at, const V *q, V *x, V *J, V *features,
                                    V *work) {
-    if (HK_IS(p, at, HK_POLYNOMIAL))
-        HK(polynomial)(p, at, q, x, J, work);
-    else if (HK_IS(p, at, HK_READOUT))
+    if (HK_IS(p, at, HK_READOUT))
         HK(readout)(p, at, q, x, J, work);
     else if (HK_USES(HK_ELM) || HK_USES(HK_AFFINE) || HK_USES(HK_KERNEL))
         HK(elm)(p, at, q, x, J, features, work);
 }
 
-#define HK_REGRESS_WORK(n, S, powers)                                                              \
-    ((1 + HK_USES(HK_PROJECTED)) * (n) + HK_POSE_WORK(n, S) + HK_USES(HK_POLYNOMIAL) * (powers))
+#define HK_REGRESS_WORK(n, S) ((1 + HK_USES(HK_PROJECTED)) * (n) + HK_POSE_WORK(n, S))
 
 /* Any regressor, also one of A q + b, the part of q that its training rows moved; A (n, n). */
 static inline void HK(regress)(const hk_plan *p, int at, const V *q, V *x, V *J, V *features,

@@ -15,7 +15,7 @@ const @REAL@ @NAME@_home[@N@] = {@HOME@};
 static const hk_plan plan = {code, data, 0};
 
 /* Numbers of memory to compute in, on the stack. */
-enum { WORK = HK_MODEL_WORK(HK_MAX_N, HK_MAX_S, HK_MAX_M, HK_MAX_F, HK_MAX_P) };
+enum { WORK = HK_MODEL_WORK(HK_MAX_N, HK_MAX_S, HK_MAX_M, HK_MAX_F) };
 
 void @NAME@_forward(const @REAL@ *q, @REAL@ *x) {
     real work[WORK];

@@ -235,7 +235,7 @@ def test_a_largest_error_is_in_millimetres(log, robot, tmp_path, capsys, limit, 
     """2.5 mm is the error of every row."""
     table = rows()
     with torch.no_grad():
-        tips = robots.from_toml(robot)(torch.from_numpy(-1e-3 * table[:, 1:7])).numpy()
+        tips = robots.read_description(robot).chain(torch.from_numpy(-1e-3 * table[:, 1:7])).numpy()
     table[:, 7:10] = 1e3 * tips + [1.5, 0.0, 2.0]
     log = write(tmp_path / "moved.csv", table)
     assert run(capsys, "evaluate", robot, log, "--fail-above", limit)[0] == code

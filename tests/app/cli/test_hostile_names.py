@@ -81,7 +81,7 @@ def home(tmp_path, monkeypatch):
     (tmp_path / "data.toml").write_text(data, encoding="utf-8")
     turns = np.linspace(0, 6, 20)[:, None] + np.arange(3)
     q = np.concatenate([4.0 * size * np.sin(turns) for size in (1.0, 0.8, 0.6, 0.5)])
-    x = robots.from_toml(tmp_path / "robot.toml")(torch.from_numpy(q)).numpy()
+    x = robots.read_description(tmp_path / "robot.toml").chain(torch.from_numpy(q)).numpy()
     x += 2e-4 * np.sin(0.3 * q)
     with open(LOG, "w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)

@@ -68,7 +68,8 @@ def made(tmp_path_factory):
     (home / "data.toml").write_text(ROBOT[ROBOT.index("[log]") : ROBOT.index("[limits]")])
     turns = np.linspace(0, 6, 20)[:, None] + np.arange(3)
     q = np.concatenate([0.004 * size * np.sin(turns) for size in (1.0, 0.8, 0.6, 0.5)])
-    x = robots.from_toml(home / "robot.toml")(torch.from_numpy(q)).numpy() + 2e-4 * np.sin(300 * q)
+    chain = robots.read_description(home / "robot.toml").chain
+    x = chain(torch.from_numpy(q)).numpy() + 2e-4 * np.sin(300 * q)
     for name, n in (("log.csv", 80), ("track.csv", 40), ("run.csv", 40)):
         table = np.column_stack([q, x, np.arange(80) // 20])[:n]
         np.savetxt(home / name, table, "%.9g", ",", header="a,b,c,x,y,z,motion", comments="")

@@ -37,9 +37,8 @@ def home(tmp_path, monkeypatch):
     (tmp_path / "data.toml").write_text(ROBOT[ROBOT.index("[log]") : ROBOT.index("[limits]")])
     turns = np.linspace(0, 6, 20)[:, None] + np.arange(3)
     q = np.concatenate([0.004 * size * np.sin(turns) for size in (1.0, 0.8, 0.6, 0.5)])
-    x = robots.from_toml(tmp_path / "robot.toml")(torch.from_numpy(q)).numpy() + 2e-4 * np.sin(
-        300 * q
-    )
+    chain = robots.read_description(tmp_path / "robot.toml").chain
+    x = chain(torch.from_numpy(q)).numpy() + 2e-4 * np.sin(300 * q)
     table = np.column_stack([q, x, np.arange(80) // 20])
     header = "a,b,c,x,y,z,motion"
     np.savetxt("log.csv", table, "%.9g", ",", header=header, comments="")

@@ -28,7 +28,7 @@ q_max = 0.006
 
 def folder(tmp_path, held_out):
     (tmp_path / "robot.toml").write_text(ROBOT, encoding="utf-8")
-    chain = robots.from_toml(tmp_path / "robot.toml")
+    chain = robots.read_description(tmp_path / "robot.toml").chain
     q = np.random.default_rng(0).uniform(-0.007, 0.007, (60, 2, 3))
     q = (q - q.mean(axis=2, keepdims=True)).reshape(60, 6).clip(-0.008, 0.006)
     with torch.no_grad():

@@ -48,7 +48,7 @@ def log(tmp_path):
     robot = tmp_path / "robot.toml"
     robot.write_text(ROBOT)
     with torch.no_grad():
-        x = robots.from_toml(robot)(torch.from_numpy(q)).numpy()
+        x = robots.read_description(robot).chain(torch.from_numpy(q)).numpy()
     x += 0.02 * np.sin(30 * q[:, :3]) + 0.001 * rng.standard_normal(x.shape)
     rows = np.column_stack([1000 * q, 1000 * x, np.repeat(np.arange(6), 30)])
     path = tmp_path / "log.csv"
