@@ -16,7 +16,8 @@ from torch import Tensor
 
 from hybridkin._core.arrays import identity
 from hybridkin._core.kernel_numbers import HK_LEAST_LENGTH
-from hybridkin.chains._arcs import WorkOfGravity, segments_of
+from hybridkin.chains._arcs import segments_of
+from hybridkin.chains._gravity import WorkOfGravity
 
 _MOST_STEPS = (
     1000  # a body that falls to one side and is pulled to another turns slowly

@@ -50,7 +50,7 @@ CHAINS = {
 }
 SETTINGS = (
     "n_actuators n_outputs n_segments routing extensible starts bends stage markers gravity "
-    "arcs_per_segment actuators_per_segment in_metres units takes_lengths default_parameters "
+    "arcs_per_segment actuators_per_segment in_metres unit_of_q takes_lengths default_parameters "
     "parameter_sets kinds names"
 ).split()
 NUMBERS = "rest reach rigid_length absolute pulls couplings limits".split()
