@@ -15,6 +15,7 @@ from hybridkin import (
     HybridForwardModel,
     InverseKinematics,
     datasets,
+    open_model,
     plots,
     robots,
     save_model,
@@ -32,7 +33,7 @@ TRACK = InverseKinematics(trunk(), q_min=0.1, q_max=0.4, dt=0.1).track(
 )
 SAVED = FOLDER / "model.safetensors"
 save_model(FITTED, SAVED)
-LOADED = workflow.open_model(SAVED)
+LOADED = open_model(SAVED)
 LIMITS = workflow.path_limits(LOADED, q_min=0.1, q_max=0.4)
 LOG = datasets.Log(Q, X, GROUPS, np.arange(24.0))
 CSV, POINTS, ROBOT = FOLDER / "log.csv", FOLDER / "path.csv", FOLDER / "robot.toml"
@@ -61,7 +62,6 @@ NUMBERS = [np.nan, np.inf, -np.inf, 0, -0.0, 1, -1, 2.5, 5e-324, 1e-300, 1e300, 
 OBJECTS = (torch.nn.Module, HybridForwardModel, datasets.Log, robots.LogFormat)
 OBJECTS += (
     robots.RobotDescription,
-    workflow.LoadedModel,
     workflow.PathLimits,
     trajectories.Trajectory,
     type(TRACK),

@@ -49,6 +49,7 @@ from hybridkin import (
     datasets,
     jacobian,
     load_model,
+    open_model,
     plots,
     robots,
     save_model,
@@ -378,12 +379,12 @@ ENTRIES = {
             "groups": GROUPS,
         },
     ),
-    "workflow.open_model": (workflow.open_model, {"path": SAVED, "robot": ROBOT}),
+    "open_model": (open_model, {"model": SAVED, "robot": ROBOT}),
     "workflow.scaled_path": (workflow.scaled_path, {"path": PATH, "scale": 0.5}),
     "workflow.path_limits": (
         workflow.path_limits,
         {
-            "loaded": LOADED,
+            "model": LOADED,
             "q_min": 0.1,
             "q_max": np.full(3, 0.4),
             "dq_max": 1.0,
@@ -394,7 +395,7 @@ ENTRIES = {
     "workflow.shape_path": (
         workflow.shape_path,
         {
-            "loaded": LOADED,
+            "model": LOADED,
             "limits": LIMITS,
             "shape": "spiral",
             "size": [0.02, 0.05],
@@ -406,7 +407,7 @@ ENTRIES = {
             "dt": 0.1,
         },
     ),
-    "workflow.describe": (workflow.describe, {"loaded": LOADED}),
+    "workflow.describe": (workflow.describe, {"model": LOADED}),
     "workflow.read_log": (
         workflow.read_log,
         {
@@ -423,26 +424,25 @@ COSTLY = {
         choose_geometry,
         {"chain": trunk(), "q": Q, "x": X, "groups": GROUPS},
     ),
-    "LoadedModel.effective": (LOADED.effective, {"commands": Q}),
-    "LoadedModel.expected_errors": (LOADED.expected_errors, {"q": Q}),
+    "HybridForwardModel.was_fitted": (LOADED.was_fitted, {"X": Q, "y": X}),
     "RobotDescription.to_log": (DESCRIPTION.to_log, {"q": Q}),
     "RobotDescription.from_log": (DESCRIPTION.from_log, {"q": Q}),
     "evaluate_log": (
         workflow.evaluate_log,
-        {"loaded": LOADED, "log": LOG, "out": None, "force": True},
+        {"model": LOADED, "log": LOG, "out": None, "force": True},
     ),
     "verify_track": (
         workflow.verify_track,
-        {"loaded": LOADED, "track": SENT, "log": LOG, "out": None},
+        {"model": LOADED, "track": SENT, "log": LOG, "out": None},
     ),
     "next_rows": (
         workflow.next_rows,
-        {"loaded": LOADED, "out": OUT, "n": 2, "limits": LIMITS, "path": PATH},
+        {"model": LOADED, "out": OUT, "n": 2, "limits": LIMITS, "path": PATH},
     ),
     "track_path": (
         workflow.track_path,
         {
-            **{"loaded": LOADED, "path": PATH, "out": OUT, "limits": LIMITS, "start": "rest"},
+            **{"model": LOADED, "path": PATH, "out": OUT, "limits": LIMITS, "start": "rest"},
             **{"tol": 1e-3, "force": True},
         },
     ),

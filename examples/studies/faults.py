@@ -37,7 +37,14 @@ from log_mistakes import Case, advised, fits
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hybridkin import HybridForwardModel, Hysteresis, cross_fit, save_model
+from hybridkin import (
+    HybridForwardModel,
+    Hysteresis,
+    cross_fit,
+    native,
+    open_model,
+    save_model,
+)
 from hybridkin.app import check_log, workflow
 from hybridkin.app.workflow.errors import Promise
 from hybridkin.app.workflow.report import Report
@@ -187,11 +194,11 @@ FAULTS: dict[str, tuple[Callable[[Run], NDArray], str]] = {
 """What is done to a run, and the name of its cause."""
 
 
-def fitted(robot: FaultRobot, seed: int, folder: Path) -> workflow.LoadedModel:
+def fitted(robot: FaultRobot, seed: int, folder: Path) -> HybridForwardModel:
     """Return a hybrid that is fitted to a log of a robot and promises errors; it is kept."""
     path = folder / f"{robot.name}_{seed}.safetensors"
     if path.is_file():
-        return workflow.open_model(path)
+        return open_model(path)
     rng = np.random.default_rng([seed, 1])
     q = np.concatenate([robot.motion(rng, N_ROWS) for _ in range(N_MOTIONS)])
     groups = np.repeat(np.arange(N_MOTIONS), N_ROWS)
@@ -206,7 +213,7 @@ def fitted(robot: FaultRobot, seed: int, folder: Path) -> workflow.LoadedModel:
     training: dict[str, Any] = {"saved": "hybrid", "held_out": {"hybrid": held_out}}
     training["promise"] = vars(Promise.of(errors, far))
     save_model(model, path, training=training)
-    return workflow.open_model(path)
+    return open_model(path)
 
 
 def _write_track(path: Path, q: NDArray, x: NDArray) -> None:
@@ -221,7 +228,7 @@ def _write_track(path: Path, q: NDArray, x: NDArray) -> None:
 
 
 def verified(
-    loaded: workflow.LoadedModel,
+    model: HybridForwardModel,
     robot: FaultRobot,
     seed: int,
     fault: str,
@@ -235,9 +242,9 @@ def verified(
     x = FAULTS[fault][0](run)
     x = x + robot.noise * rng.standard_normal(x.shape)
     track = folder / "track.csv"
-    _write_track(track, q, loaded.tips(q))
+    _write_track(track, q, native.evaluate(model.module_, q)[0])
     began = time.process_time()
-    record = workflow.verify_track(loaded, track, Log(q, x)).record
+    record = workflow.verify_track(model, track, Log(q, x)).record
     others = getattr(record, "also", [])
     if not hasattr(record, "also"):
         others = [name for name, share in record.causes.items() if share > 0.5]
@@ -264,10 +271,10 @@ def study(seeds: Sequence[int], folder: Path, faults: Sequence[str]) -> list[dic
             robot = kind(seed)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                loaded = fitted(robot, seed, folder)
+                model = fitted(robot, seed, folder)
                 for fault in faults:
                     for number in range(N_CLEAN if fault == CLEAN else 1):
-                        found = verified(loaded, robot, seed, fault, folder, number)
+                        found = verified(model, robot, seed, fault, folder, number)
                         found |= {"robot": robot.name, "seed": seed, "fault": fault}
                         records.append(found)
     return records

@@ -49,11 +49,12 @@ from hybridkin import (
     HybridForwardModel,
     cross_fit,
     datasets,
+    native,
+    open_model,
     robots,
     save_model,
     trajectories,
 )
-from hybridkin.app.workflow import open_model
 from hybridkin.app.workflow.errors import Promise
 from hybridkin.app.workflow.report import Report
 
@@ -372,15 +373,15 @@ def along_still(setup: Setup, folder: Path, counts: NDArray) -> dict[str, float]
         along still directions ("model_error", "model_error_projected") [m].
     """
     found = directions(setup.log.counts)
-    loaded = open_model(folder)
-    chain = loaded.chain
+    model = open_model(folder)
+    chain = model.mechanical_model_
     if chain is None:
         raise ValueError(f"{folder} has no mechanical model.")
     signs = -setup.robot.signs
     along = (counts - found.mean) @ found.still
     projected = counts - along @ found.still.T
     functions = {
-        "model": lambda c: loaded.tips(signs * c),
+        "model": lambda c: native.evaluate(model.module_, signs * c)[0],
         "mechanical": lambda c: chain(torch.from_numpy(signs * c)).detach().numpy(),
         "robot": lambda c: setup.robot.tips_of(setup.robot.pulls(c)),
     }

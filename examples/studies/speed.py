@@ -27,6 +27,7 @@ from hybridkin import (
     InverseKinematics,
     datasets,
     native,
+    open_model,
     robots,
 )
 from hybridkin.app import workflow
@@ -153,11 +154,9 @@ def main() -> None:
     if arguments.model is None:
         cases = trunk_cases()
     else:
-        loaded = workflow.open_model(arguments.model, arguments.robot)
-        limits = workflow.path_limits(loaded)
-        cases = [
-            Case(Path(arguments.model).name, loaded.model, limits.q_min, limits.q_max)
-        ]
+        model = open_model(arguments.model, arguments.robot)
+        limits = workflow.path_limits(model)
+        cases = [Case(Path(arguments.model).name, model, limits.q_min, limits.q_max)]
     torch.set_num_threads(1)
     print(
         f"torch {torch.__version__}, one thread; us per row: NumPy, eager torch, ratio"

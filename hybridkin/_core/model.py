@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
@@ -225,6 +225,10 @@ class ForwardModel(PortableModule):
         """Return one model for each point of the robot: a chain of K markers has K."""
         return [self]
 
+    def softer(self) -> Sequence[ForwardModel]:
+        """Return the same robot with actuators that give way, where that may matter."""
+        return []
+
     def unit_messages(self, q: Tensor, name: str, factor: float = 1.0) -> list[str]:
         """Return warnings if q (N, n) holds values too large to be metres or radians.
 
@@ -382,10 +386,6 @@ class ForwardModel(PortableModule):
         from pytorch_kinematics import Transform3d  # takes a second and loads pyplot
 
         return Transform3d(matrix=self.pose(q))
-
-    def softer(self) -> list[ForwardModel]:
-        """Return the same robot with actuators that give way, where that may matter."""
-        return []
 
     # The robot after a change.
 

@@ -17,7 +17,7 @@ from sklearn.metrics import r2_score
 from sklearn.utils.validation import check_is_fitted
 from typing_extensions import Self
 
-from hybridkin._core.arrays import labels
+from hybridkin._core.arrays import check_shape, labels, real_array
 from hybridkin._core.commands import Commands
 from hybridkin._core.digests import row_digests
 from hybridkin._core.distinct import targets_that_count
@@ -234,7 +234,9 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """
         check_is_fitted(self, "module_")
         q = check_inputs(self, Commands.of(X).q)
-        return np.isin(row_digests(q, y), self._fit.fitted_rows)
+        measured = real_array(y, "y")
+        check_shape(measured, "y", (len(q), "m"), "one row for each row of `X`")
+        return np.isin(row_digests(q, measured), self._fit.fitted_rows)
 
     def effective(self, X: object) -> NDArray:
         """Return what the actuators do for commands X [unit of q]; without `hysteresis`, X itself.

@@ -14,8 +14,7 @@ import pandas as pd
 import torch
 from saved_models import FOLDER, predictions
 
-from hybridkin import RigidChain, load_model, robots
-from hybridkin.app.workflow import open_model
+from hybridkin import RigidChain, load_model, open_model, robots
 from hybridkin.datasets import load_armlab, load_asl_trunk, load_log
 from hybridkin.ik import trajectories
 
@@ -165,7 +164,7 @@ READERS = {
         [TOML],
         [hostile.damaged, hostile.renumbered, hostile.described],
         lambda path, k: _read_chain(
-            open_model(path).model if k % 2 else robots.read_description(path).chain
+            open_model(path).mechanical_model_ if k % 2 else robots.read_description(path).chain
         ),
         "robot.toml",
     ),

@@ -30,11 +30,11 @@ from hybridkin.app.cli._terminal import Stages, write
 from hybridkin.formats import FRAMES, METRES, check_outputs, visible, write_file
 
 if TYPE_CHECKING:
-    from hybridkin import Chain, robots, trajectories
+    from hybridkin import ForwardModel, robots, trajectories
     from hybridkin.app import LogReport
     from hybridkin.app.workflow import (
         Counts,
-        LoadedModel,
+        HybridForwardModel,
         MeasuredLog,
         PathLimits,
         Report,
@@ -128,18 +128,18 @@ def _interruptible() -> Iterator[None]:
 
 def _next(arguments: argparse.Namespace, stages: Stages) -> _Result:
     workflow = hybridkin.app.workflow
-    loaded = _model_of(arguments)
+    model = _model_of(arguments)
     measured = None
     if arguments.log is not None:
-        measured = _log_of(loaded, arguments, stages, chain=loaded.chain)
+        measured = _log_of(model, arguments, stages, chain=model.module_.robot)
         measured.check(arguments.force)
     report = workflow.next_rows(
-        loaded,
+        model,
         arguments.out,
         n=arguments.n,
-        limits=_limits(arguments, loaded, within_fit=False),
+        limits=_limits(arguments, model, within_fit=False),
         measured=measured,
-        path=_path_of(arguments, loaded),
+        path=_path_of(arguments, model),
         force=arguments.force,
         progress=stages,
     )
@@ -218,12 +218,12 @@ def _replaced_model(arguments: argparse.Namespace) -> str:
 
 
 def _evaluate(arguments: argparse.Namespace, stages: Stages) -> _Result:
-    loaded = _model_of(arguments)
-    nominal = loaded.chain if loaded.header is None else None
-    log = _log_of(loaded, arguments, stages, chain=nominal)
+    model = _model_of(arguments)
+    nominal = None if model.description_.created else model.module_.robot
+    log = _log_of(model, arguments, stages, chain=nominal)
     _note(log.report, stages)
     report = hybridkin.app.workflow.evaluate_log(
-        loaded, log, arguments.out, force=arguments.force
+        model, log, arguments.out, force=arguments.force
     )
     mean = 1000.0 * report.record.judged.mean
     limit = arguments.fail_above
@@ -231,25 +231,25 @@ def _evaluate(arguments: argparse.Namespace, stages: Stages) -> _Result:
 
 
 def _view(arguments: argparse.Namespace, stages: Stages) -> _Result:
-    loaded = _model_of(arguments)
+    model = _model_of(arguments)
     log = None
     if arguments.log is not None:
-        log = _log_of(loaded, arguments, stages, base_is_free=True)
-    path = _path_of(arguments, loaded)
-    limits = _scaled_limits(arguments, loaded)
+        log = _log_of(model, arguments, stages, base_is_free=True)
+    path = _path_of(arguments, model)
+    limits = _scaled_limits(arguments, model)
     place = {"host": arguments.host, "port": arguments.port}
     with hybridkin.app.view(
-        loaded, log, path=path, **vars(limits), **place
+        model, log, path=path, **vars(limits), **place
     ) as shown_robot:
         address = shown_robot.address
-        words = f"{visible(loaded.name)} is at {address}. Ctrl-C ends it."
+        words = f"{visible(model.description_.name)} is at {address}. Ctrl-C ends it."
         stages.note(words, important=True)
         if not arguments.no_browser and "SSH_CONNECTION" not in os.environ:
             webbrowser.open(address)
         with contextlib.suppress(KeyboardInterrupt):
             shown_robot.wait()
     report = hybridkin.app.workflow.Report(
-        f"View of {loaded.name}", {"address": address}
+        f"View of {model.description_.name}", {"address": address}
     )
     report.text("The view is closed.")
     return report, 0
@@ -257,17 +257,17 @@ def _view(arguments: argparse.Namespace, stages: Stages) -> _Result:
 
 def _track(arguments: argparse.Namespace, stages: Stages) -> _Result:
     workflow = hybridkin.app.workflow
-    loaded = _model_of(arguments)
+    model = _model_of(arguments)
     if (arguments.path is None) == (arguments.shape is None):
         raise ValueError("give either a file of points or --shape, one of the two.")
-    log_format = loaded.log_format()
-    limits = _limits(arguments, loaded)
-    path = _path_of(arguments, loaded)
+    log_format = model.description_.log
+    limits = _limits(arguments, model)
+    path = _path_of(arguments, model)
     if path is None:
         metre = METRES[arguments.unit or log_format.x_unit]
         center = arguments.center
         path = workflow.shape_path(
-            loaded,
+            model,
             limits,
             arguments.shape,
             np.multiply(metre, arguments.size or ()).tolist(),
@@ -280,14 +280,14 @@ def _track(arguments: argparse.Namespace, stages: Stages) -> _Result:
         )
     start = arguments.start
     report = workflow.track_path(
-        loaded,
+        model,
         workflow.scaled_path(path, arguments.scale),
         arguments.out,
         limits=limits,
         start=start if isinstance(start, str) else log_format.from_log(start),
         tol=1e-3 * arguments.tol,
         delay=arguments.delay or 0.0,
-        counts=_counts(arguments, loaded),
+        counts=_counts(arguments, model),
         out_of_reach=arguments.out_of_reach,
         force=arguments.force,
         progress=stages,
@@ -301,15 +301,15 @@ def _track(arguments: argparse.Namespace, stages: Stages) -> _Result:
     return report, int(not good)
 
 
-def _counts(arguments: argparse.Namespace, loaded: LoadedModel) -> Counts | None:
+def _counts(arguments: argparse.Namespace, model: HybridForwardModel) -> Counts | None:
     """Return the numbers to which commands are rounded, None without `--round`."""
     Counts = hybridkin.app.workflow.Counts
     if arguments.round is None:
         return None
     if arguments.round is not True:
-        n = loaded.n_actuators
+        n = model.n_features_in_
         return Counts([arguments.round] * n, [0.0] * n)
-    counts = Counts.read(loaded.training)
+    counts = Counts.read(model.description_.training)
     if counts is None or not any(counts.steps):
         raise ValueError(
             "`--round` needs a model that was fitted by `hybridkin fit` to a log with whole "
@@ -319,11 +319,11 @@ def _counts(arguments: argparse.Namespace, loaded: LoadedModel) -> Counts | None
 
 
 def _verify(arguments: argparse.Namespace, stages: Stages) -> _Result:
-    loaded = _model_of(arguments)
-    log_format = _log_format(arguments, loaded.log_format(), arguments.model)
+    model = _model_of(arguments)
+    log_format = _log_format(arguments, model.description_.log, arguments.model)
     log = _measured_track(arguments, replace(log_format, groups=None), stages)
     report = hybridkin.app.workflow.verify_track(
-        loaded,
+        model,
         arguments.track,
         log,
         arguments.out,
@@ -363,7 +363,7 @@ def _animate(arguments: argparse.Namespace, stages: Stages) -> _Result:
 
 
 def _export(arguments: argparse.Namespace, stages: Stages) -> _Result:
-    loaded = _model_of(arguments)
+    model = _model_of(arguments)
     if arguments.fmu is not None:
         kind = "fmu"
     elif arguments.mex:
@@ -371,13 +371,13 @@ def _export(arguments: argparse.Namespace, stages: Stages) -> _Result:
     else:
         kind = "c"
     report = hybridkin.app.workflow.export_model(
-        loaded,
+        model,
         arguments.fmu or arguments.out,
         kind=kind,
         name=arguments.name,
         dtype=arguments.dtype,
         dt=arguments.dt,
-        limits=None if arguments.dt is None else _limits(arguments, loaded),
+        limits=None if arguments.dt is None else _limits(arguments, model),
         force=arguments.force,
     )
     return report, 0
@@ -385,9 +385,12 @@ def _export(arguments: argparse.Namespace, stages: Stages) -> _Result:
 
 def _describe(arguments: argparse.Namespace, stages: Stages) -> _Result:
     workflow = hybridkin.app.workflow
+    if arguments.log.suffix.lower() == ".toml":
+        robot = hybridkin.robots.read_description(arguments.log)
+        return workflow.describe_robot(robot), 0
     if not workflow.is_log(arguments.log):
-        loaded = workflow.open_model(arguments.log, arguments.robot)
-        return workflow.describe(loaded), 0
+        model = hybridkin.open_model(arguments.log, arguments.robot)
+        return workflow.describe(model), 0
     if arguments.robot is None:
         raise ValueError(
             f"{arguments.log} is a log; name its robot: --robot ROBOT.toml."
@@ -518,25 +521,27 @@ _COMMANDS = (
 _RUN = {command.__name__[1:]: command for command in _COMMANDS}
 
 
-def _model_of(arguments: argparse.Namespace) -> LoadedModel:
+def _model_of(arguments: argparse.Namespace) -> HybridForwardModel:
     """Return the model that the arguments name."""
-    return hybridkin.app.workflow.open_model(arguments.model, arguments.robot)
+    return hybridkin.open_model(arguments.model, arguments.robot)
 
 
 def _limits(
-    arguments: argparse.Namespace, loaded: LoadedModel, **options: bool
+    arguments: argparse.Namespace, model: HybridForwardModel, **options: bool
 ) -> PathLimits:
     """Return the limits of a track with what the arguments say."""
-    scaled = _scaled_limits(arguments, loaded)
-    return hybridkin.app.workflow.path_limits(loaded, **vars(scaled), **options)
+    scaled = _scaled_limits(arguments, model)
+    return hybridkin.app.workflow.path_limits(model, **vars(scaled), **options)
 
 
-def _scaled_limits(arguments: argparse.Namespace, loaded: LoadedModel) -> robots.Limits:
+def _scaled_limits(
+    arguments: argparse.Namespace, model: HybridForwardModel
+) -> robots.Limits:
     """Return the limits of the arguments, in the log's unit and sign, which may swap the ends."""
     limits = hybridkin.robots.Limits(
         arguments.q_min, arguments.q_max, arguments.dq_max, arguments.ddq_max
     )
-    return limits.scaled(loaded.log_format().q_factor)
+    return limits.scaled(model.description_.log.q_factor)
 
 
 def _note(found: LogReport, stages: Stages) -> None:
@@ -545,24 +550,24 @@ def _note(found: LogReport, stages: Stages) -> None:
 
 
 def _path_of(
-    arguments: argparse.Namespace, loaded: LoadedModel
+    arguments: argparse.Namespace, model: HybridForwardModel
 ) -> trajectories.Trajectory | None:
     """Return the path of the tip that the arguments name; None without."""
     if arguments.path is None:
         return None
-    unit = arguments.unit or loaded.log_format().x_unit
+    unit = arguments.unit or model.description_.log.x_unit
     return hybridkin.trajectories.from_csv(arguments.path, unit=unit, dt=arguments.dt)
 
 
 def _log_of(
-    loaded: LoadedModel,
+    model: HybridForwardModel,
     arguments: argparse.Namespace,
     stages: Stages,
-    chain: Chain | None = None,
+    chain: ForwardModel | None = None,
     base_is_free: bool = False,
 ) -> MeasuredLog:
     """Return the log of the arguments in the format of a model's robot."""
-    described = None if loaded.description is None else loaded.description.log
+    described = model.description_.robot.log
     log_format = _log_format(arguments, described, arguments.model)
     return _read(arguments, log_format, stages, chain, base_is_free)
 
@@ -571,7 +576,7 @@ def _read(
     arguments: argparse.Namespace,
     log_format: robots.LogFormat,
     stages: Stages,
-    chain: Chain | None = None,
+    chain: ForwardModel | None = None,
     base_is_free: bool = False,
 ) -> MeasuredLog:
     """Return the log of the arguments, read and checked."""

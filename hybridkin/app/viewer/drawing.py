@@ -8,8 +8,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from hybridkin import Chain, Commands, ForwardModel
+from hybridkin import Commands, ForwardModel
 from hybridkin.app.viewer.steered import SteeredRobot
+from hybridkin.app.workflow.model import is_fitted, tips_at
 from hybridkin.datasets import Log
 from hybridkin.plots import BackboneDisplay
 
@@ -32,10 +33,10 @@ class Body:
 
     def __init__(self, scene: Any, model: Any, robot: SteeredRobot) -> None:
         self._model = model
-        self._chain = robot.loaded.chain
+        self._chain = robot.model.module_.robot
         body = _body_of(model, robot)
         self._thick = 0.015 * robot.size
-        least = robot.loaded.module.robot.least_radius
+        least = robot.model.module_.tip_model.robot.least_radius
         self._thick = min(self._thick, 0.4 * least)
         self._backbone = scene.add_spline_catmull_rom(
             "/robot/backbone",
@@ -91,11 +92,11 @@ class Body:
 
     def _marked(self, robot: SteeredRobot) -> NDArray:
         """Return the markers (K, 3) as the model predicts them."""
-        return robot.loaded.predict(Commands(robot.q[None])).reshape(-1, 3)
+        return robot.model.predict(Commands(robot.q[None])).reshape(-1, 3)
 
     def _tensions(self, robot: SteeredRobot) -> tuple[NDArray, NDArray]:
         """Return colours (n, 3) of the actuators, and which are slack (n,)."""
-        model = robot.loaded.module.robot
+        model = robot.model.module_.tip_model.robot
         q = torch.from_numpy(robot.q)
         low = torch.from_numpy(robot.limits.q_min)
         with torch.no_grad():
@@ -113,7 +114,7 @@ class Ghost:
     """The backbone of another model at the same command."""
 
     def __init__(
-        self, scene: Any, name: str, chain: Chain, robot: SteeredRobot
+        self, scene: Any, name: str, chain: ForwardModel, robot: SteeredRobot
     ) -> None:
         self._chain = chain
         self.line = scene.add_spline_catmull_rom(
@@ -136,12 +137,12 @@ class LogCloud:
     """Rows of a log: measured tips coloured by the error of the model, which can be clicked."""
 
     def __init__(self, scene: Any, robot: SteeredRobot, log: Log) -> None:
-        loaded = robot.loaded
+        model = robot.model
         (commands, tips) = robot.measured_rows(log)
         every = 1 + len(tips) // _MOST_ROWS
         self._commands = commands[::every]
         self._tips = tips[::every]
-        error = np.linalg.norm(loaded.tips(self._commands) - self._tips, axis=1)
+        error = np.linalg.norm(tips_at(model, self._commands) - self._tips, axis=1)
         largest = 1.0
         if len(error):
             largest = float(np.percentile(error, 95))
@@ -155,9 +156,9 @@ class LogCloud:
             point_shape="circle",
         )
         self.learned = None
-        if loaded.hybrid is not None and loaded.chain is not None:
-            mechanical = tips_of(loaded.chain, self._commands)
-            hybrid = tips_of(loaded.hybrid.module_, self._commands)
+        if is_fitted(model):
+            mechanical = tips_of(model.module_.robot, self._commands)
+            hybrid = tips_of(model.module_, self._commands)
             self.learned = scene.add_line_segments(
                 "/learned",
                 np.stack([mechanical, hybrid], axis=1),

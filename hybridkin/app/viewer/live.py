@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Callable
-from pathlib import Path
 from threading import Event, Thread
 from typing import Any
 
@@ -13,7 +12,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Self
 
-from hybridkin import Chain, HybridForwardModel, trajectories
+from hybridkin import (
+    Chain,
+    ForwardModel,
+    HybridForwardModel,
+    as_forward_model,
+    open_model,
+    trajectories,
+)
 from hybridkin.app.viewer.drawing import BLUE, GREEN, ORANGE, RED, Body, Ghost, LogCloud
 from hybridkin.app.viewer.motions import (
     Loop,
@@ -25,7 +31,7 @@ from hybridkin.app.viewer.motions import (
 )
 from hybridkin.app.viewer.steered import RATE, SteeredRobot
 from hybridkin.app.workflow.domain import path_limits
-from hybridkin.app.workflow.model import LoadedModel
+from hybridkin.app.workflow.model import expected_errors, has_body, is_fitted
 from hybridkin.datasets import Log
 from hybridkin.formats import csv_table, markdown, visible
 from hybridkin.plots.page_server import page_server, stop
@@ -37,7 +43,7 @@ _PAUSE = 0.1  # between two updates of the words [s]
 
 
 def view(
-    model: LoadedModel | HybridForwardModel | Chain,
+    model: HybridForwardModel | Chain,
     log: Log | None = None,
     *,
     path: trajectories.Trajectory | None = None,
@@ -52,8 +58,8 @@ def view(
 
     Parameters
     ----------
-    model : LoadedModel, HybridForwardModel or Chain
-        A model with a mechanical part that can be drawn; from a file by `workflow.open_model`.
+    model : HybridForwardModel or Chain
+        A model with a mechanical part that can be drawn; from a file by `open_model`.
     log : Log, optional
         Measured rows to show, from `datasets.load_log` or `workflow.read_log`. A click on a row
         moves the robot there.
@@ -92,12 +98,12 @@ def view(
     ...     print(shown.address)
     http://127.0.0.1:8080
     """
-    if not isinstance(model, LoadedModel):
-        model = LoadedModel(type(model).__name__, Path(), model)
-    if model.chain is None:
+    if not isinstance(model, HybridForwardModel):
+        model = open_model(as_forward_model(model))
+    if not has_body(model):
         raise TypeError(
             "`model` must be a chain, or a hybrid fitted on one, so that its body can be drawn; "
-            f"got a model without a mechanical part, {model.name}."
+            f"got a model without a mechanical part, {model.description_.name}."
         )
     if log is not None and not _has_range(model):
         q_min = np.nanmin(log.q, axis=0) if q_min is None else q_min
@@ -108,11 +114,9 @@ def view(
     return LiveView(SteeredRobot(model, limits), log, path, host, port)
 
 
-def _has_range(model: LoadedModel) -> bool:
+def _has_range(model: HybridForwardModel) -> bool:
     """Return whether the model or its description gives a range of the actuators."""
-    if model.trained_range is not None:
-        return True
-    return model.description is not None and model.description.limits.q_min is not None
+    return is_fitted(model) or model.description_.limits.q_min is not None
 
 
 class LiveView:
@@ -169,7 +173,7 @@ class LiveView:
         scene.add_frame(
             "/base", axes_length=0.15 * robot.size, axes_radius=0.004 * robot.size
         )
-        self._body = Body(scene, robot.loaded.model, robot)
+        self._body = Body(scene, robot.model, robot)
         self._aim = scene.add_transform_controls(
             "/target",
             scale=0.15 * robot.size,
@@ -201,7 +205,7 @@ class LiveView:
                 self._switched[name] = self._rows.learned
             scene.on_click()(self._clicked)
         self._ghosts = []
-        for name, chain in _other_models(robot.loaded).items():
+        for name, chain in _other_models(robot.model).items():
             ghost = Ghost(scene, name, chain, robot)
             self._ghosts.append(ghost)
             self._switched[name] = ghost.line
@@ -265,7 +269,7 @@ class LiveView:
     def _add_sliders(self) -> None:
         """Add a slider for every actuator, in the names and the unit of the log."""
         robot = self.robot
-        log_format = robot.loaded.log_format()
+        log_format = robot.model.description_.log
         self._factor = np.broadcast_to(log_format.q_factor, robot.q.shape)
         ends = [robot.limits.q_min / self._factor, robot.limits.q_max / self._factor]
         low, high = np.sort(ends, axis=0)
@@ -319,12 +323,12 @@ class LiveView:
         rows = []
         for k, row in enumerate(self.robot.commands()):
             rows.append([f"{k / RATE:.2f}", *(f"{value:.9g}" for value in row)])
-        text = csv_table(["t", *self.robot.loaded.log_format().q], rows)
+        text = csv_table(["t", *self.robot.model.description_.log.q], rows)
         event.client.send_file_download("commands.csv", text.encode())
 
     def _expected(self) -> float:
         """Return the error to expect of the robot here [m], 0 if it is not known."""
-        expected = self.robot.loaded.expected_errors(self.robot.q[None])
+        expected = expected_errors(self.robot.model, self.robot.q[None])
         for errors in expected.values():
             return float(errors[0])
         return 0.0
@@ -389,7 +393,7 @@ class LiveView:
             color = GREEN
         if tuple(self._ball.color) != color:
             self._ball.color = color
-        names = map(markdown, robot.loaded.log_format().q)
+        names = map(markdown, robot.model.description_.log.q)
         at_limits = itertools.compress(names, robot.held)
         lines = [f"**{situation.words}**"]
         if np.isfinite(situation.error):
@@ -405,11 +409,12 @@ class LiveView:
                 slider.value = float(np.clip(value, slider.min, slider.max))
 
 
-def _other_models(loaded: LoadedModel) -> dict[str, Chain]:
-    """Return the mechanical models behind a model, by name."""
+def _other_models(model: HybridForwardModel) -> dict[str, ForwardModel]:
+    """Return the mechanical models behind a fitted model, by name."""
     models = {}
-    if loaded.description is not None and loaded.description.chain is not None:
-        models["nominal model"] = loaded.description.chain
-    if loaded.hybrid is not None and loaded.chain is not None:
-        models["calibrated model"] = loaded.chain
-    return {name: chain for name, chain in models.items() if chain is not loaded.model}
+    nominal = model.description_.robot.chain
+    if is_fitted(model):
+        models["calibrated model"] = model.module_.robot
+        if nominal is not None:
+            models["nominal model"] = nominal
+    return models

@@ -41,7 +41,7 @@ class Wiggle:
         high = robot.limits.q_max
         home = np.clip(robot.domain.preferred, low, high)
         self._robot = robot
-        self._names = robot.loaded.log_format().q
+        self._names = robot.model.description_.log.q
         self._steps = [home]
         for j in range(len(home)):
             there = home.copy()

@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hybridkin import IKStatus, InverseKinematics
+from hybridkin import HybridForwardModel, IKStatus, InverseKinematics
 from hybridkin.app.workflow.domain import Domain, PathLimits
-from hybridkin.app.workflow.model import LoadedModel
+from hybridkin.app.workflow.model import commands_for, domain_distance, tips_at
 from hybridkin.datasets import Log
 
 RATE = 50.0  # ticks per second
@@ -51,7 +51,7 @@ class SteeredRobot:
 
     Parameters
     ----------
-    loaded : LoadedModel
+    model : HybridForwardModel
         The model.
     limits : PathLimits
         Limits of the actuators. Without a limit of speed the whole range takes one second.
@@ -66,21 +66,21 @@ class SteeredRobot:
         Largest extent of the reachable space [m].
     """
 
-    def __init__(self, loaded: LoadedModel, limits: PathLimits) -> None:
-        self.loaded = loaded
+    def __init__(self, model: HybridForwardModel, limits: PathLimits) -> None:
+        self.model = model
         self.limits = limits
-        self.domain = Domain(loaded, limits)
+        self.domain = Domain(model, limits)
         self.span = np.maximum(limits.q_max - limits.q_min, np.finfo(float).tiny)
         speed = self.span / _TRAVEL if limits.dq_max is None else limits.dq_max
         self.q = self.domain.preferred
-        self.x = loaded.tips(self.q[None])[0]
+        self.x = tips_at(model, self.q[None])[0]
         self.target = self.x
         tips = self.domain.sample[1]
         self.size = float(np.ptp(np.vstack([tips, np.zeros(3)]), axis=0).max())
         self._close = _CLOSE * self.size
         self._largest_step = speed / RATE
         self._tracker = InverseKinematics(
-            loaded.module.without_hysteresis,
+            model.module_.tip_model.without_hysteresis,
             q_min=limits.q_min,
             q_max=limits.q_max,
             dq_max=speed,
@@ -126,7 +126,7 @@ class SteeredRobot:
             else:
                 way = self._goal - before
                 self.q = before + np.clip(way, -self._largest_step, self._largest_step)
-            self.x = self.loaded.tips(self.q[None])[0]
+            self.x = tips_at(self.model, self.q[None])[0]
             if self._goal is not None:
                 self.target = self.x
             self._history.append(self.q)
@@ -138,7 +138,7 @@ class SteeredRobot:
     def situation(self) -> Situation:
         """What there is to say about robot and target."""
         with self._lock:
-            inside = bool(self.loaded.domain_distance(self.q[None])[0] <= 1.0)
+            inside = bool(domain_distance(self.model, self.q[None])[0] <= 1.0)
             error = float(np.linalg.norm(self.target - self.x))
             reached = error <= self._close
             out_of_reach = False
@@ -171,7 +171,7 @@ class SteeredRobot:
         """Return motions of the actuators (N, n) and tips (N, 3) of the known rows of a log."""
         tips = log.x[:, -3:]
         measured = np.isfinite(log.q).all(axis=1) & np.isfinite(tips).all(axis=1)
-        return self.loaded.effective(log.commands[measured]), tips[measured]
+        return self.model.effective(log.commands[measured]), tips[measured]
 
     def commands(self) -> NDArray:
         """Return the commands (T, n) since the start, at most ten minutes, in the log's unit.
@@ -180,5 +180,5 @@ class SteeredRobot:
         """
         with self._lock:
             motion = np.array(self._history)
-        sent = self.loaded.commands(motion, np.arange(len(motion)) / RATE)
-        return self.loaded.log_format().to_log(sent)
+        sent = commands_for(self.model, motion, np.arange(len(motion)) / RATE)
+        return self.model.description_.log.to_log(sent)

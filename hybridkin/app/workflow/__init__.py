@@ -3,9 +3,9 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from hybridkin.app.workflow.description import Description, describe
+from hybridkin.app.workflow.description import Description, describe, describe_robot
 from hybridkin.app.workflow.log import LogError, MeasuredLog, read_log
-from hybridkin.app.workflow.model import LOG_SUFFIXES, LoadedModel, is_log, open_model
+from hybridkin.app.workflow.model import LOG_SUFFIXES, is_log
 from hybridkin.app.workflow.report import Report
 
 if TYPE_CHECKING:
@@ -32,7 +32,6 @@ __all__ = [
     "Evaluation",
     "FitRecord",
     "FitSettings",
-    "LoadedModel",
     "LogError",
     "MeasuredLog",
     "PathLimits",
@@ -41,6 +40,7 @@ __all__ = [
     "Verification",
     "animate_track",
     "describe",
+    "describe_robot",
     "estimated_delay",
     "evaluate_log",
     "export_model",
@@ -48,7 +48,6 @@ __all__ = [
     "is_log",
     "merge_files",
     "next_rows",
-    "open_model",
     "path_limits",
     "read_log",
     "read_tips",

@@ -5,15 +5,23 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
 from hybridkin import robots
 from hybridkin.app.workflow.errors import HeldOutErrors
-from hybridkin.app.workflow.model import LoadedModel
+from hybridkin.app.workflow.model import (
+    hysteresis_in_words,
+    is_fitted,
+    trained_range,
+    widths_in_log,
+)
 from hybridkin.app.workflow.report import Report, listed
 from hybridkin.formats import visible
+
+if TYPE_CHECKING:
+    from hybridkin import HybridForwardModel
 
 _NAMES = 24  # width of the names of rows
 _NOTES = ("log", "rows", "n_whole", "n_motions", "saved", "chosen")
@@ -22,7 +30,7 @@ _PER_TIME = {"dq_max": "/s", "ddq_max": "/s^2"}
 
 @dataclass(frozen=True, eq=False)
 class Description:
-    """What a model is, in SI units; entries that are not known are None.
+    """What a model is, in SI units; entries that are not known are None or empty.
 
     Attributes
     ----------
@@ -36,11 +44,11 @@ class Description:
         The choices of "auto", see ``HybridForwardModel.cv_results_``.
     hysteresis : list of float or None
         Widths of the hysteresis of one or all actuators, in the unit of the robot's logs.
-    domain : Limits or None
+    domain : Limits
         Training range.
     log_format : LogFormat
         Format of the robot's logs.
-    limits : Limits or None
+    limits : Limits
         Limits of its actuators.
     training : dict
         Notes of the fit in the file.
@@ -55,20 +63,20 @@ class Description:
     geometry: Mapping[str, Tensor]
     auto: Mapping[str, Any] | None
     hysteresis: list[float] | None
-    domain: robots.Limits | None
+    domain: robots.Limits
     log_format: robots.LogFormat
-    limits: robots.Limits | None
+    limits: robots.Limits
     training: Mapping[str, Any]
-    created: str | None
-    versions: Mapping[str, str] | None
+    created: str
+    versions: Mapping[str, str]
 
 
-def describe(loaded: LoadedModel) -> Report[Description]:
+def describe(model: HybridForwardModel) -> Report[Description]:
     """Return a report on a model.
 
     Parameters
     ----------
-    loaded : LoadedModel
+    model : HybridForwardModel
         The model, as from `open_model`.
 
     Returns
@@ -76,42 +84,87 @@ def describe(loaded: LoadedModel) -> Report[Description]:
     Report of Description
         Geometry, training, domain, errors and choices.
     """
-    header = loaded.header or {}
-    robot = loaded.description
-    hybrid = loaded.hybrid
+    known = model.description_
+    robot = model.module_.robot
+    kind = type(model)
+    rows = model.html_rows()
+    if not is_fitted(model):
+        kind = type(robot)
+        rows = robot.html_rows()
     record = Description(
-        name=loaded.name,
-        path=str(loaded.path),
-        kind=type(loaded.model).__name__,
-        n_actuators=loaded.n_actuators,
-        geometry={} if loaded.chain is None else loaded.chain.geometry(),
-        auto=None if hybrid is None else hybrid.cv_results_,
-        hysteresis=loaded.hysteresis_widths,
-        domain=loaded.trained_range,
-        log_format=loaded.log_format(),
-        limits=None if robot is None else robot.limits,
-        training=loaded.training,
-        created=header.get("created"),
-        versions=header.get("versions"),
+        name=known.name,
+        path=str(known.path),
+        kind=kind.__name__,
+        n_actuators=model.n_features_in_,
+        geometry=robot.geometry(),
+        auto=model.cv_results_,
+        hysteresis=widths_in_log(model),
+        domain=trained_range(model),
+        log_format=known.log,
+        limits=known.limits,
+        training=known.training,
+        created=known.created,
+        versions=known.versions,
     )
+    hysteresis = ""
+    if model.hysteresis_:
+        hysteresis = f"The actuators have {hysteresis_in_words(model)}."
+    return _report(record, rows, hysteresis)
+
+
+def describe_robot(robot: robots.RobotDescription) -> Report[Description]:
+    """Return a report on a robot, of which there is no fitted model.
+
+    Parameters
+    ----------
+    robot : RobotDescription
+        The robot, as from `robots.read_description`; with segments.
+
+    Returns
+    -------
+    Report of Description
+        Its geometry, limits and logs.
+    """
+    if robot.chain is None:
+        raise ValueError(
+            f"`robot` {robot.path} has no segments: there is nothing to describe before a fit."
+        )
+    n = robot.n_actuators
+    log = robot.log
+    if log is None:
+        unit = "m" if robot.chain.in_metres else "1"
+        names = tuple(f"q{i + 1}" for i in range(n))
+        log = robots.LogFormat(names, ("x", "y", "z"), unit)
+    record = Description(
+        name=robot.name,
+        path=str(robot.path),
+        kind=type(robot.chain).__name__,
+        n_actuators=n,
+        geometry=robot.chain.geometry(),
+        auto=None,
+        hysteresis=None,
+        domain=robots.Limits(),
+        log_format=log,
+        limits=robot.limits,
+        training={},
+        created="",
+        versions={},
+    )
+    return _report(record, robot.chain.html_rows(), "")
+
+
+def _report(
+    record: Description, rows: Mapping[str, object], hysteresis: str
+) -> Report[Description]:
+    """Return a record with its words; `rows` are those of a notebook."""
     title = f"{record.name}: {record.kind}, {record.n_actuators} actuators"
     report = Report(title, record)
-    if hybrid is None:
-        rows = loaded.module.html_rows()
-    else:
-        rows = hybrid.html_rows()
     report.verbatim(_in_lines(rows))
-    if loaded.hysteresis:
-        report.text(
-            f"The actuators have {loaded.hysteresis.in_words(loaded.log_unit)}."
-        )
+    if hysteresis:
+        report.text(hysteresis)
     log = record.log_format
-    for name, limits in {
-        "Training range": record.domain,
-        "Limits": record.limits,
-    }.items():
-        if limits is not None:
-            _write_limits(report, name, limits, log)
+    _write_limits(report, "Training range", record.domain, log)
+    _write_limits(report, "Limits", record.limits, log)
     report.text(
         "Logs: q in {unit}, q_sign {sign} ({q}), x in {x_unit} ({x}).",
         unit=log.q_unit,
@@ -121,7 +174,7 @@ def describe(loaded: LoadedModel) -> Report[Description]:
         x=", ".join(log.x),
     )
     _write_training(report, record.training)
-    if record.versions is not None:
+    if record.versions:
         words = [f"{name} {version}" for name, version in record.versions.items()]
         report.text(
             "Saved on {date} by {versions}.",

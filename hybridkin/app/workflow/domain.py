@@ -8,8 +8,14 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hybridkin import InverseKinematics, robots
-from hybridkin.app.workflow.model import LoadedModel
+from hybridkin import HybridForwardModel, InverseKinematics, robots
+from hybridkin.app.workflow.model import (
+    domain_distance,
+    half_width,
+    is_fitted,
+    tips_at,
+    trained_range,
+)
 from hybridkin.arguments import real_array
 
 _WALKERS = 256
@@ -30,6 +36,8 @@ class PathLimits:
         Largest speed [m/s] and acceleration [m/s^2].
     source : str
         Source of `q_min` and `q_max`, in words.
+    lead : ndarray of shape (n,) or float
+        Half the width of the hysteresis [unit of q]; 0 without.
     """
 
     q_min: NDArray
@@ -37,6 +45,12 @@ class PathLimits:
     source: str
     dq_max: NDArray | None = None
     ddq_max: NDArray | None = None
+    lead: NDArray | float = 0.0
+
+    @property
+    def commands(self) -> tuple[NDArray, NDArray]:
+        """Limits of commands, which lead what the actuators do by up to half the width."""
+        return self.q_min - self.lead, self.q_max + self.lead
 
     @property
     def span(self) -> NDArray:
@@ -45,7 +59,7 @@ class PathLimits:
 
 
 def path_limits(
-    loaded: LoadedModel,
+    model: HybridForwardModel,
     q_min: ArrayLike | None = None,
     q_max: ArrayLike | None = None,
     dq_max: ArrayLike | None = None,
@@ -59,7 +73,7 @@ def path_limits(
 
     Parameters
     ----------
-    loaded : LoadedModel
+    model : HybridForwardModel
         The model, as from `open_model`.
     q_min, q_max, dq_max, ddq_max : float or array-like of shape (n,), optional
         Limits of the commands [m], of their speed [m/s] and acceleration [m/s^2].
@@ -76,7 +90,7 @@ def path_limits(
     ValueError
         If the range of the actuators is not known.
     """
-    n = loaded.n_actuators
+    n = model.n_features_in_
     overrides: dict[str, NDArray] = {}
     for name, value in zip(_NAMES, (q_min, q_max, dq_max, ddq_max), strict=True):
         if value is not None:
@@ -86,14 +100,12 @@ def path_limits(
                     f"`{name}` must be one number or {n}, got {limit.size}."
                 )
             overrides[name] = limit
-    described = robots.Limits()
-    if loaded.description is not None:
-        described = loaded.description.limits
+    described = model.description_.limits
     trained = robots.Limits()
     if within_fit or not _has_ends(described):
-        trained = loaded.trained_range or trained
-    limits = dict(vars(described.narrowed(loaded.half_width).intersect(trained)))
-    given = vars(robots.Limits(**overrides).narrowed(loaded.half_width))
+        trained = trained_range(model) or trained
+    limits = dict(vars(described.narrowed(half_width(model)).intersect(trained)))
+    given = vars(robots.Limits(**overrides).narrowed(half_width(model)))
     for name in overrides:
         limit = given[name]
         # Of one given end, scaled to actuators of both signs, some entries are open.
@@ -124,7 +136,7 @@ def path_limits(
         source = "given"
     elif "q_min" in overrides or "q_max" in overrides:
         source = f"given and {source}"
-    return PathLimits(**values, source=source)
+    return PathLimits(**values, source=source, lead=half_width(model))
 
 
 def _has_ends(limits: robots.Limits) -> bool:
@@ -138,7 +150,7 @@ def _has_ends(limits: robots.Limits) -> bool:
 class Domain:
     """The commands that a track may use: within limits, and in the domain of the model."""
 
-    loaded: LoadedModel
+    model: HybridForwardModel
     limits: PathLimits
 
     @cached_property
@@ -150,25 +162,24 @@ class Domain:
         the middle. For a model without a fit it is no tendon pulled, or for other robots the middle
         of the limits.
         """
-        trained = self.loaded.trained_range
+        fitted = is_fitted(self.model)
         limits = self.limits
-        spanned = trained or limits
+        spanned = trained_range(self.model) if fitted else limits
         middle = 0.5 * (np.asarray(spanned.q_min) + np.asarray(spanned.q_max))
         middle = self._bent(middle)
         candidates = [middle]
         if self.all_tendons:
             candidates.append(self.rest)
-            if trained is None:
+            if not fitted:
                 candidates.reverse()
-        hybrid = self.loaded.hybrid
-        if hybrid is not None and hybrid.fitted_module_.tested is not None:
-            tested = hybrid.fitted_module_.tested
-            rows = tested.rows.numpy(force=True) - hybrid.change_.shift
+        tested = self.model.fitted_module_.tested
+        if tested is not None:
+            rows = tested.rows.numpy(force=True) - self.model.change_.shift
             far = np.linalg.norm(rows - middle, axis=1)
             median = self._bent(np.median(rows, axis=0))
             candidates = [median, *candidates, rows[far.argmin()]]
         q = np.clip(candidates, limits.q_min, limits.q_max)
-        distance = self.loaded.domain_distance(q)
+        distance = domain_distance(self.model, q)
         return q[np.maximum(distance, 1.0).argmin()]  # the first of those in the domain
 
     def _bent(self, q: NDArray) -> NDArray:
@@ -177,7 +188,7 @@ class Domain:
 
     @cached_property
     def _actuators(self) -> robots.ActuatorLayout:
-        return self.loaded.module.robot.actuator_layout
+        return self.model.module_.tip_model.robot.actuator_layout
 
     @property
     def all_tendons(self) -> bool:
@@ -189,7 +200,7 @@ class Domain:
         """The command (n,) at which no tendon is pulled; for other robots zero."""
         if self.all_tendons:
             return self._actuators.rest
-        return np.zeros(self.loaded.n_actuators)
+        return np.zeros(self.model.n_features_in_)
 
     @cached_property
     def sample(self) -> tuple[NDArray, NDArray]:
@@ -206,18 +217,18 @@ class Domain:
         high = self.limits.q_max
         span = self.limits.span
         q = rng.uniform(low, high, (_WALKERS, len(low)))
-        if self.loaded.hybrid is not None:
+        if is_fitted(self.model):
             q[:] = self.preferred
             for _ in range(_STEPS):
                 step = _STEP * span * rng.standard_normal(q.shape)
                 ahead = q + step @ self.bending
-                inside = self.loaded.domain_distance(ahead) <= 1.0
+                inside = domain_distance(self.model, ahead) <= 1.0
                 inside &= ((ahead >= low) & (ahead <= high)).all(axis=1)
                 q[inside] = ahead[inside]
             # Near the preferred one, because that may be exactly straight.
             near = 0.01 * span * rng.standard_normal(len(low))
             q[0] = self.preferred + near @ self.bending
-        tips = self.loaded.tips(q)
+        tips = tips_at(self.model, q)
         finite = np.isfinite(tips).all(axis=1)
         return q[finite], tips[finite]
 
@@ -233,9 +244,9 @@ class Domain:
         With hysteresis the limits of q are those of the commands.
         """
         limits = self.limits
-        q_min, q_max = self.of_commands
+        q_min, q_max = limits.commands
         return InverseKinematics(
-            self.loaded.model,
+            self.model,
             q_min=q_min,
             q_max=q_max,
             dq_max=limits.dq_max,
@@ -243,12 +254,6 @@ class Domain:
             q_pref=self.preferred,
             dt=dt,
         )
-
-    @property
-    def of_commands(self) -> tuple[NDArray, NDArray]:
-        """Limits of commands, which lead what the actuators do by up to half the width."""
-        half = self.loaded.half_width
-        return self.limits.q_min - half, self.limits.q_max + half
 
     def postures(self, n: int) -> NDArray:
         """Return at most n commands from the whole range of the limits; tendons are balanced.
@@ -259,9 +264,9 @@ class Domain:
         low = self.limits.q_min
         high = self.limits.q_max
         q = np.random.default_rng(0).uniform(low, high, (n, len(low)))
-        return self.loaded.module.robot.balanced(q, low, high)
+        return self.model.module_.tip_model.robot.balanced(q, low, high)
 
     @cached_property
     def bending(self) -> NDArray:
         """The projector (n, n) of rows q on those that bend a plain tendon chain, else identity."""
-        return self.loaded.module.robot.effective_directions()
+        return self.model.module_.tip_model.robot.effective_directions()

@@ -19,7 +19,14 @@ from hybridkin.app.workflow.fit_record import (
     write_markers,
 )
 from hybridkin.app.workflow.log import MeasuredLog, checked, write_check
-from hybridkin.app.workflow.model import LoadedModel
+from hybridkin.app.workflow.model import (
+    check_columns,
+    fitted_rows,
+    has_body,
+    held_out_errors,
+    is_fitted,
+    kind_of,
+)
 from hybridkin.app.workflow.report import Report, check_out
 from hybridkin.datasets import Log
 
@@ -103,7 +110,7 @@ def _share(values: NDArray) -> float:
 
 
 def evaluate_log(
-    loaded: LoadedModel,
+    model: HybridForwardModel,
     log: Log,
     out: str | Path | None = None,
     *,
@@ -113,7 +120,7 @@ def evaluate_log(
 
     Parameters
     ----------
-    loaded : LoadedModel
+    model : HybridForwardModel
         The model, as from `open_model`.
     log : Log
         As from `read_log` or `datasets.load_log`.
@@ -135,15 +142,15 @@ def evaluate_log(
     """
     if out is not None:
         check_out(out, "evaluate", _FIGURES, force=force)
-    loaded.check_columns(log.q)
+    check_columns(model, log.q)
     measured = checked(log, None, base_is_free=False)
     measured.check(force)
-    if loaded.hysteresis:
+    if model.hysteresis_:
         measured.check_order("A model with hysteresis")
-    predicted = loaded.predict(measured.commands)
+    predicted = model.predict(measured.commands)
     markers = marker_distances(predicted, log.x)
-    errors = _row_errors(loaded, measured.commands, markers)
-    fitted = loaded.was_fitted(log.q, log.x, measured.motions)
+    errors = _row_errors(model, measured.commands, markers)
+    fitted = fitted_rows(model, log.q, log.x, measured.motions)
     fitted_errors = None
     new_errors = None
     if fitted is not None and fitted.any():
@@ -154,7 +161,7 @@ def evaluate_log(
     for name in dict.fromkeys(measured.motions):
         motions[str(name)] = errors.of(measured.motions == name)
     record = Evaluation(
-        model=str(loaded.path),
+        model=str(model.description_.path),
         log=log.source,
         log_check=measured.report,
         all=errors.of(np.ones(len(log.q), dtype=bool)),
@@ -162,35 +169,34 @@ def evaluate_log(
         fitted_rows=None if fitted is None else int(fitted.sum()),
         fitted=fitted_errors,
         new=new_errors,
-        held_out=None if fitted_errors is None else loaded.held_out,
+        held_out=None if fitted_errors is None else held_out_errors(model),
         markers=errors_of_markers(markers),
     )
-    report = Report(f"{loaded.name}: errors on {Path(log.source).name}", record)
-    _write_errors(report, loaded.hybrid)
+    report = Report(
+        f"{model.description_.name}: errors on {Path(log.source).name}", record
+    )
+    _write_errors(report, model)
     if out is not None:
-        _add_figures(report, loaded, measured, predicted)
+        _add_figures(report, model, measured, predicted)
         report.write(out)
     return report
 
 
 def _row_errors(
-    loaded: LoadedModel, commands: Commands, markers: NDArray
+    model: HybridForwardModel, commands: Commands, markers: NDArray
 ) -> _RowErrors:
     in_domain = np.full(len(commands), np.nan)
     in_radius = in_domain
-    hybrid = loaded.hybrid
-    if hybrid is not None:
-        in_domain = hybrid.in_domain(commands).astype(float)
-    if hybrid is not None and hybrid.radius_ is not None:
-        _, radius = hybrid.predict(commands, return_radius=True)
+    if is_fitted(model):
+        in_domain = model.in_domain(commands).astype(float)
+    if model.radius_ is not None:
+        _, radius = model.predict(commands, return_radius=True)
         inside = np.nanmax(markers, axis=1) <= radius
         in_radius = np.where(np.isinf(radius), np.nan, inside)
     return _RowErrors(np.nanmean(markers, axis=1), in_domain, in_radius)
 
 
-def _write_errors(
-    report: Report[Evaluation], hybrid: HybridForwardModel | None
-) -> None:
+def _write_errors(report: Report[Evaluation], model: HybridForwardModel) -> None:
     """Add the errors to a report."""
     record = report.record
     write_check(report, record.log_check)
@@ -214,31 +220,31 @@ def _write_errors(
         entries |= {name: part for name, part in parts.items() if part is not None}
     largest_first = sorted(record.motions.items(), key=lambda item: -item[1].mean)
     columns = ["rows", "mean", "median", "p95", "max"]
-    if hybrid is not None:
+    if is_fitted(model):
         columns += ["share_in_domain", "share_in_radius"]
     report.errors(entries | dict(largest_first), columns)
-    if hybrid is not None and hybrid.radius_ is not None:
+    if model.radius_ is not None:
         report.text(
-            f"Estimated error radius: {hybrid.radius_}. Rows without a radius do not count."
+            f"Estimated error radius: {model.radius_}. Rows without a radius do not count."
         )
     write_markers(report, record.markers, "all rows")
 
 
 def _add_figures(
     report: Report[Evaluation],
-    loaded: LoadedModel,
+    model: HybridForwardModel,
     log: MeasuredLog,
     predicted: NDArray,
 ) -> None:
     plots = hybridkin.plots
     errors = np.nanmean(marker_distances(predicted, log.x), axis=1)
-    add_histogram(report, {loaded.kind: errors}, "Tip errors of all rows.")
+    add_histogram(report, {kind_of(model): errors}, "Tip errors of all rows.")
     figure, ax = plots.new_figure(6.4, 5.2, subplot_kw={"projection": "3d"})
     row = int(np.argsort(errors)[int(0.95 * len(errors))])
     body = None
-    if loaded.chain is not None:
-        q = loaded.effective(log.commands)[row]
-        body = plots.BackboneDisplay.from_estimator(loaded.chain, q).points[0]
+    if has_body(model):
+        q = model.effective(log.commands)[row]
+        body = plots.BackboneDisplay.from_estimator(model.module_.robot, q).points[0]
     tips = plots.WorkspaceDisplay(log.x[:, -3:], predicted[:, -3:], body, row)
     tips.plot(ax, unit="mm")
     report.figure(

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from hybridkin import HybridForwardModel
 from hybridkin.app.workflow.domain import Domain, PathLimits, path_limits
-from hybridkin.app.workflow.model import LoadedModel
+from hybridkin.app.workflow.model import hysteresis_in_words
 from hybridkin.app.workflow.report import Report
 from hybridkin.arguments import one_of
 from hybridkin.native import export_c, export_fmu, export_mex
@@ -20,7 +21,7 @@ _TITLES = {
 
 
 def export_model(
-    loaded: LoadedModel,
+    model: HybridForwardModel,
     out: str | Path,
     *,
     kind: str = "c",
@@ -34,7 +35,7 @@ def export_model(
 
     Parameters
     ----------
-    loaded : LoadedModel
+    model : HybridForwardModel
         The model, as from `open_model`.
     out : str or Path
         Folder to write into; of a functional mock-up unit the file.
@@ -62,37 +63,37 @@ def export_model(
         raise ValueError('`dtype` must be "float64" here; "float32" is for C code.')
     record: dict[str, object] = {"dtype": dtype, "dt": dt}
     report = Report(_TITLES[kind], record)
-    report.text(f"{name}: {loaded.n_actuators} actuators, {dtype}.")
-    model = loaded.module
+    report.text(f"{name}: {model.n_features_in_} actuators, {dtype}.")
+    exported = model.module_.tip_model
     if dt is not None:
-        limits = limits or path_limits(loaded)
-        model = Domain(loaded, limits).solver(dt=dt)
+        limits = limits or path_limits(model)
+        exported = Domain(model, limits).solver(dt=dt)
         record["limits"] = limits
         report.text(f"Steps of {dt:g} s within limits: {limits.source}.")
-    about_q = _about_q(loaded)
+    about_q = _about_q(model)
     report.text("{about_q}", about_q=about_q)
     words = {"name": name, "about_q": about_q}
     if kind == "fmu":
-        report.paths = [export_fmu(model, out, **words, force=force)]
+        report.paths = [export_fmu(exported, out, **words, force=force)]
     elif kind == "mex":
-        report.paths = export_mex(model, out, **words, force=force)
+        report.paths = export_mex(exported, out, **words, force=force)
     else:
-        report.paths = export_c(model, out, dtype=dtype, **words, force=force)
+        report.paths = export_c(exported, out, dtype=dtype, **words, force=force)
     return report
 
 
-def _about_q(loaded: LoadedModel) -> str:
+def _about_q(model: HybridForwardModel) -> str:
     """Return unit, sign and hysteresis of q in sentences, as a controller must know them."""
-    log = loaded.log_format()
+    log = model.description_.log
     factors = np.broadcast_to(log.q_factor, len(log.q))
     terms = []
     for i, name in enumerate(log.q):
         terms.append(f"q[{i}] = {factors[i]:g} * {name}")
     unit = "" if log.q_unit == "1" else f" in {log.q_unit}"
     about_q = f"q from the columns of the log{unit}: {', '.join(terms)}."
-    if not loaded.hysteresis:
+    if not model.hysteresis_:
         return about_q
     return (
-        f"{about_q} The actuators have {loaded.hysteresis.in_words(loaded.log_unit)}: x(q) is "
-        "that of what the actuators do; steps return commands for it."
+        f"{about_q} The actuators have {hysteresis_in_words(model)}: x(q) is that of "
+        "what the actuators do; steps return commands for it."
     )

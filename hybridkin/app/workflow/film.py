@@ -6,15 +6,15 @@ from functools import partial
 from pathlib import Path
 
 import hybridkin
-from hybridkin import Commands
-from hybridkin.app.workflow.model import LoadedModel
+from hybridkin import Commands, HybridForwardModel
+from hybridkin.app.workflow.model import has_body, promised_errors, tips_at
 from hybridkin.app.workflow.report import Progress, Report, quiet
 from hybridkin.app.workflow.track import LEAD_IN, TARGET, read_track
 from hybridkin.formats import check_outputs
 
 
 def animate_track(
-    loaded: LoadedModel,
+    model: HybridForwardModel,
     path: str | Path,
     out: str | Path,
     *,
@@ -28,7 +28,7 @@ def animate_track(
 
     Parameters
     ----------
-    loaded : LoadedModel
+    model : HybridForwardModel
         A model with a chain as its mechanical model.
     path : str or Path
         ``track.csv`` of `track_path`, its folder, or any log of commands in the robot's format. The
@@ -51,28 +51,28 @@ def animate_track(
     Report of dict
         Number of "frames" and "bytes", frames per second "fps".
     """
-    if loaded.chain is None:
+    if not has_body(model):
         raise ValueError(
-            f"`model` {loaded.path} has no body to draw; give a model with a chain as its "
-            "mechanical model."
+            f"`model` {model.description_.path} has no body to draw; give a model with a chain as "
+            "its mechanical model."
         )
     out = Path(out)
     check_outputs([out], "animate", force=force)
-    log = read_track(path, loaded.log_format())
-    q = loaded.effective(Commands(log.q, time=log.time))
+    log = read_track(path, model.description_.log)
+    q = model.effective(Commands(log.q, time=log.time))
     if log.groups is not None:  # the way to the path is no part of it
         on_path = log.groups != LEAD_IN
         log = log.rows(on_path)
         q = q[on_path]
-    promised = loaded.promised_errors(q)
+    promised = promised_errors(model, q)
     film = hybridkin.plots.TrackAnimation.from_estimator(
-        loaded.chain,
+        model.module_.robot,
         q,
         target=log.x if tuple(log.x_names) == TARGET else None,
         t=log.time,
-        tips=loaded.tips(q),
+        tips=tips_at(model, q),
         expected=None if promised is None else promised.mean,
-        names=loaded.log_format().q if loaded.chain.rings else (),
+        names=model.description_.log.q if model.module_.robot.rings else (),
         n_frames=n_frames,
     )
     try:
@@ -84,7 +84,7 @@ def animate_track(
     fps = speed * film.fps
     size = out.stat().st_size
     record = {"frames": len(film.rows), "fps": fps, "bytes": size}
-    report = Report(f"{loaded.name}: film of {path}", record)
+    report = Report(f"{model.description_.name}: film of {path}", record)
     report.text(f"{len(film.rows)} frames, {fps:.3g} a second, {size / 1e6:.2f} MB")
     report.paths = [out]
     return report

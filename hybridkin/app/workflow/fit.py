@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -41,7 +42,7 @@ from hybridkin.app.workflow.fit_record import (
     write_model,
 )
 from hybridkin.app.workflow.log import MeasuredLog, checked
-from hybridkin.app.workflow.model import LoadedModel
+from hybridkin.app.workflow.model import log_unit, plane_in_words
 from hybridkin.app.workflow.report import Progress, Report, check_out, quiet
 from hybridkin.datasets import Log
 
@@ -115,6 +116,7 @@ def fit_log(
     if model.calibrate == mechanical.geometry:
         model.set_params(calibrate=robot.calibrate)
     model.count_as_fitted(complete.q, complete.x)
+    model.described(replace(model.description_, robot=robot))
     progress("writing the report", 0, 1)
     held_out = {}
     errors = errors_of_rows(compared)
@@ -148,7 +150,7 @@ def fit_log(
         auto=model.cv_results_,
         words=[
             explained_in_words(held_out, rows, model),
-            *_in_words(LoadedModel(robot.name, Path(out), model, robot), model),
+            *_in_words(model),
         ],
         tried=mechanical.tried,
         calibrated=mechanical.parameters,
@@ -211,16 +213,16 @@ def _calibration(
     )
 
 
-def _in_words(loaded: LoadedModel, model: HybridForwardModel) -> list[str]:
+def _in_words(model: HybridForwardModel) -> list[str]:
     """Return what a model chose and expects, its error radius, and motions that its log lacks."""
     words = [
-        *auto_in_words(model, loaded.log_unit),
+        *auto_in_words(model, log_unit(model)),
         *model.structure_in_words(),
     ]
     if model.radius_ is not None:
         words.append(f"Estimated error radius: {model.radius_}.")
-    if loaded.plane_in_words():
-        words.append(loaded.plane_in_words())
+    if plane_in_words(model):
+        words.append(plane_in_words(model))
     return words
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Self
 
-from hybridkin import Chain, Commands, robots
+from hybridkin import Chain, Commands, ForwardModel, robots
 from hybridkin.app import LogReport, check_log
 from hybridkin.app.workflow.report import Report
 from hybridkin.datasets import Log, load_log
@@ -170,7 +170,7 @@ def read_log(
     path: str | Path,
     log_format: robots.LogFormat,
     *,
-    chain: Chain | None = None,
+    chain: ForwardModel | None = None,
     base_is_free: bool = True,
     exclude: Sequence[str] = (),
     drop_invalid: bool = False,
@@ -250,7 +250,7 @@ def write_check(report: Report, check: LogReport) -> None:
         )
 
 
-def checked(log: Log, chain: Chain | None, base_is_free: bool) -> MeasuredLog:
+def checked(log: Log, chain: ForwardModel | None, base_is_free: bool) -> MeasuredLog:
     """Return a log with its check and its motions; a `MeasuredLog` is returned unchanged."""
     if isinstance(log, MeasuredLog):
         return log
@@ -258,7 +258,10 @@ def checked(log: Log, chain: Chain | None, base_is_free: bool) -> MeasuredLog:
 
 
 def _check(
-    log: Log, chain: Chain | None, base_is_free: bool = True, drop_invalid: bool = True
+    log: Log,
+    chain: ForwardModel | None,
+    base_is_free: bool = True,
+    drop_invalid: bool = True,
 ) -> LogReport:
     return check_log(
         log, chain=chain, base_is_free=base_is_free, drop_invalid=drop_invalid

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hybridkin import trajectories
+from hybridkin import HybridForwardModel, trajectories
 from hybridkin.app.workflow.domain import Domain, PathLimits
-from hybridkin.app.workflow.model import LoadedModel
+from hybridkin.app.workflow.model import has_body
 from hybridkin.app.workflow.reach import center_of, placed
 from hybridkin.arguments import number, one_of, real_array
 
@@ -46,7 +46,7 @@ def scaled_path(path: trajectories.Trajectory, scale: float) -> trajectories.Tra
 
 
 def shape_path(
-    loaded: LoadedModel,
+    model: HybridForwardModel,
     limits: PathLimits,
     shape: str,
     size: Sequence[float],
@@ -62,7 +62,7 @@ def shape_path(
 
     Parameters
     ----------
-    loaded : LoadedModel
+    model : HybridForwardModel
         The model, as from `open_model`.
     limits : PathLimits
         As from `path_limits`.
@@ -101,10 +101,10 @@ def shape_path(
             f"`size` does not fit: --size must be {len(sizes)} numbers for a {shape} "
             f"({', '.join(sizes)}), such as --size {example} --unit mm, got {size!r:.80}."
         )
-    domain = Domain(loaded, limits)
+    domain = Domain(model, limits)
     tips = domain.sample[1]
     middle = tips.mean(axis=0) if center is None else real_array(center, "center")
-    plane: ArrayLike = _normal_of(tips, loaded) if normal is None else normal
+    plane: ArrayLike = _normal_of(tips, model) if normal is None else normal
     if shape == "figure-eight":
         path = trajectories.figure_eight(
             middle, extent, normal=plane, duration=duration, dt=dt
@@ -125,10 +125,10 @@ def shape_path(
     return placed(domain, path, _TOL)[0] if center is None else path
 
 
-def _normal_of(tips: NDArray, loaded: LoadedModel) -> NDArray:
+def _normal_of(tips: NDArray, model: HybridForwardModel) -> NDArray:
     """Return the normal (3,) of the plane nearest to tips (N, 3), along the base's z-axis."""
     normal = np.linalg.svd(tips - tips.mean(axis=0), full_matrices=False)[2][2]
-    ahead = (
-        normal if loaded.chain is None else loaded.chain.base.numpy(force=True)[:3, 2]
-    )
+    ahead = normal
+    if has_body(model):
+        ahead = model.module_.robot.base[:3, 2].numpy(force=True)
     return normal if normal @ ahead > 0.0 else -normal

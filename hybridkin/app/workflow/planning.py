@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from hybridkin import choose_rows, trajectories
+from hybridkin import HybridForwardModel, choose_rows, trajectories
 from hybridkin.app.workflow.domain import Domain, PathLimits, path_limits
 from hybridkin.app.workflow.log import MeasuredLog
-from hybridkin.app.workflow.model import LoadedModel
+from hybridkin.app.workflow.model import commands_for, tips_at
 from hybridkin.app.workflow.report import (
     Progress,
     Report,
@@ -27,7 +27,7 @@ _TOL = 1e-3  # tolerance of the inverse kinematics along a path [m]
 
 
 def next_rows(
-    loaded: LoadedModel,
+    model: HybridForwardModel,
     out: str | Path,
     *,
     n: int = 50,
@@ -46,7 +46,7 @@ def next_rows(
 
     Parameters
     ----------
-    loaded : LoadedModel
+    model : HybridForwardModel
         The model, as from `open_model`.
     out : str or Path
         Folder to write into.
@@ -79,33 +79,33 @@ def next_rows(
     check_out(out, "next", ["next.csv"], force=force)
     n = whole(n, "n")
     if limits is None:
-        limits = path_limits(loaded, within_fit=False)
-    domain = Domain(loaded, limits)
+        limits = path_limits(model, within_fit=False)
+    domain = Domain(model, limits)
     candidates = domain.postures(_POOL)
     target = None
     where = "within the limits"
     if path is not None:
         target = best_track(domain, path, _TOL, Attempts(progress)).effective
         candidates = np.concatenate([target, candidates])
-        far = np.linalg.norm(loaded.tips(target) - path.x, axis=1).max()
+        far = np.linalg.norm(tips_at(model, target) - path.x, axis=1).max()
         where = f"along the path, which the model reaches to within {millimetres(far)}"
     measured_q = None
     if measured is not None:
-        measured_q = loaded.effective(measured.commands)
+        measured_q = model.effective(measured.commands)
     progress("choosing configurations", 0, 1)
-    rows, errors = choose_rows(
-        loaded.model, candidates, n, measured=measured_q, target=target
-    )
+    rows, errors = choose_rows(model, candidates, n, measured=measured_q, target=target)
     n_measured = 0 if measured is None else len(measured.q)
     record = {
         "command": "next",
-        "model": loaded.path,
+        "model": model.description_.path,
         "n_measured": n_measured,
         "where": where,
         "limits": limits,
         "expected_errors": errors,
     }
-    report = Report(f"{loaded.name}: {n} configurations to measure next", record)
+    report = Report(
+        f"{model.description_.name}: {n} configurations to measure next", record
+    )
     shown = sorted({k for k in _SHOWN if k < n} | {n})
     table = [[str(k), f"{1e3 * errors[k - 1]:.2f}"] for k in shown]
     report.table(["rows", "expected error [mm]"], table)
@@ -114,8 +114,8 @@ def next_rows(
         f"little, not how large the error will be. {n_measured} rows are already measured. "
         f"Limits: {limits.source}."
     )
-    log = loaded.log_format()
-    sent = log.to_log(loaded.commands(candidates[rows]))
+    log = model.description_.log
+    sent = log.to_log(commands_for(model, candidates[rows]))
     numbers = np.column_stack([sent, errors / METRES[log.x_unit]])
     report.table_file(
         "next.csv", [*log.q, "expected_error"], np.char.mod("%.9g", numbers)

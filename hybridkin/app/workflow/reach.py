@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from hybridkin import IKStatus, trajectories
 from hybridkin.app.workflow.domain import Domain
+from hybridkin.app.workflow.model import promised_errors
 from hybridkin.app.workflow.report import (
     Progress,
     millimetres,
@@ -51,7 +52,7 @@ def placed(
     good = np.flatnonzero(inside == inside.max())
     best = int(good[0])
     q = solution.q[good]
-    promised = domain.loaded.promised_errors(q.reshape(-1, q.shape[-1]))
+    promised = promised_errors(domain.model, q.reshape(-1, q.shape[-1]))
     if promised is not None:
         best = int(good[promised.mean.reshape(len(good), -1).mean(axis=1).argmin()])
     return trajectories.Trajectory(path.t, path.x + shifts[best]), float(inside[best])

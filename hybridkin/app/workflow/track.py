@@ -14,11 +14,21 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import hybridkin
-from hybridkin import IKStatus, Track, robots, trajectories
+from hybridkin import HybridForwardModel, IKStatus, Track, robots, trajectories
 from hybridkin.app.workflow.counts import Counts
 from hybridkin.app.workflow.domain import Domain, PathLimits, path_limits
 from hybridkin.app.workflow.errors import Errors
-from hybridkin.app.workflow.model import LoadedModel
+from hybridkin.app.workflow.model import (
+    domain_distance,
+    expected_errors,
+    hysteresis_in_words,
+    is_fitted,
+    kind_of,
+    plane_in_words,
+    promised_errors,
+    tips_at,
+    widths_in_log,
+)
 from hybridkin.app.workflow.reach import better_place, check_reach
 from hybridkin.app.workflow.report import (
     Progress,
@@ -106,7 +116,7 @@ class TrackRecord:
     period: float = _DT
 
 
-def _write(report: Report[TrackRecord], loaded: LoadedModel, better: str) -> None:
+def _write(report: Report[TrackRecord], model: HybridForwardModel, better: str) -> None:
     """Add the record to a report, in words; `better` says where the path would lie better."""
     record = report.record
     errors = record.errors
@@ -118,7 +128,7 @@ def _write(report: Report[TrackRecord], loaded: LoadedModel, better: str) -> Non
     )
     rows = [[status, str(count)] for status, count in record.statuses.items()]
     report.table(["status", "points"], rows)
-    log = loaded.log_format()
+    log = model.description_.log
     sign = ", shortening positive" if np.all(np.less(log.q_sign, 0)) else ""
     report.text(
         f"track.csv: q in {{unit}}{sign}; x, target and error in {log.x_unit}; t in s. Its first "
@@ -130,15 +140,15 @@ def _write(report: Report[TrackRecord], loaded: LoadedModel, better: str) -> Non
         f"Period: {duration_in_words(record.period)} from row to row. Send the commands at these "
         "times: lag and creep are those of this pace."
     )
-    if loaded.hysteresis:
+    if model.hysteresis_:
         report.text(
-            f"The actuators have {loaded.hysteresis.in_words(loaded.log_unit)}: a command crosses "
-            "the width when its actuator reverses, and leads where they creep. Send q; "
-            "effective_... is the motion of the actuators."
+            f"The actuators have {hysteresis_in_words(model)}: a command crosses the "
+            "width when its actuator reverses, and leads where they creep. Send q; effective_... "
+            "is the motion of the actuators."
         )
-    if loaded.plane_in_words():
-        report.text("{plane}", plane=loaded.plane_in_words())
-    report.text(*_about_counts(record, Counts.read(loaded.training)))
+    if plane_in_words(model):
+        report.text("{plane}", plane=plane_in_words(model))
+    report.text(*_about_counts(record, Counts.read(model.description_.training)))
     report.text(_outcome(record, better))
 
 
@@ -185,7 +195,7 @@ def _outcome(record: TrackRecord, better: str) -> str:
 
 
 def track_path(
-    loaded: LoadedModel,
+    model: HybridForwardModel,
     path: trajectories.Trajectory,
     out: str | Path,
     *,
@@ -211,7 +221,7 @@ def track_path(
 
     Parameters
     ----------
-    loaded : LoadedModel
+    model : HybridForwardModel
         The model, as from `open_model`.
     path : Trajectory
         Points [m] and times [s].
@@ -250,11 +260,11 @@ def track_path(
         the largest scale in reach.
     """
     check_out(out, "track", ["track.csv", "track.png", "commands.png"], force=force)
-    domain = Domain(loaded, limits or path_limits(loaded))
+    domain = Domain(model, limits or path_limits(model))
     stands = _start(domain, start)
     check_reach(domain, path, tol, out_of_reach, progress)
     attempts = Attempts(progress)
-    if not loaded.hysteresis or stands is None:
+    if not model.hysteresis_ or stands is None:
         track = best_track(domain, path, tol, attempts)
         lead_in = _lead_in(track, stands, domain)
     else:
@@ -278,55 +288,55 @@ def track_path(
             "before": float(exact.error.mean()),
             "after": float(track.error.mean()),
         }
-    whole = _with_lead_in(track, lead_in[:-1], loaded)
+    whole = _with_lead_in(track, lead_in[:-1], model)
     statuses = [IKStatus(int(code)).name for code in track.status]
-    inside = loaded.domain_distance(track.effective) <= 1.0
+    inside = domain_distance(model, track.effective) <= 1.0
     _, reached = track.score
     missed = np.isin(track.status, _REACHED, invert=True)
     better = ""
-    if loaded.hybrid is not None and inside.mean() < 1.0 - _MOST_OUTSIDE:
+    if is_fitted(model) and inside.mean() < 1.0 - _MOST_OUTSIDE:
         better = f": {better_place(domain, path, tol)}"
     record = TrackRecord(
-        model=str(loaded.path),
+        model=str(model.description_.path),
         n=len(path),
         reached=reached,
         missed=len(path) - reached,
         missed_by=float(track.error[missed].max(initial=0.0)),
         errors=Errors.of(track.error),
         statuses=dict(Counter(statuses)),
-        in_domain=None if loaded.hybrid is None else float(inside.mean()),
-        expected=_expected(loaded, track),
-        expected_inside=_expected(loaded, track, track.status == IKStatus.CONVERGED),
+        in_domain=None if not is_fitted(model) else float(inside.mean()),
+        expected=_expected(model, track),
+        expected_inside=_expected(model, track, track.status == IKStatus.CONVERGED),
         rounded=rounded,
         backend=domain.solver().tracker(track.q[0]).backend,
-        hysteresis=loaded.hysteresis_widths,
+        hysteresis=widths_in_log(model),
         lead_in=n_lead,
         limits=domain.limits,
         delay=delay,
         period=_period(whole),
     )
-    report = Report(f"{loaded.name}: a path of {len(path)} points", record)
-    _write(report, loaded, better)
+    report = Report(f"{model.description_.name}: a path of {len(path)} points", record)
+    _write(report, model, better)
     commands = {"command": whole.q}
-    if loaded.hysteresis:
+    if model.hysteresis_:
         commands["actuator"] = whole.effective
-    _add_path(report, loaded, track)
+    _add_path(report, model, track)
     _add_commands(report, domain, whole.t, commands, n_lead)
     statuses = [LEAD_IN] * n_lead + statuses
     digits = 9 if counts is None else 15
-    _add_track(report, whole, commands, statuses, loaded.log_format(), digits)
+    _add_track(report, whole, commands, statuses, model.description_.log, digits)
     report.write(out)
     return report
 
 
 def _expected(
-    loaded: LoadedModel, track: Track, rows: NDArray | slice = slice(None)
+    model: HybridForwardModel, track: Track, rows: NDArray | slice = slice(None)
 ) -> dict[str, float]:
     """Return the mean errors to expect at rows of a track; empty if not known.
 
     The directions in which the solver and the model miss a point do not depend on each other.
     """
-    promised = loaded.promised_errors(track.effective[rows])
+    promised = promised_errors(model, track.effective[rows])
     if promised is None or len(promised.mean) == 0:
         return {}
     missed = track.error[rows]
@@ -367,11 +377,11 @@ def _lead_in(track: Track, start: NDArray | None, domain: Domain) -> NDArray:
         return track.q[:1]
     limits = domain.limits
     end = track.effective[0]
-    hysteresis = domain.loaded.hysteresis
+    hysteresis = domain.model.hysteresis_
     if hysteresis:
         # With creep only a start: the track then begins with the state after these commands.
         led, _ = hysteresis.command(np.stack([start, end]), dt=1.0)
-        end = led[1].clip(*domain.of_commands)
+        end = led[1].clip(*domain.limits.commands)
     way = end - start
     dt = _period(track)
     speed = limits.dq_max
@@ -393,14 +403,14 @@ def _period(points: Track | trajectories.Trajectory) -> float:
     return float(points.t[1] - points.t[0]) if len(points.t) > 1 else _DT
 
 
-def _with_lead_in(track: Track, lead_in: NDArray, loaded: LoadedModel) -> Track:
+def _with_lead_in(track: Track, lead_in: NDArray, model: HybridForwardModel) -> Track:
     """Return a track after other commands (N, n); the targets of these are the model's tips."""
     n = len(lead_in)
     dt = _period(track)
     effective = lead_in
-    if loaded.hysteresis and n > 0:
-        effective, _ = loaded.hysteresis.apply(lead_in, None, dt)
-    x = loaded.tips(effective)
+    if model.hysteresis_ and n > 0:
+        effective, _ = model.hysteresis_.apply(lead_in, None, dt)
+    x = tips_at(model, effective)
     return replace(
         track,
         t=np.concatenate([track.t[0] + dt * np.arange(n), track.t + n * dt]),
@@ -446,9 +456,9 @@ def best_track(
     """
     commands, tips = domain.sample
     state = None
-    if lead_in is not None and domain.loaded.hysteresis:
+    if lead_in is not None and domain.model.hysteresis_:
         commands = lead_in[-1]
-        _, state = domain.loaded.hysteresis.apply(lead_in, None, _period(path))
+        _, state = domain.model.hysteresis_.apply(lead_in, None, _period(path))
     way = np.linalg.norm(np.diff(path.x, axis=0), axis=1).max(initial=0.0)
     extent = np.linalg.norm(np.ptp(tips, axis=0))
     least = max(1, math.ceil(way / (_STEP * extent)))
@@ -489,12 +499,12 @@ def _alone(track: Track, domain: Domain, tol: float, state: Any) -> Track:
     With hysteresis other commands can do the same at the points: what an actuator does between
     them, such as a reversal, depends on all commands. The better ones of both are kept.
     """
-    hysteresis = domain.loaded.hysteresis
+    hysteresis = domain.model.hysteresis_
     if not hysteresis:
         return track
     commands = [track.q]
     exact, _ = hysteresis.command(track.effective, state, _steps(track))
-    exact = _within_speeds(exact.clip(*domain.of_commands), track, domain)
+    exact = _within_speeds(exact.clip(*domain.limits.commands), track, domain)
     if exact is not None:
         commands.append(exact)
     tracks = [_with_commands(track, q, domain, tol, state) for q in commands]
@@ -529,25 +539,25 @@ def _with_commands(
     track: Track, q: NDArray, domain: Domain, tol: float, state: Any
 ) -> Track:
     """Return a track with commands q (N, n) that are sent alone, and what they do."""
-    loaded = domain.loaded
+    model = domain.model
     effective = q
-    if loaded.hysteresis:
-        effective, _ = loaded.hysteresis.apply(q, state, _steps(track))
-    x = loaded.tips(effective)
+    if model.hysteresis_:
+        effective, _ = model.hysteresis_.apply(q, state, _steps(track))
+    x = tips_at(model, effective)
     sent = replace(track, q=q, effective=effective, x=x)
     return domain.solver().judged(sent, tol=tol)
 
 
 def _rounded(q: NDArray, counts: Counts, domain: Domain) -> NDArray:
     """Return commands (N, n) rounded to the numbers of the log, within the limits."""
-    log = domain.loaded.log_format()
-    low, high = np.sort(log.to_log(np.stack(domain.of_commands)), axis=0)
+    log = domain.model.description_.log
+    low, high = np.sort(log.to_log(np.stack(domain.limits.commands)), axis=0)
     return log.from_log(counts.rounded(log.to_log(q), low, high))
 
 
 def _state_after(lead_in: NDArray, track: Track, domain: Domain) -> Any:
     """Return the state of the hysteresis after the commands of a lead-in, None without."""
-    hysteresis = domain.loaded.hysteresis
+    hysteresis = domain.model.hysteresis_
     if not hysteresis or len(lead_in) < 2:
         return None
     return hysteresis.apply(lead_in, None, _period(track))[1]
@@ -606,15 +616,17 @@ def _text(values: NDArray, digits: int = 9) -> NDArray:
     return np.char.mod(f"%.{digits}g", values + 0.0).T  # no -0
 
 
-def _add_path(report: Report[TrackRecord], loaded: LoadedModel, track: Track) -> None:
+def _add_path(
+    report: Report[TrackRecord], model: HybridForwardModel, track: Track
+) -> None:
     plots = hybridkin.plots
     figure, axes = plots.new_figure(11.0, 4.6, 1, 3)
-    display = plots.TrackingDisplay.from_tracks({f"solver on {loaded.kind}": track})
+    display = plots.TrackingDisplay.from_tracks({f"solver on {kind_of(model)}": track})
     # The plane of the largest moves.
     i, j = sorted(np.argsort(np.ptp(track.target, axis=0))[1:])
     display.plot(axes[0], unit="mm", plane="xyz"[i] + "xyz"[j])
     display.plot_time(axes[1], unit="mm")
-    errors = loaded.expected_errors(track.effective)
+    errors = expected_errors(model, track.effective)
     expected = {f"robot, {name}": values for name, values in errors.items()}
     display.plot_error(axes[2], unit="mm", expected=expected)
     caption = "Path and tip by the model; error of the solver"
@@ -631,15 +643,15 @@ def _add_commands(
     n_lead: int,
 ) -> None:
     """Add the commands and their limits, in names, unit and sign of the robot's logs."""
-    loaded = domain.loaded
-    log_format = loaded.log_format()
-    rings = loaded.module.robot.rings or (slice(0, loaded.n_actuators),)
+    model = domain.model
+    log_format = model.description_.log
+    rings = model.module_.tip_model.robot.rings or (slice(0, model.n_features_in_),)
     counts = [ring.stop - ring.start for ring in rings]
     n = len(counts)
     figure, axes = hybridkin.plots.new_figure(
         7.0, 1.0 + 1.8 * n, n, 1, sharex=True, squeeze=False
     )
-    low, high = domain.of_commands
+    low, high = domain.limits.commands
     display = hybridkin.plots.ActuatorDisplay(
         commands, counts, t, names=log_format.q, limits=np.stack([low, high])
     )

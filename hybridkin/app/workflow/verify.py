@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridkin import Commands, robots
+from hybridkin import Commands, HybridForwardModel, robots
 from hybridkin.app.checks.causes.alignment import Alignment
 from hybridkin.app.checks.causes.comparison import CauseComparison, compare_causes
 from hybridkin.app.checks.causes.evidence import Actuators, Evidence
@@ -18,7 +18,13 @@ from hybridkin.app.checks.causes.motion import Motion
 from hybridkin.app.checks.causes.separation import separating_motion
 from hybridkin.app.workflow.delay import Delay, at_times, estimated_delay
 from hybridkin.app.workflow.errors import Errors, ExpectedErrors
-from hybridkin.app.workflow.model import LoadedModel
+from hybridkin.app.workflow.model import (
+    check_columns,
+    domain_distance,
+    is_fitted,
+    promised_errors,
+    tips_at,
+)
 from hybridkin.app.workflow.report import Report, check_out, millimetres, percent
 from hybridkin.app.workflow.track import LEAD_IN, read_track
 from hybridkin.arguments import check_tips, number
@@ -155,7 +161,7 @@ class Verification:
 
 
 def verify_track(
-    loaded: LoadedModel,
+    model: HybridForwardModel,
     track: str | Path,
     log: Log,
     out: str | Path | None = None,
@@ -173,7 +179,7 @@ def verify_track(
 
     Parameters
     ----------
-    loaded : LoadedModel
+    model : HybridForwardModel
         The model that computed the track, as from `open_model`.
     track : str or Path
         ``track.csv`` of `track_path`, or its folder.
@@ -202,9 +208,9 @@ def verify_track(
     if out is not None:
         check_out(out, "verify", force=force)
     if log.q.shape[1]:
-        loaded.check_columns(log.q)
-    sent = read_track(track, loaded.log_format())
-    motion = loaded.effective(Commands(sent.q, time=sent.time))
+        check_columns(model, log.q)
+    sent = read_track(track, model.description_.log)
+    motion = model.effective(Commands(sent.q, time=sent.time))
     rows = _rows_of(log, sent)
     if delay is None:
         delay = _delay_of(track)
@@ -221,21 +227,21 @@ def verify_track(
             f"`log` must have at least 3 measured tips of the path, got {len(rows)}."
         )
     q = motion[rows]
-    predicted = loaded.tips(q)
+    predicted = tips_at(model, q)
     later = None
     if sent.time is not None and (np.diff(rows) > 0).all() and len(rows) > 3:
         later = estimated_delay(sent.time[rows], predicted, x)
     check_tips(x, predicted, "x")
     errors = np.linalg.norm(x - predicted, axis=1)
-    promised = loaded.promised_errors(q)
+    promised = promised_errors(model, q)
     parts = {}
-    for name, part in _parts(loaded, q).items():
+    for name, part in _parts(model, q).items():
         if part.any():
             parts[name] = _errors_of(part, errors, promised)
     kept = None
     if promised is not None:
         kept = bool(parts["path"].mean <= _KEPT * parts["path"].promised)
-    compared = compare_causes(_evidence(loaded, sent, motion, rows, x, promised))
+    compared = compare_causes(_evidence(model, sent, motion, rows, x, promised))
     cause = None
     also = []
     amount = ""
@@ -249,7 +255,7 @@ def verify_track(
         remedy = likely.cause.remedy
         separate = _separation(compared)
     record = Verification(
-        model=str(loaded.path),
+        model=str(model.description_.path),
         track=str(track),
         log=log.source,
         parts=parts,
@@ -260,11 +266,13 @@ def verify_track(
         amount=amount,
         remedy=remedy,
         separate=separate,
-        range=_share_of_range(loaded, q),
+        range=_share_of_range(model, q),
         delay=delay,
         later=later,
     )
-    title = f"{loaded.name}: {Path(track).name} against {Path(log.source).name}"
+    title = (
+        f"{model.description_.name}: {Path(track).name} against {Path(log.source).name}"
+    )
     report = Report(title, record)
     record._write(report)
     if out is not None:
@@ -319,9 +327,9 @@ def _rows_of(log: Log, sent: Log) -> NDArray:
     return rows
 
 
-def _parts(loaded: LoadedModel, q: NDArray) -> dict[str, NDArray]:
+def _parts(model: HybridForwardModel, q: NDArray) -> dict[str, NDArray]:
     """Return the rows of the parts of the path: the whole, in and out of the log, quarters."""
-    inside = loaded.domain_distance(q) <= 1.0
+    inside = domain_distance(model, q) <= 1.0
     parts = {
         "path": np.ones(len(q), dtype=bool),
         "inside the log": inside,
@@ -345,18 +353,18 @@ def _errors_of(
     )
 
 
-def _share_of_range(loaded: LoadedModel, q: NDArray) -> float | None:
+def _share_of_range(model: HybridForwardModel, q: NDArray) -> float | None:
     """Return the largest range of an actuator, as a share of its range in the log."""
-    if loaded.hybrid is None:
+    if not is_fitted(model):
         return None
-    low, high = loaded.hybrid.training_range_
+    low, high = model.training_range_
     widths = high - low
     moved = widths > 0.0
     return float((np.ptp(q, axis=0)[moved] / widths[moved]).max(initial=0.0))
 
 
 def _evidence(
-    loaded: LoadedModel,
+    model: HybridForwardModel,
     sent: Log,
     motion: NDArray,
     rows: NDArray,
@@ -367,13 +375,13 @@ def _evidence(
     order = np.argsort(rows, kind="stable")
     rows = rows[order]
     q = motion[rows]
-    robot = loaded.module.robot
+    robot = model.module_.tip_model.robot
     bodies = [body.tip_model for body in (robot, *robot.softer())]
-    off_plane = _off_plane(loaded, q)
+    off_plane = _off_plane(model, q)
     low = motion.min(axis=0)
     high = motion.max(axis=0)
-    if loaded.hybrid is not None:
-        low, high = loaded.hybrid.training_range_
+    if is_fitted(model):
+        low, high = model.training_range_
     expected = 0.0
     if promised is not None:
         expected = float(promised.mean.mean())
@@ -381,10 +389,10 @@ def _evidence(
         motion=Motion.of(motion, sent.time, None),
         rows=rows,
         x=x[order],
-        model=loaded.module,
+        model=model.module_.tip_model,
         bodies=bodies,
-        actuators=_actuators(loaded.log_format(), robot.actuator_layout),
-        inside=loaded.domain_distance(q - off_plane) <= 1.0,
+        actuators=_actuators(model.description_.log, robot.actuator_layout),
+        inside=domain_distance(model, q - off_plane) <= 1.0,
         off_plane=off_plane,
         promised=expected,
         low=low,
@@ -412,11 +420,11 @@ def _separation(compared: CauseComparison) -> str:
     return f"{separation.words} (the tips then differ by up to {far})"
 
 
-def _off_plane(loaded: LoadedModel, q: NDArray) -> NDArray:
+def _off_plane(model: HybridForwardModel, q: NDArray) -> NDArray:
     """Return the part (N, n) of commands off the plane of the log, 0 if they keep to it."""
-    if loaded.module.plane is None:
+    if model.module_.tip_model.plane is None:
         return np.zeros_like(q)
-    point, normals = (part.numpy(force=True) for part in loaded.module.plane)
+    point, normals = (part.numpy(force=True) for part in model.module_.tip_model.plane)
     off = (q - point) @ normals @ normals.T
     return np.where(np.abs(off).max() > _OFF * np.ptp(q, axis=0).max(), off, 0.0)
 

@@ -8,10 +8,11 @@ import torch
 from simulated_log import COLUMNS, ROBOT, document, rows, run
 
 import hybridkin
-from hybridkin import Hysteresis, IKStatus, save_model
+from hybridkin import Hysteresis, IKStatus, open_model, save_model
 from hybridkin.app import workflow
 from hybridkin.app.workflow import Counts
 from hybridkin.app.workflow.domain import Domain
+from hybridkin.app.workflow.model import domain_distance, tips_at
 from hybridkin.app.workflow.track import LEAD_IN, Attempts, best_track
 
 CHAIN = hybridkin.ConstantCurvatureChain([0.005, 0.005], lengths=[0.1, 0.1])
@@ -53,8 +54,8 @@ def playful(tmp_path_factory):
 
 def line_to(home, end, n=21):
     """Write a path of n points from the middle of the tips along z, a share of them beyond."""
-    loaded = workflow.open_model(home)
-    tip = loaded.tips(Domain(loaded, workflow.path_limits(loaded)).preferred[None])[0]
+    loaded = open_model(home)
+    tip = tips_at(loaded, Domain(loaded, workflow.path_limits(loaded)).preferred[None])[0]
     z = np.linspace(tip[2], tip[2] + end, n)
     points = [f"{0.1 * k},{1e3 * tip[0]},{1e3 * tip[1]},{1e3 * z[k]}" for k in range(n)]
     path = home / f"line_{end}.csv"
@@ -73,16 +74,18 @@ def numbers(table, names):
 
 
 def test_a_model_with_a_guard_prefers_the_median_of_its_log_in_the_compiled_core(home):
-    loaded = workflow.open_model(home)
+    loaded = open_model(home)
     domain = Domain(loaded, workflow.path_limits(loaded))
-    q = loaded.hybrid.fitted_module_.tested.rows.numpy()
+    q = loaded.fitted_module_.tested.rows.numpy()
     assert len(q) > 50
     median = np.median(q, axis=0) @ domain.bending
     np.testing.assert_allclose(domain.preferred, median, rtol=0, atol=1e-9)
-    assert loaded.domain_distance(median[None])[0] <= 1.0
+    assert domain_distance(loaded, median[None])[0] <= 1.0
     ik = domain.solver()
     np.testing.assert_allclose(ik.settings.posture.numbers, domain.preferred, rtol=0, atol=1e-8)
-    assert ik.tracker(domain.preferred).backend == hybridkin.native.backend(loaded.module)
+    assert ik.tracker(domain.preferred).backend == hybridkin.native.backend(
+        loaded.module_.tip_model
+    )
 
 
 @pytest.mark.slow
@@ -120,9 +123,9 @@ def test_a_promise_counts_the_points_that_are_missed(home, tmp_path, capsys):
 @pytest.mark.slow
 def test_one_point_beyond_is_a_failure_only_if_asked(home, tmp_path, capsys):
     """The end of a path that is longer than the robot by a millimetre."""
-    loaded = workflow.open_model(home)
+    loaded = open_model(home)
     limits = workflow.path_limits(loaded)
-    tip = loaded.tips(Domain(loaded, limits).preferred[None])[0]
+    tip = tips_at(loaded, Domain(loaded, limits).preferred[None])[0]
     path = line_to(home, 0.0)
     lines = path.read_text().split()
     lines[-1] = f"2.0,{1e3 * tip[0]},{1e3 * tip[1]},{1e3 * (tip[2] + 0.002)}"
@@ -153,7 +156,7 @@ def test_progress_numbers_every_attempt_once():
 @pytest.mark.parametrize("dq_max", [None, 4e-3])
 def test_errors_and_statuses_are_those_of_the_commands_alone(playful, dq_max):
     """Reversals between two points of a path are not in the file, so nothing may need them."""
-    loaded = workflow.open_model(playful)
+    loaded = open_model(playful)
     limits = workflow.path_limits(loaded, dq_max=dq_max)
     domain = Domain(loaded, limits)
     size = (0.03, 0.015)
@@ -161,7 +164,7 @@ def test_errors_and_statuses_are_those_of_the_commands_alone(playful, dq_max):
     track = best_track(domain, path, 1e-4, Attempts(lambda *_: None))
     effective, _ = Hysteresis.backlash(4e-4).apply(track.q)
     np.testing.assert_allclose(track.effective, effective, rtol=0, atol=1e-15)
-    error = np.linalg.norm(loaded.tips(effective) - path.x, axis=1)
+    error = np.linalg.norm(tips_at(loaded, effective) - path.x, axis=1)
     np.testing.assert_allclose(track.error, error, rtol=0, atol=1e-12)
     reached = np.isin(track.status, (IKStatus.CONVERGED, IKStatus.OUT_OF_DOMAIN))
     np.testing.assert_array_equal(reached, error <= 1e-4)
@@ -214,7 +217,7 @@ def test_rounded_commands_are_whole_and_say_what_it_costs(model, request, tmp_pa
     table = table_of(tmp_path / "t")
     q = numbers(table, COLUMNS)
     np.testing.assert_allclose(q / step, np.rint(q / step), rtol=0, atol=1e-9)
-    loaded = workflow.open_model(folder)
+    loaded = open_model(folder)
     tips = 1e3 * loaded.predict(-1e-3 * q)
     np.testing.assert_allclose(tips, numbers(table, "xyz"), atol=1e-5)
     on_path = table["status"] != LEAD_IN

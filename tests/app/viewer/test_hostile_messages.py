@@ -10,6 +10,7 @@ import pytest
 
 import hybridkin
 from hybridkin import robots
+from hybridkin.app.workflow.model import tips_at
 
 viser = pytest.importorskip("viser", reason='needs viser: pip install "hybridkin[view]"')
 import msgspec  # noqa: E402 (viser brings them)
@@ -92,7 +93,7 @@ def sending(*messages):
 
 def is_alive(view):
     """Steer the view from its page, and return whether the robot follows."""
-    home = view.robot.loaded.tips(view.robot.domain.preferred[None])[0]
+    home = tips_at(view.robot.model, view.robot.domain.preferred[None])[0]
     goal = home + np.array([0.02, 0.0, 0.0])
     until(lambda: view.robot._resting)
     connected(view, sending({**POSE, "position": goal.tolist()}))
@@ -259,7 +260,7 @@ def test_names_of_actuators_are_text_on_the_page(tmp_path):
         f'q = [{quoted}, "b", "c"]\nx = ["x", "y", "z"]\nq_unit = "counts"\n'
         '[limits]\nq_min = 0.0\nq_max = 1.0\nunit = "log"\n'
     )
-    model = hybridkin.app.workflow.open_model(path)
+    model = hybridkin.open_model(path)
     with hybridkin.app.view(model, port=9700) as shown:
         shown.go_to(np.zeros(3))
         until(lambda: "at limits: `<img`" in shown._words.content)

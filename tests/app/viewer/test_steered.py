@@ -1,19 +1,26 @@
 """The robot behind a live view: targets, commands, rest and what is said of them."""
 
 import threading
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from hybridkin import ConstantCurvatureChain, HybridForwardModel, Hysteresis, robots
+from hybridkin import (
+    ConstantCurvatureChain,
+    ForwardModel,
+    HybridForwardModel,
+    Hysteresis,
+    open_model,
+    robots,
+)
 from hybridkin.app.viewer.steered import RATE, SteeredRobot
-from hybridkin.app.workflow import LoadedModel, path_limits
+from hybridkin.app.workflow import path_limits
 
 
 def steered(model, **limits):
-    loaded = LoadedModel("robot", Path(), model)
-    return SteeredRobot(loaded, path_limits(loaded, **limits))
+    if isinstance(model, ForwardModel):
+        model = open_model(model)
+    return SteeredRobot(model, path_limits(model, **limits))
 
 
 @pytest.fixture

@@ -5,8 +5,8 @@ import warnings
 import numpy as np
 import torch
 
-from hybridkin import HybridForwardModel, robots, save_model
-from hybridkin.app.workflow import open_model
+from hybridkin import HybridForwardModel, open_model, robots, save_model
+from hybridkin.app.workflow.model import expected_errors, kind_of
 
 ROBOT = """name = "arm"
 routing = "base"
@@ -44,10 +44,10 @@ def folder(tmp_path, held_out):
 
 def test_a_model_says_what_it_is_and_what_error_to_expect(tmp_path):
     loaded = folder(tmp_path, {"mean": 0.004, "p95": 0.009})
-    assert loaded.kind == "hybrid, linear"
-    expected = loaded.expected_errors(np.zeros((3, 6)))
+    assert kind_of(loaded) == "hybrid, linear"
+    expected = expected_errors(loaded, np.zeros((3, 6)))
     assert [*expected] == ["held-out motions, mean", "held-out motions, 95 %"]
     np.testing.assert_allclose([*expected.values()], [[0.004] * 3, [0.009] * 3])
     nominal = open_model(tmp_path / "robot.toml")
-    assert nominal.kind == "mechanical, nominal"
-    assert nominal.expected_errors(np.zeros((3, 6))) == {}
+    assert kind_of(nominal) == "mechanical, nominal"
+    assert expected_errors(nominal, np.zeros((3, 6))) == {}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from hybridkin import ConstantCurvatureChain, HybridForwardModel, save_model
+from hybridkin import ConstantCurvatureChain, HybridForwardModel, open_model, save_model
 from hybridkin.app import workflow
 from hybridkin.app.workflow.track import TARGET
 from hybridkin.datasets import Log
@@ -42,7 +42,7 @@ def loaded(tmp_path_factory):
     model = HybridForwardModel(CHAIN, "quadratic").fit(q, x)
     path = tmp_path_factory.mktemp("model") / "model.safetensors"
     save_model(model, path, training=TRAINING)
-    return workflow.open_model(path)
+    return open_model(path)
 
 
 def written(path, q):

@@ -12,6 +12,7 @@ from hybridkin import (
     ConstantCurvatureChain,
     HybridForwardModel,
     Hysteresis,
+    open_model,
     robots,
     trajectories,
 )
@@ -22,6 +23,7 @@ from hybridkin.app.workflow.domain import Domain
 from hybridkin.app.workflow.errors import Errors, HeldOutErrors, Promise
 from hybridkin.app.workflow.fit_record import largest_errors
 from hybridkin.app.workflow.log import checked
+from hybridkin.app.workflow.model import domain_distance, fitted_rows, tips_at, widths_in_log
 from hybridkin.app.workflow.path import scaled_path
 from hybridkin.datasets import Log
 
@@ -135,7 +137,10 @@ def loaded(gains, tmp_path, *, learned=False, width=0.0):
             x = PLAIN(torch.from_numpy(q)).numpy() + 0.1 * q[:, :3]
         model = HybridForwardModel(chain, "linear", hysteresis=width / np.abs(gains))
         model.fit(q / gains, x, groups=np.arange(120) // 10)
-    return workflow.LoadedModel("r", tmp_path / "model", model, description)
+    if not learned:
+        model = open_model(chain)
+    known = replace(model.description_, robot=description, path=tmp_path / "model")
+    return model.described(known)
 
 
 @pytest.mark.parametrize("learned", [False, True])
@@ -163,20 +168,20 @@ def test_commands_exceed_the_limits_by_half_the_backlash_in_any_unit(tmp_path):
     motors = loaded(GAINS, tmp_path, learned=True, width=width)
     found = []
     for model, gains in ((metres, np.ones(6)), (motors, GAINS)):
-        low, high = Domain(model, workflow.path_limits(model)).of_commands
+        low, high = workflow.path_limits(model).commands
         found.append(np.sort([low * gains, high * gains], axis=0))
-        described = Domain(model, workflow.path_limits(model, within_fit=False)).of_commands
+        described = workflow.path_limits(model, within_fit=False).commands
         ends = np.sort([described[0] * gains, described[1] * gains], axis=0)
         assert_allclose(ends, [LIMITS.q_min, LIMITS.q_max], rtol=1e-9)
-        of_log = np.ravel(model.hysteresis.width)
+        of_log = np.ravel(model.hysteresis_.width)
         if gains is GAINS:
             of_log = np.degrees(of_log)
-        assert_allclose(model.hysteresis_widths, of_log, rtol=1e-12)
+        assert_allclose(widths_in_log(model), of_log, rtol=1e-12)
     assert_allclose(found[1], found[0], rtol=1e-9, atol=1e-12)
     inner = workflow.path_limits(metres)
     assert_allclose(found[0], [inner.q_min - 0.5 * width, inner.q_max + 0.5 * width])
     given = {"q_min": np.full(6, -0.003), "q_max": np.full(6, 0.002)}
-    asked = Domain(metres, workflow.path_limits(metres, **given)).of_commands
+    asked = workflow.path_limits(metres, **given).commands
     assert_allclose(asked, [*given.values()], rtol=1e-9)
 
 
@@ -216,12 +221,12 @@ def test_the_domain_is_that_of_metres(tmp_path, learned):
     assert_allclose(np.minimum(np.abs(pulled(metres)), slack), 0.0, atol=1e-12)
     q, tips = domain.sample
     assert ((q >= limits.q_min) & (q <= limits.q_max)).all()
-    assert_allclose(motors.tips(q), tips)
+    assert_allclose(tips_at(motors, q), tips)
     size = np.ptp(reference.sample[1], axis=0)
     assert_allclose(np.ptp(tips, axis=0), size, rtol=0.25)
     if learned:
         assert_allclose(pulled(q * GAINS - reference.preferred), 0.0, atol=1e-12)
-        assert (motors.domain_distance(q) <= 1.0).all()
+        assert (domain_distance(motors, q) <= 1.0).all()
 
 
 @pytest.mark.slow
@@ -254,7 +259,7 @@ def test_a_track_in_degrees_is_one_in_metres(tmp_path):
     phase = np.linspace(0.0, 0.5, 8)[:, None]
     ring = 2.0 * np.pi / 3.0 * np.arange(3)
     way = 0.002 * np.hstack([np.cos(ring + phase), np.cos(ring - phase)])
-    path = trajectories.Trajectory(0.05 * np.arange(8), loaded(np.ones(6), tmp_path).tips(way))
+    path = trajectories.Trajectory(0.05 * np.arange(8), tips_at(loaded(np.ones(6), tmp_path), way))
     lengths = []
     # The speed decides how long the way to the path takes, then the acceleration.
     for gains, most in ((np.full(6, -1e-3), 2.0), (GAINS, 0.1)):
@@ -267,7 +272,7 @@ def test_a_track_in_degrees_is_one_in_metres(tmp_path):
         n_lead = report.record.lead_in
         assert table["status"] == ["LEAD_IN"] * n_lead + ["CONVERGED"] * 8
         # The numbers of the file, in the unit of the log, whose sign is that of the gain.
-        unit = np.pi / 180.0 if model.log_format().q_unit == "deg" else 1.0
+        unit = np.pi / 180.0 if model.description_.log.q_unit == "deg" else 1.0
         q = numbers(table, COLUMNS) * unit * np.abs(gains)
         assert_allclose(q[0], start, rtol=0, atol=1e-9)
         lead = np.diff(q[: n_lead + 1], axis=0, prepend=q[:1]) / 0.05
@@ -275,7 +280,7 @@ def test_a_track_in_degrees_is_one_in_metres(tmp_path):
         assert 0.6 < max(speed / 0.02, change / most) <= 1.0 + 1e-6
         tips = 1e-2 * numbers(table, "xyz")
         assert_allclose(tips[n_lead:], path.x, rtol=0, atol=1e-4)
-        assert_allclose(tips, model.tips(q / gains), rtol=0, atol=1e-9)
+        assert_allclose(tips, tips_at(model, q / gains), rtol=0, atol=1e-9)
         errors = 1e-2 * numbers(table, ["error"])[n_lead:, 0]
         assert_allclose(errors, np.linalg.norm(tips[n_lead:] - path.x, axis=1), atol=1e-9)
         assert report.record.errors.mean == pytest.approx(errors.mean(), abs=1e-9)
@@ -302,7 +307,7 @@ def test_an_evaluation_counts_rows_whatever_the_names_and_order_of_motions(tmp_p
     model = loaded(GAINS, tmp_path, learned=True)
     q, x = measured(model, GAINS, MOTIONS, far=4)
     errors = np.linalg.norm(model.predict(q) - x, axis=1)
-    inside = model.hybrid.in_domain(q)
+    inside = model.in_domain(q)
     assert 0.5 < inside.mean() < 0.9
     names = np.array([*"zaqmk"])[MOTIONS]
     order = np.random.default_rng(1).permutation(len(q))
@@ -334,10 +339,10 @@ def test_a_motion_is_fitted_if_half_of_its_rows_are_whatever_its_name(tmp_path):
     motions = np.repeat(np.arange(5), 5 * LENGTHS)
     q, x = measured(model, GAINS, motions, far=len(motions))
     fitted = np.arange(150) % 5 < 1 + motions % 3  # 1 to 3 of 5 rows
-    model.model.fit(q[fitted], x[fitted])
+    model.fit(q[fitted], x[fitted])
     expected = fitted | (motions == 2)
     for names in (motions, np.array([*"zaqmk"])[motions], 10 - motions):
-        assert_array_equal(model.was_fitted(q, x, names), expected)
+        assert_array_equal(fitted_rows(model, q, x, names), expected)
 
 
 # ---------------------------------------------------------------- comparison, verification
@@ -404,11 +409,12 @@ def test_the_cause_of_an_error_does_not_depend_on_units(tmp_path, fault, cause):
     q, _ = swings(1, 60)
     t = np.cumsum(0.05 + 0.05 * (np.arange(60) % 3))
     promise = {"at_rows": 1e-4, "per_distance": 0.0, "p95": 2.0}
-    notes = {"training": {"saved": "h", "promise": promise}}
+    notes = {"saved": "h", "promise": promise}
     found = []
     for gains in (np.ones(6), np.full(6, -2e-3)):
-        model = replace(loaded(gains, tmp_path, learned=True), header=notes)
-        log = model.log_format()
+        model = loaded(gains, tmp_path, learned=True)
+        model.described(replace(model.description_, training=notes))
+        log = model.description_.log
         x = fault(q)
         table = np.column_stack([t, log.to_log(q / gains), 100.0 * x, 100.0 * x])
         head = ",".join(["t", *log.q, *"xyz", "target_x", "target_y", "target_z", "status"])

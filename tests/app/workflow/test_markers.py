@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from hybridkin import ConstantCurvatureChain, robots
-from hybridkin.app.workflow import FitSettings, evaluate_log, fit_log, open_model, read_log
+from hybridkin import ConstantCurvatureChain, open_model, robots
+from hybridkin.app.workflow import FitSettings, evaluate_log, fit_log, read_log
+from hybridkin.app.workflow.model import tips_at
 from hybridkin.datasets import load_log
 
 ROBOT = """
@@ -92,7 +93,7 @@ def test_a_fit_reports_every_marker_and_its_model_steers_the_tip(folder):
     assert "| marker 1 " in report.markdown()
     loaded = open_model(out)
     assert loaded.predict(log.q).shape == (64, 6)
-    np.testing.assert_allclose(loaded.tips(log.q), loaded.predict(log.q)[:, 3:], atol=1e-12)
+    np.testing.assert_allclose(tips_at(loaded, log.q), loaded.predict(log.q)[:, 3:], atol=1e-12)
     judged = evaluate_log(loaded, log, folder / "evaluation")
     assert len(judged.record.markers) == 2
     assert judged.record.all.share_in_radius > 0.7

@@ -10,6 +10,7 @@ from hybridkin import ConstantCurvatureChain, HybridForwardModel, IKStatus
 from hybridkin.app import workflow
 from hybridkin.app.workflow.domain import Domain
 from hybridkin.app.workflow.errors import Promise
+from hybridkin.app.workflow.model import promised_errors
 from hybridkin.app.workflow.reach import better_place, placed
 from hybridkin.ik import trajectories
 
@@ -36,13 +37,12 @@ def test_no_promise_is_nothing_at_the_rows_of_the_log():
 
 
 @pytest.fixture(scope="module")
-def domain(tmp_path_factory):
+def domain():
     chain = ConstantCurvatureChain([0.05, 0.05])
     q = 0.25 + 0.05 * rng.uniform(-1.0, 1.0, (300, 6))
     x = chain(torch.from_numpy(q)).numpy()
     model = HybridForwardModel(chain, "linear").fit(q, x + 1e-3 * q[:, :3])
-    loaded = workflow.LoadedModel("robot", tmp_path_factory.mktemp("m") / "m", model)
-    return Domain(loaded, workflow.path_limits(loaded))
+    return Domain(model, workflow.path_limits(model))
 
 
 def test_a_path_outside_is_moved_to_where_it_lies_inside(domain):
@@ -64,13 +64,13 @@ def test_a_path_is_placed_where_its_promise_is_least(domain):
         "held_out": {"h": {"mean": 2e-3, "p95": 5e-3}},
         "promise": {"at_rows": 1e-3, "per_distance": 5e-3, "p95": 2.0},
     }
-    loaded = replace(domain.loaded, header={"training": training})
-    model = HybridForwardModel(loaded.chain, "linear")
+    chain = domain.model.mechanical_model
+    model = HybridForwardModel(chain, "linear")
     q = domain.sample[0][:200]
-    x = loaded.chain(torch.from_numpy(q)).numpy() + 1e-3 * q[:, :3]
+    x = chain(torch.from_numpy(q)).numpy() + 1e-3 * q[:, :3]
     model.fit(q, x, groups=np.arange(200) // 10)
-    loaded = replace(loaded, model=model)
-    promising = Domain(loaded, workflow.path_limits(loaded))
+    model.described(replace(model.description_, training=training))
+    promising = Domain(model, workflow.path_limits(model))
     tips = promising.sample[1]
     path = trajectories.figure_eight(tips.mean(axis=0), [0.01, 0.01], dt=0.1)
     moved, share = placed(promising, path, 1e-4)
@@ -80,7 +80,7 @@ def test_a_path_is_placed_where_its_promise_is_least(domain):
         solution = promising.solver().solve(path.x + shift, restarts=0)
         if not (solution.status == IKStatus.CONVERGED).all():
             return np.inf
-        return loaded.promised_errors(solution.q).mean.mean()
+        return promised_errors(model, solution.q).mean.mean()
 
     least = promise(moved.x[0] - path.x[0])
     elsewhere = np.array([promise(tip - tips.mean(axis=0)) for tip in tips[::25]])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hybridkin import ConstantCurvatureChain, HybridForwardModel, save_model
+from hybridkin import ConstantCurvatureChain, HybridForwardModel, open_model, save_model
 from hybridkin.app import workflow
 from hybridkin.app.cli.main import main
 from hybridkin.app.workflow.track import TARGET
@@ -70,8 +70,8 @@ def test_rows_need_a_number_or_times(files, capsys):
 
 
 def test_read_tips_has_no_commands(files):
-    loaded = workflow.open_model(files / "model.safetensors")
-    log = workflow.read_tips(files / "camera.csv", loaded.log_format())
+    loaded = open_model(files / "model.safetensors")
+    log = workflow.read_tips(files / "camera.csv", loaded.description_.log)
     assert log.q.shape == (240, 0)
     assert log.x.shape == (240, 3)
     assert log.time is None

@@ -12,6 +12,7 @@ from hybridkin import (
     ConstantCurvatureChain,
     HybridForwardModel,
     Hysteresis,
+    open_model,
     robots,
     save_model,
 )
@@ -57,7 +58,7 @@ def loaded(tmp_path_factory):
     model = HybridForwardModel(CHAIN, "quadratic").fit(q, x)
     path = tmp_path_factory.mktemp("model") / "model.safetensors"
     save_model(model, path, training=TRAINING)
-    return workflow.open_model(path)
+    return open_model(path)
 
 
 def written(path, q, x):
@@ -169,7 +170,15 @@ def test_the_command_leaves_out_rows_without_a_tip(loaded, tmp_path, capsys):
     lines = measured.read_text().splitlines()
     lines[51] = lines[51].replace(str(x[50, 2]), "nan", 1)
     measured.write_text("\n".join(lines))
-    command = ["verify", loaded.path, track, measured, "--out", tmp_path / "out", "--json"]
+    command = [
+        "verify",
+        loaded.description_.path,
+        track,
+        measured,
+        "--out",
+        tmp_path / "out",
+        "--json",
+    ]
     assert main([*map(str, command)]) == 1
     record = json.loads(capsys.readouterr().out)
     assert record["cause"] == "moved base"

@@ -1,7 +1,6 @@
 import json
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +11,7 @@ from hybridkin import (
     HybridForwardModel,
     Hysteresis,
     datasets,
+    open_model,
     robots,
     save_model,
     trajectories,
@@ -26,6 +26,7 @@ from hybridkin.app.workflow.compare import (
 )
 from hybridkin.app.workflow.domain import Domain
 from hybridkin.app.workflow.log import checked
+from hybridkin.app.workflow.model import domain_distance, fitted_rows, has_body, held_out_errors
 
 ROBOT = """
 calibrate = ["radii", "base"]
@@ -111,12 +112,12 @@ def test_a_fit_to_a_thinned_log_knows_all_of_its_rows(log, tmp_path):
     measured = workflow.read_log(path, description.log, chain=description.chain)
     settings = workflow.FitSettings(n_folds=2, auto=False, max_rows=60)
     record = workflow.fit_log(measured, description, tmp_path / "m", settings, n_jobs=1).record
-    loaded = workflow.open_model(tmp_path / "m")
-    assert loaded.was_fitted(measured.q, measured.x, measured.motions).all()
-    assert not loaded.was_fitted(measured.q, measured.x + 1e-5, measured.motions).any()
-    assert loaded.held_out.mean == record.held_out[record.saved].mean > 0.0
-    nominal = workflow.open_model(robot)
-    assert not nominal.was_fitted(measured.q, measured.x, measured.motions).any()
+    loaded = open_model(tmp_path / "m")
+    assert fitted_rows(loaded, measured.q, measured.x, measured.motions).all()
+    assert not fitted_rows(loaded, measured.q, measured.x + 1e-5, measured.motions).any()
+    assert held_out_errors(loaded).mean == record.held_out[record.saved].mean > 0.0
+    nominal = open_model(robot)
+    assert not fitted_rows(nominal, measured.q, measured.x, measured.motions).any()
     report = workflow.evaluate_log(nominal, measured)
     assert report.record.fitted_rows == 0
 
@@ -125,7 +126,8 @@ def test_given_limits_replace_those_of_the_description():
     chain = ConstantCurvatureChain([0.005], lengths=[0.1])
     limits = robots.Limits(np.full(3, -0.01), np.full(3, 0.01), np.full(3, 0.02))
     robot = robots.RobotDescription("robot", chain, (), None, limits)
-    loaded = workflow.LoadedModel("robot", Path("robot.toml"), chain, robot)
+    nominal = open_model(chain)
+    loaded = nominal.described(replace(nominal.description_, robot=robot))
     found = workflow.path_limits(loaded, q_max=0.002, ddq_max=0.5)
     assert found.q_min.tolist() == [-0.01] * 3
     assert found.q_max.tolist() == [0.002] * 3
@@ -136,7 +138,7 @@ def test_given_limits_replace_those_of_the_description():
     with pytest.raises(ValueError, match="`q_min` must not exceed `q_max`"):
         workflow.path_limits(loaded, q_min=0.02)
     with pytest.raises(ValueError, match="--q-min"):
-        workflow.path_limits(workflow.LoadedModel("robot", Path("robot.toml"), chain))
+        workflow.path_limits(open_model(chain))
 
 
 MOTORS = """
@@ -162,7 +164,7 @@ ddq_max = 360
 def test_motor_angles_from_the_log_to_the_commands(tmp_path, capsys):
     robot = tmp_path / "motors.toml"
     robot.write_text(MOTORS)
-    loaded = workflow.open_model(robot)
+    loaded = open_model(robot)
     turn = np.radians([1.0, 1.0, 1.0])
     np.testing.assert_allclose(workflow.path_limits(loaded).q_min, -60 * turn)
     assert main(["describe", str(robot)]) == 0
@@ -178,7 +180,7 @@ def test_motor_angles_from_the_log_to_the_commands(tmp_path, capsys):
     limits = json.loads(capsys.readouterr().out)["limits"]
     np.testing.assert_allclose(limits["q_min"], [-20, -20, -30] * turn)
     np.testing.assert_allclose(limits["q_max"], 10 * turn)
-    log = workflow.read_log(out / "track.csv", replace(loaded.log_format(), x_unit="m"))
+    log = workflow.read_log(out / "track.csv", replace(loaded.description_.log, x_unit="m"))
     angles = datasets.load_log(out / "track.csv", ["a", "b", "c"], ["x", "y", "z"], q_unit="1").q
     np.testing.assert_allclose(log.q, -turn * angles, rtol=1e-12)
     assert (np.abs(angles - [5, 5, 10]) <= [15.001, 15.001, 20.001]).all()
@@ -202,7 +204,7 @@ def test_a_robot_without_segments_from_the_log_to_the_commands(log, tmp_path):
     robot, model = tmp_path / "data.toml", tmp_path / "m"
     robot.write_text(DATA_ROBOT)
     with pytest.raises(ValueError, match="has no model before a fit: hybridkin fit LOG"):
-        workflow.open_model(robot)
+        open_model(robot)
     description = robots.read_description(robot)
     measured = workflow.read_log(path, description.log, chain=description.chain)
     with pytest.raises(ValueError, match="`hysteresis` requires a robot with segments"):
@@ -213,13 +215,14 @@ def test_a_robot_without_segments_from_the_log_to_the_commands(log, tmp_path):
     saved = report.record.saved
     assert saved in ("hybrid, quadratic", "hybrid, ELM")
     assert errors[saved].mean < errors["data-driven, linear"].mean
-    loaded = workflow.open_model(model)
-    assert (loaded.name, loaded.chain) == ("pneumatic arm", None)
+    loaded = open_model(model)
+    assert loaded.description_.name == "pneumatic arm"
+    assert not has_body(loaded)
     np.testing.assert_allclose(measured.q[0], 1e3 * np.array([0.25] * 6), rtol=0.3)  # as they are
     evaluated = workflow.evaluate_log(loaded, measured)
     assert evaluated.record.all.mean < 0.005
-    assert loaded.hybrid.in_domain(measured.q).mean() > 0.9
-    assert not loaded.hybrid.in_domain(measured.q + 300).any()
+    assert loaded.in_domain(measured.q).mean() > 0.9
+    assert not loaded.in_domain(measured.q + 300).any()
     text = workflow.describe(loaded).plain()
     assert re.search("mechanical model: +AffineModule", text)
     fitted_for = text[text.index("Training range") : text.index("Logs:")]
@@ -255,11 +258,11 @@ def test_the_range_and_the_preferred_configuration_move_with_the_zeros(tmp_path)
     found = []
     for _ in range(2):
         save_model(model, tmp_path / "model")
-        loaded = workflow.open_model(tmp_path / "model")
+        loaded = open_model(tmp_path / "model")
         limits = workflow.path_limits(loaded)
         found.append((Domain(loaded, limits).preferred, limits.q_min))
         model.adapt(q - 0.01 * np.linspace(-1, 1, 9), model.predict(q))
-    assert np.abs(loaded.hybrid.change_.shift).max() > 0.005
+    assert np.abs(loaded.change_.shift).max() > 0.005
     for before, after in zip(*found, strict=True):
-        np.testing.assert_allclose(before - after, loaded.hybrid.change_.shift, atol=1e-12)
-    assert loaded.domain_distance(found[1][0][None])[0] <= 1.0
+        np.testing.assert_allclose(before - after, loaded.change_.shift, atol=1e-12)
+    assert domain_distance(loaded, found[1][0][None])[0] <= 1.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hybridkin import InverseKinematics
+from hybridkin import InverseKinematics, open_model
 from hybridkin.app import workflow
 
 
@@ -24,17 +24,16 @@ class Follower:
     """
 
     def __init__(self, model, period, dq_max=0.0, tolerance=1e-3):
-        self.loaded = workflow.open_model(model)
-        self.log = self.loaded.log_format()
+        self.model = open_model(model)
+        self.log = self.model.description_.log
         self.names = list(self.log.q)
         factors = np.abs(self.log.q_factor)
         limits = workflow.path_limits(
-            self.loaded, dq_max=dq_max * factors if dq_max > 0.0 else None
+            self.model, dq_max=dq_max * factors if dq_max > 0.0 else None
         )
-        half = self.loaded.half_width  # commands lead what the actuators do
-        self._low, self._high = limits.q_min - half, limits.q_max + half
+        self._low, self._high = limits.commands
         self._ik = InverseKinematics(
-            self.loaded.model,
+            self.model,
             q_min=self._low,
             q_max=self._high,
             dq_max=limits.dq_max,
