@@ -21,6 +21,9 @@ from hybridkin.calibration.calibrate import check_data
 from hybridkin.calibration.measured import evenly_spaced, folds, inner_and_outer
 from hybridkin.chains.chain import Chain
 
+Starts = tuple[Start | None, ...]
+"""Starts of the fits of all sets of parameters; None without parameters."""
+
 # rows and folds for the scores
 _MOST = 400
 _FOLDS = 3

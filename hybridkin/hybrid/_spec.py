@@ -17,9 +17,8 @@ from typing_extensions import Self
 
 from hybridkin._core.arrays import countable
 from hybridkin._core.model import ForwardModel
-from hybridkin.calibration._search import Start
 from hybridkin.calibration.calibrate import CalibrationResult, fit_geometry, refitted
-from hybridkin.calibration.choice import GeometryChoice, choose_geometry
+from hybridkin.calibration.choice import GeometryChoice, Starts, choose_geometry
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.structural import StructuralChain
 from hybridkin.hybrid._drift import too_far
@@ -31,7 +30,6 @@ from hybridkin.hybrid.held_out import MEAN_LENGTH
 from hybridkin.hybrid.structure_fit import StructureFit
 from hybridkin.hysteresis.value import NO_HYSTERESIS, Hysteresis
 
-Starts = tuple[Start | None, ...]
 Seed = int | np.random.RandomState | None
 Weighted = list[tuple[float, TipCorrection]]  # weights and corrections, without guards
 

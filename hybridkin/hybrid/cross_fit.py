@@ -13,10 +13,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybridkin._core.arrays import one_of, whole
 from hybridkin._core.turns import one_thread
+from hybridkin.calibration.choice import Starts
 from hybridkin.calibration.measured import folds as folds_of_rows
 from hybridkin.datasets.logs import Log
 from hybridkin.hybrid._rows import Rows
-from hybridkin.hybrid._spec import ErrorModel, Spec, Starts
+from hybridkin.hybrid._spec import ErrorModel, Spec
 from hybridkin.hybrid.estimator import HybridForwardModel
 from hybridkin.hybrid.held_out import CrossFit, Predictions, Split
 from hybridkin.hybrid.log_fit import Anew, FitOnce, fit_once

@@ -13,7 +13,7 @@ from torch import Tensor
 from typing_extensions import Self
 
 from hybridkin.calibration.calibrate import CalibrationResult
-from hybridkin.calibration.choice import GeometryChoice
+from hybridkin.calibration.choice import GeometryChoice, Starts
 from hybridkin.calibration.measured import folds
 from hybridkin.hybrid._drift import Drift, too_far
 from hybridkin.hybrid._fit import few_rows, fit_hybrid, fit_messages
@@ -32,7 +32,6 @@ from hybridkin.hybrid._spec import (
     FittedHybrid,
     HysteresisChoice,
     Spec,
-    Starts,
 )
 from hybridkin.hybrid._worse import worse_than_mechanical
 from hybridkin.hybrid.cv_results import CvResults
