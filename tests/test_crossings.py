@@ -30,9 +30,10 @@ from hybridkin import (
     InverseKinematics,
     RigidChain,
     load_model,
+    open_model,
     save_model,
 )
-from hybridkin.app.workflow import open_model, path_limits
+from hybridkin.app.workflow import path_limits
 from hybridkin.hybrid._wrapped import in_columns
 from hybridkin.plots import BackboneDisplay
 

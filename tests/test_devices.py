@@ -117,7 +117,7 @@ WORK = {
     "calibrate tensors": lambda _: calibrated("radii", "base", tensors=1),
     "hysteresis": lambda _: [
         Hysteresis.backlash(0.01).apply(Q)[0],
-        hybrid(error_model="drop", hysteresis="auto"),
+        *hybrid(error_model="drop", hysteresis="auto"),
     ],
     "elm": lambda _: [*NETWORK.fit(Q, X).partial_fit(Q, X).predict(Q, return_std=True)],
     "parallel elm": lambda _: hybrid(error_model=NETWORK, coverage=0.8),

@@ -14,6 +14,7 @@ from sklearn.tree import DecisionTreeRegressor
 from torch import Tensor
 
 from hybridkin import (
+    Commands,
     ConstantCurvatureChain,
     ElasticTendonChain,
     ELMRegressor,
@@ -165,7 +166,8 @@ def hybrid(error_model: Any, chain: Any = None, **settings: Any) -> Any:
     model = HybridForwardModel(
         chain or segment(), error_model, random_state=0, **settings
     )
-    return model.fit(q, x, groups=groups)
+    commands = Commands(q, groups, np.arange(len(q)) * 0.1)
+    return model.fit(commands, x, groups=groups)
 
 
 def on_chain(chain: Any, low: NDArray, high: NDArray, error_model: Any) -> Any:

@@ -22,8 +22,10 @@ if TYPE_CHECKING:
         merge_logs,
         read_columns,
     )
+    from hybridkin.datasets.table_files import LOG_SUFFIXES
 
 __all__ = [
+    "LOG_SUFFIXES",
     "EncoderFault",
     "Log",
     "Merged",
@@ -44,6 +46,7 @@ __all__ = [
 
 # Some results are Bunches of scikit-learn; a merge needs scipy.
 _NAMES_OF = {
+    "table_files": ("LOG_SUFFIXES",),
     "merged": ("Merged", "TimedColumns", "merge_logs", "read_columns"),
     "_recordings": (
         "load_armlab",

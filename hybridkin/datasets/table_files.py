@@ -12,6 +12,8 @@ from hybridkin.datasets._text_files import text_table
 
 _MOST_COLUMNS = 10_000  # of an array
 
+LOG_SUFFIXES = (".csv", ".tsv", ".txt", ".npz", ".parquet", ".pq")
+
 
 def read_table(path: Path, form: TextForm) -> Table:
     """Return the table in a file; `form` is that of a text file."""

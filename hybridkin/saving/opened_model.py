@@ -8,6 +8,7 @@ from pathlib import Path
 from hybridkin._core.arrays import as_path
 from hybridkin._core.model import ForwardModel, as_forward_model
 from hybridkin.chains.robots import RobotDescription, read_description
+from hybridkin.datasets.table_files import LOG_SUFFIXES
 from hybridkin.hybrid.description import nominal_hybrid
 from hybridkin.hybrid.estimator import HybridForwardModel
 from hybridkin.hybrid.model_description import ModelDescription
@@ -79,6 +80,10 @@ def _described(path: Path) -> HybridForwardModel:
 
 def _saved(path: Path, robot: str | Path | None) -> HybridForwardModel:
     """Return the model of a file."""
+    if path.suffix.lower() in LOG_SUFFIXES:
+        raise ValueError(
+            f"`model` must be a model or a robot description, got the log {path}."
+        )
     opened = load_model(path)
     if not isinstance(opened, HybridForwardModel):
         opened = nominal_hybrid(as_forward_model(opened))

@@ -467,7 +467,7 @@ def test_operators_do_not_change(operator):
     """What is derived from them, such as the width, stays right."""
     for twin in (operator, copy.deepcopy(operator), pickle.loads(pickle.dumps(operator))):
         for name, value in vars(twin).items():
-            with pytest.raises(AttributeError, match="make a new operator"):
+            with pytest.raises(AttributeError, match="make a new one"):
                 setattr(twin, name, value)
             if isinstance(value, np.ndarray):
                 with pytest.raises(ValueError, match="read-only"):

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from hybridkin import native, robots
 from hybridkin.app.workflow.errors import ExpectedErrors, HeldOutErrors, Promise
 from hybridkin.arguments import as_path
+from hybridkin.datasets import LOG_SUFFIXES
 from hybridkin.formats import UNITS, LogUnit, in_terms
 
 if TYPE_CHECKING:
     from hybridkin import HybridForwardModel
 
-LOG_SUFFIXES = (".csv", ".tsv", ".txt", ".npz", ".parquet", ".pq")
 """Endings of files that are treated as logs."""
 
 _MODELS = (".toml", ".safetensors")
