@@ -223,7 +223,7 @@ ENTRIES = {
             ),
         )
         for name, (chain, q) in CHAINS.items()
-        for method in (ROW_BY_ROW[type(chain)] + " check_actuators contradiction").split()
+        for method in (ROW_BY_ROW[type(chain)] + " check_actuators contradictions").split()
     },
     "ConstantCurvatureChain.with_markers": (
         tendon_chain().with_markers,

@@ -17,7 +17,7 @@ from sklearn.metrics import r2_score
 from sklearn.utils.validation import check_is_fitted
 from typing_extensions import Self
 
-from hybridkin._core.arrays import check_shape, labels, real_array
+from hybridkin._core.arrays import check_shape, labels, real_array, shaped
 from hybridkin._core.commands import Commands
 from hybridkin._core.digests import row_digests
 from hybridkin._core.distinct import targets_that_count
@@ -233,7 +233,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             All False for a nominal model, which no rows were fitted to.
         """
         check_is_fitted(self, "module_")
-        q = check_inputs(self, Commands.of(X).q)
+        q = shaped(Commands.of(X).q, "X", ("N", self.n_features_in_))
         measured = real_array(y, "y")
         check_shape(measured, "y", (len(q), "m"), "one row for each row of `X`")
         return np.isin(row_digests(q, measured), self._fit.fitted_rows)
