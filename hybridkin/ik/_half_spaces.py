@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from hybridkin._core.arrays import Numbers, Transform, as_tensor
 from hybridkin._core.kernel_numbers import IK_PROXIMAL
+from hybridkin._core.portable import Portable
 from hybridkin.ik._box import BoxProblem, box_limited_step
 from hybridkin.ik._gram import apply_rows
 from hybridkin.ik.tasks import PositionTask, Task
 
 
-class HalfSpaces(NamedTuple):
+@dataclass(frozen=True, eq=False, repr=False)
+class HalfSpaces(Portable):
     """Half-spaces in which the tip must stay: normals x <= offsets, unit normals (k, m)."""
 
     normals: Tensor

@@ -8,10 +8,12 @@ from typing import TypeAlias
 import torch
 from torch import Tensor
 
+from hybridkin._core.portable import Portable
+
 Function: TypeAlias = Callable[[Tensor], Tensor]
 
 
-class NoPosture:
+class NoPosture(Portable):
     """No configuration is preferred."""
 
     exists = False

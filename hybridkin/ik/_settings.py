@@ -346,7 +346,8 @@ class StepSettings(Portable):
         n_spaces = self.tip_limits.n
         if n_spaces > 0:
             plan.limit("actuators", n_spaces)  # they share arrays of the kernels
-            numbers += [as_array(part).T for part in self.tip_limits]
+            spaces = self.tip_limits
+            numbers += [as_array(spaces.normals).T, as_array(spaces.offsets)]
         stages = self.task.hysteresis.stage_numbers(n)
         numbers.append(stages.numbers)
 
