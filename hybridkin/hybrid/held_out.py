@@ -112,7 +112,7 @@ class CrossFit:
     y : ndarray of shape (N, m)
         Measured tips [m], NaN for missing markers.
     counts : ndarray of shape (N,)
-        Number of times each row counts.
+        Number of times each row counts [1].
     groups : ndarray of shape (N,) or None
         Motion of every row.
     fold : ndarray of shape (N,)
@@ -175,7 +175,7 @@ class CrossFit:
         rows : Rows
             The N rows.
         splits : sequence of (ndarray, ndarray)
-            Training and test rows of every fold.
+            Training and test rows of every fold, each of shape (k,) [row numbers].
         held_out : iterable of Predictions
             Those of the test rows, fold by fold.
         outer : Outer, optional
