@@ -53,8 +53,9 @@ def open_model(
     --------
     >>> from hybridkin import open_model, robots
     >>> model = open_model(robots.bionic_handling_assistant())
-    >>> model.predict([[0.2] * 9]).round(3)
-    array([[0. , 0. , 0.6]])
+    >>> x, y, z = model.predict([[0.2] * 9])[0]
+    >>> round(float(z), 3)
+    0.6
     """
     if isinstance(model, ForwardModel):
         return nominal_hybrid(model)
