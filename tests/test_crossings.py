@@ -337,8 +337,8 @@ def test_the_core_agrees_with_torch(crossing):
     np.testing.assert_allclose(model.jacobian(log.commands), J, rtol=1e-7, atol=1e-7)
     in_domain = model.in_domain(log.commands)
     assert (in_domain <= inside.numpy()).all()
-    if not model.hysteresis_ or case["change"] in ("none", "drifted"):
-        # The log has its own states of hysteresis; shifted zeros may move them out of its range.
+    if case["hysteresis"] != "creep, friction" or "adapted" not in case["change"]:
+        # There the zeros that are found may shift the states out of the range of the log.
         assert (in_domain == inside.numpy()).all()
 
 
@@ -416,7 +416,9 @@ def test_the_training_range_is_that_of_the_log(crossing):
     shift = model.training_range_.low - low
     if "adapted" not in case["change"]:
         np.testing.assert_array_equal(shift, 0.0)
-    assert (np.abs(shift) < 2.0 * robot.half).all()
+    # Behind creep the rows of the log show the zeros less well.
+    most = 2.0 if case["hysteresis"] == "creep, friction" else 1.0
+    assert (np.abs(shift) < most * robot.half).all()
 
 
 def test_the_drawn_body_ends_at_the_tip(crossing):
