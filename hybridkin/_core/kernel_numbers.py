@@ -69,6 +69,7 @@ HK_ASIDE = (
     0.6  # a component of a unit vector below which a coordinate axis is not along it
 )
 IK_HEALTHY = 0.02  # sigma_min / sigma_max above which no damping is needed
+IK_CHANGES = 400  # of the active constraints of a step; a handful is usual
 IK_NEWTON = 60  # Newton steps in a box; a handful is usual
 IK_SWEEPS = 30  # of Jacobi's method for eigenvalues; six are usual
 IK_PROXIMAL = 2  # rounds that remove the effect of the least damping

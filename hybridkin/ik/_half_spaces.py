@@ -10,10 +10,8 @@ import torch
 from torch import Tensor
 
 from hybridkin._core.arrays import Numbers, Transform, as_tensor
-from hybridkin._core.kernel_numbers import IK_PROXIMAL
 from hybridkin._core.portable import Portable
-from hybridkin.ik._box import BoxProblem, box_limited_step
-from hybridkin.ik._gram import apply_rows
+from hybridkin.ik._nearest import Polyhedron, nearest
 from hybridkin.ik.tasks import PositionTask, Task
 
 
@@ -44,23 +42,15 @@ class HalfSpaces(Portable):
     def way_in(self, margin: Tensor) -> Tensor:
         """Return the shortest displacements (N, m) with along(way) <= margin.
 
-        They are -normals^T nu, where nu >= 0 minimises |normals^T nu|^2 / 2 + nu . margin. A change
-        of nu is a box-limited step; proximal rounds remove the effect of its damping.
+        Planes that contradict the ones before them are moved as far as these need.
         """
-        J = self.normals.to(margin).T.expand(len(margin), -1, -1)
-        still = torch.zeros_like(J[..., 0])
-        rounding = math.sqrt(torch.finfo(margin.dtype).eps)
-        damping_sq = torch.full_like(still[:, 0], max(1e-6, rounding))
-        infinite = torch.full_like(margin, math.inf)
-        way = still
-        nu = torch.zeros_like(margin)
-        for _ in range(1 + IK_PROXIMAL):
-            z = (self.along(way) - margin) / damping_sq[:, None]
-            problem = BoxProblem(J, still, z, damping_sq, -nu, infinite)
-            change, _ = box_limited_step(problem)
-            nu = nu + change
-            way = way - apply_rows(J, change)
-        return way
+        normals = self.normals.to(margin).expand(len(margin), -1, -1)
+        still = torch.zeros_like(normals[:, 0])
+        infinite = torch.full_like(still, math.inf)
+        none = still.new_empty(len(still), 0)
+        equations = normals[:, :0]
+        within = Polyhedron(equations, none, -infinite, infinite, normals, margin)
+        return nearest(still, within)
 
 
 def everywhere() -> HalfSpaces:

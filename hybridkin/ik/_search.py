@@ -23,6 +23,7 @@ from hybridkin.ik._gram import apply_columns, apply_rows, row_gram
 from hybridkin.ik._settings import Bounds, StepSettings
 from hybridkin.ik._starts import even_starts, nearest_starts
 from hybridkin.ik._step import limited_step, null_step
+from hybridkin.ik._strict import StepLimits
 from hybridkin.ik.tasks import Tolerance
 
 _FIRST_DAMPING = 1.0  # lambda^2 / sigma_max^2 of the first iteration
@@ -327,9 +328,11 @@ class Search:
         lower, upper = settings.step_bounds(live.q)
         half_turn = 0.5 * settings.periods.to(live.q)
         stays = torch.isinf(half_turn)
-        bounds = Bounds(lower.where(stays, -half_turn), upper.where(stays, half_turn))
+        lower = lower.where(stays, -half_turn)
+        upper = upper.where(stays, half_turn)
+        limits = StepLimits.of_bounds(lower, upper, live.q)
         still = torch.zeros_like(live.q)
-        step = limited_step(settings, live.J, live.e, still, bounds, trust * size)
+        step = limited_step(settings, live.J, live.e, still, limits, trust * size)
         new = self._point(settings.inside(live.q + step.dq), live.target)
         error_new = new.error
         predicted = (live.e - apply_rows(live.J, step.dq)).norm(dim=-1)
@@ -462,7 +465,8 @@ class Search:
         if hold:
             held = bounds.held(torch.zeros_like(at.q))
             bounds = Bounds(*(end.where(~held, 0.0) for end in bounds))
-        step = limited_step(self.settings, at.J, at.e, posture, bounds)
+        limits = StepLimits.of_bounds(*bounds, at.q)
+        step = limited_step(self.settings, at.J, at.e, posture, limits)
         return self._point(at.q + step.dq, at.target)
 
     def _nudged(self, at: Found) -> Tensor:

@@ -14,15 +14,12 @@ from torch import Tensor
 from hybridkin._core.kernel_numbers import (
     IK_BALANCE,
     IK_CORRECTIONS,
-    IK_EXCESS,
     IK_LEAST_PULL,
-    IK_PROJECTIONS,
     IK_PULL_RATIO,
     IK_SLACK,
     IK_SLIP,
     IK_STUCK,
 )
-from hybridkin.ik._box import BoxProblem, calmed, strict_box_step
 from hybridkin.ik._escape import way_out
 from hybridkin.ik._gram import (
     adaptive_damping,
@@ -33,8 +30,8 @@ from hybridkin.ik._gram import (
     row_gram,
     solve_rows,
 )
-from hybridkin.ik._half_spaces import HalfSpaces
 from hybridkin.ik._settings import Bounds, StepSettings, stopping
+from hybridkin.ik._strict import StepLimits, calmed, strict_step
 
 
 class StepRows(NamedTuple):
@@ -64,9 +61,11 @@ class Law(NamedTuple):
     settings: StepSettings
     least: Tensor
 
-    def step(self, J: Tensor, v: Tensor, posture: Tensor, bounds: Bounds) -> StepRows:
-        """Return the step for the task v and the posture step, within the bounds."""
-        return limited_step(self.settings, J, v, posture, bounds, least=self.least)
+    def step(
+        self, J: Tensor, v: Tensor, posture: Tensor, limits: StepLimits
+    ) -> StepRows:
+        """Return the step for the task v and the posture step, within the limits."""
+        return limited_step(self.settings, J, v, posture, limits, least=self.least)
 
 
 def control_step(
@@ -149,9 +148,10 @@ def control_step(
     v = feed_forward + gain * e
     if bounds is None:
         bounds = settings.step_bounds(q, seconds, last)
+    limits = StepLimits.of_bounds(*bounds, q)
     spaces = settings.tip_limits
     if spaces.n == 0:
-        step = law.step(J, v, posture, bounds)
+        step = law.step(J, v, posture, limits)
         if not settings.pulls.any():
             step = _escaping(law, at, J, v, e, step, bounds)
     else:
@@ -160,9 +160,12 @@ def control_step(
             normals = spaces.normals.to(J)[:, None].expand(-1, len(J), -1)
             brakes = [_braking(law, J, normal, change) for normal in normals]
             margin = stopping(margin, torch.stack(brakes, dim=-1))
-        confined = _Confined(law, spaces, margin, J, posture, bounds)
-        step = confined.step(v)
-        v = confined.allowed(v)
+        limits = limits._replace(A=spaces.normals.to(J) @ J, b=margin)
+        step = law.step(J, v, posture, limits)
+        left = margin - spaces.along(v)
+        rounding = 32.0 * torch.finfo(v.dtype).eps  # of a motion [m]
+        step = step._replace(stopped=(left < -rounding).any(-1))
+        v = v + spaces.way_in(left)
     step = step._replace(promised=apply_rows(J, step.dq))
     if settings.pulls.any():
         step = _arriving(law, at, J, v, step, bounds)
@@ -184,11 +187,11 @@ def limited_step(
     J: Tensor,
     v: Tensor,
     posture: Tensor,
-    bounds: Bounds,
+    limits: StepLimits,
     damping_sq: Tensor | None = None,
     least: Tensor | float = 0.0,
 ) -> StepRows:
-    """Return the step for the task v and the posture step, within the bounds.
+    """Return the step for the task v and the posture step, within the limits.
 
     Weights are a change of unit: in u = W^(1/2) q all weights are 1. With `damping_sq`, lambda^2 in
     this unit, singular values are not computed, and sigma_min is NaN. Else lambda^2 is at `least`
@@ -196,7 +199,7 @@ def limited_step(
     """
     unit = settings.unit(v)
     J = J * unit
-    box = Bounds(bounds.lower / unit, bounds.upper / unit)
+    box = limits.in_unit(unit)
     posture = posture / unit
 
     # Eq. (17): damped least squares, and the part of the posture step that does not move the tip.
@@ -222,18 +225,16 @@ def limited_step(
     # Rows within all limits keep this step; eq. (19) is solved for the others. Weights turn J out
     # of the plane.
     if settings.limits != "off":
-        clipped = box.clip(dq)
-        out_of_plane = settings.plane.n_normals and settings.weighted
-        over = ((clipped != dq).any(-1) | out_of_plane).nonzero()[:, 0]
+        out_of_plane = bool(settings.plane.n_normals) and settings.weighted
+        over = (box.broken(dq) | out_of_plane).nonzero()[:, 0]
         if over.numel() > 0:
             rows, motion = _with_plane(settings, J, v, posture)
-            lower = box.lower.expand_as(dq)
-            upper = box.upper.expand_as(dq)
-            problem = BoxProblem(rows, motion, z, damping_sq, lower, upper)
-            clipped[over] = strict_box_step(problem.take(over), calm[over])
-        dq = clipped
+            damping = damping_sq.sqrt()
+            problem = (a[over] for a in (rows, motion, z, damping))
+            inside = strict_step(*problem, box.take(over), calm[over])
+            dq = dq.index_put((over,), inside)
     held = box.held(dq)
-    dq = bounds.clip(dq * unit)
+    dq = limits.clip(dq * unit)
     return StepRows(dq, sigma_min, damping_sq.sqrt(), held, v)
 
 
@@ -275,7 +276,9 @@ def _norm(rows: Tensor) -> Tensor:
 def _braking(law: Law, J: Tensor, way: Tensor, change: Tensor) -> Tensor:
     """Return the largest change of the tip's motion per period, in multiples of `way` (N,)."""
     free = torch.full_like(J[:, 0], math.inf)
-    step = law.step(J, way, torch.zeros_like(free), Bounds(-free, free))
+    step = law.step(
+        J, way, torch.zeros_like(free), StepLimits.of_bounds(-free, free, free)
+    )
     return (change / step.dq.abs()).amin(-1)
 
 
@@ -303,99 +306,6 @@ def _escaping(
     left = torch.zeros_like(stuck).index_put((rows,), (way != 0.0).any(-1))
     held = torch.where(left[:, None], bounds.held(dq), step.saturated)
     return step._replace(dq=dq, saturated=held)
-
-
-# Limits of the tip.
-
-
-class _Confined(NamedTuple):
-    """Steps that must keep the tip in half-spaces, with margins (N, k) to their planes."""
-
-    law: Law
-    spaces: HalfSpaces
-    margin: Tensor
-    J: Tensor
-    posture: Tensor
-    bounds: Bounds
-
-    @property
-    def close(self) -> float:
-        """Rounding of a motion [m]."""
-        return 32.0 * torch.finfo(self.margin.dtype).eps
-
-    def allowed(self, v: Tensor) -> Tensor:
-        """Return motions of the tip (N, m) projected onto the half-spaces."""
-        return v + self.spaces.way_in(self.margin - self.spaces.along(v))
-
-    def along(self, dq: Tensor) -> Tensor:
-        """Return the motions (N, k) of the tip along the normals, to first order."""
-        return self.spaces.along(apply_rows(self.J, dq))
-
-    def step(self, v: Tensor) -> StepRows:
-        """Return a step within the bounds after which, to first order, the tip is in its limits.
-
-        If the bounds move J dq of the projected motion out of the half-spaces, a safe step is
-        looked for, and the margins of the half-spaces that it does not reach are widened up to it.
-        Alternating projections look for a motion that meets margins and bounds. A remaining
-        violation is removed by taking a fraction of the way from the safe step to this one.
-        """
-        wanted = self.allowed(v)
-        step = self.law.step(self.J, wanted, self.posture, self.bounds)
-        out = (self.along(step.dq) - self.margin > self.close).any(-1, keepdim=True)
-        if out.any():
-            safe = self._safe()
-            least = self.along(safe)
-            reachable = torch.maximum(self.margin, least)
-            wider = self._replace(margin=torch.where(out, reachable, self.margin))
-            dq, wanted = wider._projected(step.dq, wanted)
-            over = wider.along(dq) - wider.margin
-            fraction = wider._fraction(least - wider.margin, over)
-            between = self.bounds.clip(safe + fraction * (dq - safe))
-            dq = torch.where(fraction < 1.0, between, dq)
-            held = torch.where(out, self.bounds.held(dq), step.saturated)
-            step = step._replace(dq=dq, saturated=held)
-        stopped = ((wanted - v).abs() > self.close).any(-1)
-        return step._replace(stopped=stopped)
-
-    def _safe(self) -> Tensor:
-        """Return steps (N, n) into the half-spaces, or as near to them as found.
-
-        They start at rest, or at the hardest braking, and lead farther out of no half-space than
-        this start. Where the way in turns out of another half-space, only a fraction of it is
-        taken; else a start outside several could get worse.
-        """
-        rest = self.bounds.clip(torch.zeros_like(self.J[:, 0]))
-        without_posture = self._replace(posture=torch.zeros_like(self.posture))
-        back, _ = without_posture._projected(rest, apply_rows(self.J, rest))
-        start = self.along(rest)
-        allowed = torch.maximum(self.margin, start)
-        fraction = self._fraction(start - allowed, self.along(back) - allowed)
-        return self.bounds.clip(rest + fraction * (back - rest))
-
-    def _projected(self, dq: Tensor, wanted: Tensor) -> tuple[Tensor, Tensor]:
-        """Return steps moved towards the margins, and the tip motions they were solved for.
-
-        Alternating projections, with some excess so that they end. Rows within their margins keep
-        their step.
-        """
-        for _ in range(IK_PROJECTIONS):
-            motion = apply_rows(self.J, dq)
-            over = self.spaces.along(motion) - self.margin
-            out = (over > self.close).any(-1, keepdim=True)
-            if not out.any():
-                break
-            # A bit farther in, because a step in a box is right to rounding only.
-            way = self.spaces.way_in(-over - 8.0 * self.close)
-            wanted = torch.where(out, motion + IK_EXCESS * way, wanted)
-            step = self.law.step(self.J, wanted, self.posture, self.bounds)
-            dq = torch.where(out, step.dq, dq)
-        return dq, wanted
-
-    def _fraction(self, least: Tensor, over: Tensor) -> Tensor:
-        """Return the fractions (N, 1) of ways from `least` to `over` (N, k) that stay below 0."""
-        fraction = ((self.close - least) / (over - least)).clamp(0.0, 1.0)
-        fraction = torch.where(over > self.close, fraction, 1.0)
-        return fraction.amin(-1, keepdim=True)
 
 
 # Tendons that can only pull.
@@ -454,7 +364,7 @@ class _Arrival(NamedTuple):
             going = best.distance > close
             if not going.any():
                 break
-            left = Bounds(lower - end.dq, upper - end.dq)
+            left = StepLimits.of_bounds(lower - end.dq, upper - end.dq, end.dq)
             still = torch.zeros_like(end.J[:, 0])
             step = self.law.step(end.J, end.missing, still, left)
             dq = self.bounds.clip(end.dq + step.dq)

@@ -1,0 +1,318 @@
+"""The point of a polyhedron that is nearest to another point: every limited step is one."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import one_hot
+
+from hybridkin._core.kernel_numbers import IK_CHANGES
+from hybridkin.ik._gram import apply_rows
+
+_ROUNDING = 100.0  # of a component of a unit vector [eps]
+
+
+class Polyhedron(NamedTuple):
+    """Points x (N, n) with E x = e, lower <= x <= upper and A x <= b, a polyhedron for every row.
+
+    Attributes
+    ----------
+    E, e : Tensor of shape (N, m, n) and (N, m)
+        Equations; those that depend on the ones before them, up to rounding, are left out.
+    lower, upper : Tensor of shape (N, n)
+        Bounds, lower <= upper, infinite where there are none.
+    A, b : Tensor of shape (N, k, n) and (N, k)
+        Rows of length one, the most important ones first, and their offsets.
+    """
+
+    E: Tensor
+    e: Tensor
+    lower: Tensor
+    upper: Tensor
+    A: Tensor
+    b: Tensor
+
+    def excess(self, x: Tensor) -> Tensor:
+        """Return by how much x violates every inequality, shape (N, 2 n + k): the bounds first."""
+        beyond = (self.A @ x[..., None])[..., 0] - self.b
+        return torch.cat([self.lower - x, x - self.upper, beyond], dim=-1)
+
+    def rounding(self, x: Tensor) -> Tensor:
+        """Return what rounding may leave of the excess of x, shape (N, 2 n + k)."""
+        sizes = (self.A.abs() @ x.abs()[..., None])[..., 0] + self.b.abs()
+        bounds = [x.abs() + end.abs() for end in (self.lower, self.upper)]
+        unit = 32.0 * torch.finfo(x.dtype).eps
+        return unit * torch.cat([*bounds, sizes], dim=-1)
+
+    def normals(self, which: Tensor) -> Tensor:
+        """Return the inward normals (N, n) of inequalities (N,), one for every row."""
+        n = self.lower.shape[-1]
+        unit = torch.eye(n, dtype=self.lower.dtype, device=self.lower.device)
+        sides = torch.cat([unit, -unit]).expand(len(which), -1, -1)
+        every = torch.cat([sides, -self.A], dim=1)
+        return every[torch.arange(len(which)), which]
+
+    def take(self, rows: Tensor) -> Polyhedron:
+        """Return the polyhedra of some rows."""
+        return Polyhedron(*(a[rows] for a in self))
+
+
+class _Active(NamedTuple):
+    """The constraints that hold as equations, in n slots for every row of x.
+
+    Attributes
+    ----------
+    free : Tensor of shape (N, n, n)
+        Projector onto the directions that they leave.
+    inverse : Tensor of shape (N, n, n)
+        Rows of the pseudo-inverse of their normals, zero in free slots.
+    force : Tensor of shape (N, n)
+        Their multipliers, infinite for equations.
+    which : Tensor of shape (N, n)
+        Their inequality, -1 for none.
+    """
+
+    free: Tensor
+    inverse: Tensor
+    force: Tensor
+    which: Tensor
+
+    @classmethod
+    def none(cls, x: Tensor) -> _Active:
+        """Return no constraints of points x (N, n)."""
+        N, n = x.shape
+        free = torch.eye(n, dtype=x.dtype, device=x.device).repeat(N, 1, 1)
+        which = torch.full((N, n), -1, device=x.device)
+        return cls(free, torch.zeros_like(free), torch.zeros_like(x), which)
+
+    def along(self, normal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the free part of normals (N, n), its square, and their multiples of the others."""
+        way = apply_rows(
+            self.free, apply_rows(self.free, normal)
+        )  # twice, for rounding
+        return way, way.square().sum(-1), apply_rows(self.inverse, normal)
+
+    def with_one(
+        self, adds: Tensor, way: Tensor, shares: Tensor, force: Tensor, which: Tensor
+    ) -> _Active:
+        """Return the constraints with one more in the rows `adds`, as from `along`."""
+        unit = way / way.square().sum(-1, keepdim=True)
+        unit = torch.where(adds[:, None], unit, 0.0)
+        empty = (self.inverse == 0.0).all(-1).to(torch.uint8).argmax(-1)
+        slot = one_hot(empty, self.force.shape[-1]).bool() & adds[:, None]
+        inverse = self.inverse - shares[..., None] * unit[:, None]
+        inverse = torch.where(slot[..., None], unit[:, None], inverse)
+        return _Active(
+            self.free - way[..., None] * unit[:, None],
+            inverse,
+            torch.where(slot, force[:, None], self.force),
+            torch.where(slot, which[:, None], self.which),
+        )
+
+    def without(self, slot: Tensor) -> _Active:
+        """Return the constraints without those in slots (N, n) of bool, at most one in a row."""
+        way = (self.inverse * slot[..., None]).sum(1)
+        size = way.square().sum(-1, keepdim=True)
+        unit = torch.where(size > 0.0, way / size, 0.0)
+        others = apply_rows(self.inverse, unit)
+        inverse = self.inverse - others[..., None] * way[:, None]
+        return _Active(
+            self.free + unit[..., None] * way[:, None],
+            torch.where(slot[..., None], 0.0, inverse),
+            torch.where(slot, 0.0, self.force),
+            torch.where(slot, -1, self.which),
+        )
+
+    def where(self, kept: Tensor, others: _Active) -> _Active:
+        """Return these constraints in the rows `kept`, else the other ones."""
+        square = kept[:, None, None]
+        row = kept[:, None]
+        return _Active(
+            torch.where(square, self.free, others.free),
+            torch.where(square, self.inverse, others.inverse),
+            torch.where(row, self.force, others.force),
+            torch.where(row, self.which, others.which),
+        )
+
+    def take(self, rows: Tensor) -> _Active:
+        """Return the constraints of some rows."""
+        return _Active(*(a[rows] for a in self))
+
+
+def nearest(x: Tensor, within: Polyhedron) -> Tensor:
+    """Return the points of polyhedra that are nearest to x (N, n).
+
+    The dual active-set method of Goldfarb & Idnani with the distance as the objective: starting
+    from x, the constraint violated most becomes active, and constraints that would push the wrong
+    way leave, until none is violated. It is exact after a finite number of changes.
+
+    Rows of A that contradict the bounds or more important rows are relaxed as far as these need,
+    the least important one first.
+
+    Parameters
+    ----------
+    x : Tensor of shape (N, n)
+        Points.
+    within : Polyhedron
+        Where to; its equations and bounds have a common point.
+
+    Returns
+    -------
+    Tensor of shape (N, n)
+        Points within the bounds exactly, on equations and within rows up to rounding.
+
+    References
+    ----------
+    Goldfarb & Idnani, Math. Program. 27 (1983), with their operators H and N*.
+    """
+    ends = x.clone()
+    live = _Live.on_equations(x, within)
+    for _ in range(IK_CHANGES):
+        live = live.choosing()
+        done = live.chosen < 0
+        if done.any():
+            ended = done.nonzero()[:, 0]
+            ends[live.rows[ended]] = live.x[ended]
+            live = live.take((~done).nonzero()[:, 0])
+        if live.rows.numel() == 0:
+            break
+        live = live.after_change()
+    ends[live.rows] = live.x
+    return torch.clamp(ends, within.lower, within.upper)
+
+
+class _Live(NamedTuple):
+    """Rows of the iteration that are not solved yet: where they are, and what they push against.
+
+    Attributes
+    ----------
+    rows : Tensor of shape (N,)
+        Their places among all rows.
+    start, x : Tensor of shape (N, n)
+        The points on the equations, and at present.
+    within : Polyhedron
+        What they go into, with relaxed rows.
+    equations, active : _Active
+        The constraints at the start, and at present.
+    chosen : Tensor of shape (N,)
+        The inequality on its way to be active, -1 for none.
+    force : Tensor of shape (N,)
+        Its multiplier.
+    """
+
+    rows: Tensor
+    start: Tensor
+    x: Tensor
+    within: Polyhedron
+    equations: _Active
+    active: _Active
+    chosen: Tensor
+    force: Tensor
+
+    @classmethod
+    def on_equations(cls, x: Tensor, within: Polyhedron) -> _Live:
+        """Return the points that are nearest to x on the equations alone."""
+        active = _Active.none(x)
+        none = torch.full_like(x[:, 0], -1, dtype=torch.long)
+        for normal, value in zip(within.E.unbind(1), within.e.unbind(1), strict=True):
+            way, size, shares = active.along(normal)
+            adds = size > _rounding(x) ** 2 * normal.square().sum(-1)
+            missing = value - (normal * x).sum(-1)
+            length = torch.where(adds, missing / size, 0.0)
+            x = x + length[:, None] * way
+            force = torch.full_like(size, torch.inf)
+            active = active.with_one(adds, way, shares, force, none)
+        rows = torch.arange(len(x), device=x.device)
+        force = torch.zeros_like(x[:, 0])
+        return cls(rows, x, x, within, active, active, none, force)
+
+    def choosing(self) -> _Live:
+        """Return the same with the inequality violated most chosen where there was none."""
+        excess = self.within.excess(self.x)
+        violated = torch.where(excess > self.within.rounding(self.x), excess, 0.0)
+        most, worst = violated.max(-1)
+        none = (self.chosen < 0) & (most > 0.0)
+        return self._replace(chosen=torch.where(none, worst, self.chosen))
+
+    def after_change(self) -> _Live:
+        """Return the same after one constraint more or less, or with a row that is relaxed."""
+        x, active = self.x, self.active
+        normal = self.within.normals(self.chosen)
+        missing = self.within.excess(x).gather(-1, self.chosen[:, None])[:, 0]
+        way, size, shares = active.along(normal)
+
+        # The step at which it holds, or the first at which an active one pushes no more.
+        movable = size > _rounding(x) ** 2
+        full = torch.where(movable, missing / size, torch.inf)
+        pushes = shares > _rounding(x)
+        lengths = torch.where(pushes, active.force / shares, torch.inf)
+        first, slot = lengths.min(-1)
+        length = torch.minimum(full, first)
+        stuck = torch.isinf(length)
+        length = torch.where(stuck, 0.0, length)
+        force = self.force + length
+        active = active._replace(force=active.force - length[:, None] * shares)
+        adds = ~stuck & (full <= first)
+        drops = ~stuck & ~adds
+        leaving = one_hot(slot, x.shape[-1]).bool() & drops[:, None]
+        moved = self._replace(
+            x=x + torch.where(movable, length, 0.0)[:, None] * way,
+            active=active.with_one(adds, way, shares, force, self.chosen).without(
+                leaving
+            ),
+            chosen=torch.where(adds, -1, self.chosen),
+            force=torch.where(adds, 0.0, force),
+        )
+        if stuck.any():
+            moved = moved._relaxed(stuck, missing, shares)
+        return moved._replace(x=moved._refined())
+
+    def _relaxed(self, stuck: Tensor, missing: Tensor, shares: Tensor) -> _Live:
+        """Return the same with a row relaxed where constraints contradict: these start anew.
+
+        The chosen normal is a sum of active ones with factors `shares` (N, n), none positive.
+        """
+        n = self.x.shape[-1]
+        first_row = 2 * n
+        which = torch.where(shares < -_rounding(shares), self.active.which, -1)
+        which = torch.cat([which, self.chosen[:, None]], dim=-1)
+        factors = torch.cat([-shares, torch.ones_like(missing)[:, None]], dim=-1)
+        least, slot = which.max(-1)
+        has_row = stuck & (least >= first_row)
+        by = missing / factors.gather(-1, slot[:, None])[:, 0] * (1.0 + 1e-9)
+        row = (least - first_row).clamp_min(0)
+        over = torch.where(has_row, by, 0.0)
+        b = self.within.b
+        if b.shape[-1]:
+            b = b.scatter_add(-1, row[:, None], over[:, None])
+        anew = stuck[:, None]
+        active = self.active.where(~stuck, self.equations)
+        return self._replace(
+            x=torch.where(anew, self.start, self.x),
+            within=self.within._replace(b=b),
+            active=active,
+            chosen=torch.where(stuck, -1, self.chosen),
+            force=torch.where(stuck, 0.0, self.force),
+        )
+
+    def _refined(self) -> Tensor:
+        """Return x after one Newton step onto the active constraints, which takes rounding out."""
+        within, which = self.within, self.active.which
+        inequality = -within.excess(self.x).gather(-1, which.clamp_min(0))
+        off = torch.where(which >= 0, inequality, 0.0)
+        # Row c of `inverse` moves along the inward normal c alone.
+        return self.x - (off[..., None] * self.active.inverse).sum(1)
+
+    def take(self, rows: Tensor) -> _Live:
+        """Return some rows."""
+        parts = []
+        for part in self:
+            parts.append(part[rows] if isinstance(part, Tensor) else part.take(rows))
+        return _Live(*parts)
+
+
+def _rounding(x: Tensor) -> float:
+    """Return what rounding leaves of a component of a unit vector that is zero."""
+    return _ROUNDING * torch.finfo(x.dtype).eps

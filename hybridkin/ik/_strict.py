@@ -1,0 +1,141 @@
+"""Steps within limits, in which the task comes before the posture."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from hybridkin.ik._gram import apply_rows
+from hybridkin.ik._nearest import Polyhedron, nearest
+
+
+class StepLimits(NamedTuple):
+    """Steps dq with lower <= dq <= upper and A dq <= b.
+
+    Attributes
+    ----------
+    lower, upper : Tensor of shape (N, n)
+        Bounds, lower <= upper.
+    A, b : Tensor of shape (N, k, n) and (N, k)
+        One-sided limits, the most important ones first.
+    """
+
+    lower: Tensor
+    upper: Tensor
+    A: Tensor
+    b: Tensor
+
+    @classmethod
+    def of_bounds(cls, lower: Tensor, upper: Tensor, like: Tensor) -> StepLimits:
+        """Return bounds of steps `like` (N, n), without one-sided limits."""
+        none = like.new_empty(*like.shape[:-1], 0)
+        lower = lower.expand_as(like)
+        upper = upper.expand_as(like)
+        return cls(
+            lower, upper, none[..., None].expand(*none.shape, like.shape[-1]), none
+        )
+
+    def clip(self, dq: Tensor) -> Tensor:
+        """Return steps moved into the bounds."""
+        return torch.clamp(dq, self.lower, self.upper)
+
+    def held(self, dq: Tensor) -> Tensor:
+        """Return which actuators are at a bound, bool (N, n)."""
+        return (dq <= self.lower) | (dq >= self.upper)
+
+    def broken(self, dq: Tensor) -> Tensor:
+        """Return whether steps are beyond a limit, bool (N,)."""
+        beyond = apply_rows(self.A, dq) > self.b
+        return (self.clip(dq) != dq).any(-1) | beyond.any(-1)
+
+    def in_unit(self, unit: Tensor) -> StepLimits:
+        """Return the limits of dq / unit."""
+        return StepLimits(self.lower / unit, self.upper / unit, self.A * unit, self.b)
+
+    def take(self, rows: Tensor) -> StepLimits:
+        """Return the limits of some rows."""
+        return StepLimits(*(a[rows] for a in self))
+
+
+def calmed(z: Tensor, task: Tensor, calm: Tensor) -> Tensor:
+    """Return steps z (N, n), in the rows `calm` (N,) at most half as long as those of a task.
+
+    Else the way to a posture would go on shaking a robot that rests where its target is out of
+    reach.
+    """
+    share = task.norm(dim=-1) / (2.0 * z.norm(dim=-1))
+    share = torch.where(calm, share.clamp_max(1.0), 1.0)
+    return share.nan_to_num(1.0)[..., None] * z
+
+
+def strict_step(
+    J: Tensor, v: Tensor, z: Tensor, damping: Tensor, limits: StepLimits, calm: Tensor
+) -> Tensor:
+    """Return steps within limits whose task part does not depend on preferred steps z, eq. (19).
+
+    Without damping, z only chooses among the steps that reach v, or come nearest to it. Damping
+    would be a compromise between v and z. Therefore the damped task is first solved for z = 0; z
+    then chooses among the steps with the same motion.
+
+    Parameters
+    ----------
+    J : Tensor of shape (N, m, n)
+        Jacobians.
+    v : Tensor of shape (N, m)
+        Desired task steps J dq.
+    z : Tensor of shape (N, n)
+        Preferred steps.
+    damping : Tensor of shape (N,)
+        lambda, in the unit of the singular values of J.
+    limits : StepLimits
+        The limits of the steps.
+    calm : bool Tensor of shape (N,)
+        Where z is at most half as long as the step of the task.
+
+    Returns
+    -------
+    Tensor of shape (N, n)
+        Steps within the limits.
+    """
+    size = torch.linalg.matrix_norm(J @ J.mT).sqrt()  # about sigma_max
+    relative = max(1e-6, math.sqrt(torch.finfo(J.dtype).eps))
+    # If J is zero it only has to be positive.
+    least = torch.where(size > 0.0, relative * size, 1.0)
+    used = torch.maximum(damping, least)
+    rows = ((damping > 0.0) & (z != 0.0).any(-1)).nonzero()[:, 0]
+    if rows.numel() > 0:
+        still = torch.zeros_like(z[rows])
+        task = damped_step(J[rows], v[rows], still, used[rows], limits.take(rows))
+        v = v.index_put((rows,), apply_rows(J[rows], task))
+        z = z.index_put((rows,), calmed(z[rows], task, calm[rows]))
+        used = used.index_put((rows,), least[rows])
+    return damped_step(J, v, z, used, limits)
+
+
+def damped_step(
+    J: Tensor, v: Tensor, z: Tensor, damping: Tensor, limits: StepLimits
+) -> Tensor:
+    """Return the steps with the least |dq - z|^2 + |J dq - v|^2 / lambda^2 within the limits.
+
+    With s = (v - J dq) / lambda it is the point (dq, s) nearest to (z, 0) with J dq + lambda s = v.
+    """
+    N, m, n = J.shape
+    slack = torch.eye(m, dtype=J.dtype, device=J.device) * damping[:, None, None]
+    none = torch.full_like(v, math.inf)
+    length = limits.A.norm(dim=-1)
+    length = torch.where(length > 0.0, length, 1.0)
+    rows = torch.cat(
+        [limits.A / length[..., None], J.new_zeros(N, length.shape[1], m)], dim=-1
+    )
+    within = Polyhedron(
+        torch.cat([J, slack], dim=-1),
+        v,
+        torch.cat([limits.lower, -none], dim=-1),
+        torch.cat([limits.upper, none], dim=-1),
+        rows,
+        limits.b / length,
+    )
+    return nearest(torch.cat([z, torch.zeros_like(v)], dim=-1), within)[:, :n]
