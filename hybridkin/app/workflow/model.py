@@ -35,9 +35,7 @@ def trained_range(model: HybridForwardModel) -> robots.Limits:
 
     With backlash it is the range of the actuators' motion.
     """
-    return (
-        robots.Limits(*model.training_range_) if is_fitted(model) else robots.Limits()
-    )
+    return robots.Limits(*model.training_range_)
 
 
 def has_body(model: HybridForwardModel) -> bool:

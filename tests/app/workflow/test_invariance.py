@@ -151,7 +151,7 @@ def test_limits_are_those_of_metres(tmp_path, learned):
     """
     metres = loaded(np.ones(6), tmp_path, learned=learned)
     motors = loaded(GAINS, tmp_path, learned=learned)
-    given = robots.Limits(np.full(6, -0.003), np.full(6, 0.002), None, np.full(6, 0.1))
+    given = robots.Limits(np.full(6, -0.003), np.full(6, 0.002), ddq_max=np.full(6, 0.1))
     for limits in (robots.Limits(), given, robots.Limits(q_min=np.full(6, -0.002))):
         plain = workflow.path_limits(metres, **vars(limits))
         other = workflow.path_limits(motors, **vars(limits.scaled(1.0 / GAINS)))
