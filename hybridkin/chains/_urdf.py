@@ -17,7 +17,7 @@ from hybridkin.chains._arm_files import (
     Joint,
     JointLimits,
     check_link,
-    moved,
+    offset_origin,
     source_of,
 )
 
@@ -123,7 +123,7 @@ class Urdf:
         if kind == "fixed":
             return [Joint(origin)]
         axis = np.array(_numbers(element, "axis", "xyz", "1 0 0"))
-        origin = moved(origin, kind, axis, offset)
+        origin = offset_origin(origin, kind, axis, offset)
         if driver_kind == "fixed":
             return [Joint(origin)]
         limits = _limits(driver)
