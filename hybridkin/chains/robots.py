@@ -226,6 +226,11 @@ class RobotDescription:
             return self.chain.n_actuators
         return 0 if self.log is None else len(self.log.q)
 
+    @property
+    def has_segments(self) -> bool:
+        """Whether it has a mechanical model; else its model is learned from data alone."""
+        return self.chain is not None
+
     def to_log(self, q: Numbers) -> NDArray:
         """Return actuator vectors (..., n) in unit and sign of the logs, see `LogFormat`."""
         return self._known_log().to_log(q)
