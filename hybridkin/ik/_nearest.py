@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import one_hot
 
-from hybridkin._core.kernel_numbers import IK_CHANGES
+from hybridkin._core.kernel_numbers import IK_CHANGES, IK_PROXIMAL
 from hybridkin.ik._gram import apply_rows
 
 _ROUNDING = 100.0  # of a component of a unit vector [eps]
@@ -125,6 +125,13 @@ class _Active(NamedTuple):
             torch.where(slot, -1, self.which),
         )
 
+    def pushing(self, way: Tensor, rows: Tensor) -> _Active:
+        """Return the constraints with the forces of points `way` from the origin, in some rows."""
+        force = apply_rows(self.inverse, way)
+        return self._replace(
+            force=torch.where(rows & (self.which >= 0), force, self.force)
+        )
+
     def where(self, kept: Tensor, others: _Active) -> _Active:
         """Return these constraints in the rows `kept`, else the other ones."""
         square = kept[:, None, None]
@@ -141,7 +148,7 @@ class _Active(NamedTuple):
         return _Active(*(a[rows] for a in self))
 
 
-def nearest(x: Tensor, within: Polyhedron) -> Tensor:
+def nearest(x: Tensor, within: Polyhedron, excess: Tensor | float = 0.0) -> Tensor:
     """Return the points of polyhedra that are nearest to x (N, n).
 
     The dual active-set method of Goldfarb & Idnani with the distance as the objective: starting
@@ -157,6 +164,9 @@ def nearest(x: Tensor, within: Polyhedron) -> Tensor:
         Points.
     within : Polyhedron
         Where to; its equations and bounds have a common point.
+    excess : Tensor of shape (N,)
+        Proximal rounds move the values e of the equations by `excess` times their multipliers:
+        what has been added to lambda^2, if the points hold the slack of the equations.
 
     Returns
     -------
@@ -168,13 +178,12 @@ def nearest(x: Tensor, within: Polyhedron) -> Tensor:
     Goldfarb & Idnani, Math. Program. 27 (1983), with their operators H and N*.
     """
     ends = x.clone()
-    live = _Live.on_equations(x, within)
+    live = _Live.on_equations(x, within, torch.zeros_like(x[:, 0]) + excess)
     for _ in range(IK_CHANGES):
         live = live.choosing()
         done = live.chosen < 0
         if done.any():
-            ended = done.nonzero()[:, 0]
-            ends[live.rows[ended]] = live.x[ended]
+            ends[live.rows[done]] = live.take(done).at_bounds()
             live = live.take((~done).nonzero()[:, 0])
         if live.rows.numel() == 0:
             break
@@ -190,10 +199,14 @@ class _Live(NamedTuple):
     ----------
     rows : Tensor of shape (N,)
         Their places among all rows.
-    start, x : Tensor of shape (N, n)
-        The points on the equations, and at present.
+    origin, start, x : Tensor of shape (N, n)
+        The points to be near to, those on the equations alone, and at present.
     within : Polyhedron
-        What they go into, with relaxed rows.
+        What they go into, with relaxed rows and the values of the round.
+    values, excess : Tensor of shape (N, m) and (N,)
+        The values of the equations of the first round, and the factor of their change.
+    rounds : Tensor of shape (N,)
+        Rounds left.
     equations, active : _Active
         The constraints at the start, and at present.
     chosen : Tensor of shape (N,)
@@ -203,17 +216,22 @@ class _Live(NamedTuple):
     """
 
     rows: Tensor
+    origin: Tensor
     start: Tensor
     x: Tensor
     within: Polyhedron
+    values: Tensor
+    excess: Tensor
+    rounds: Tensor
     equations: _Active
     active: _Active
     chosen: Tensor
     force: Tensor
 
     @classmethod
-    def on_equations(cls, x: Tensor, within: Polyhedron) -> _Live:
-        """Return the points that are nearest to x on the equations alone."""
+    def on_equations(cls, origin: Tensor, within: Polyhedron, excess: Tensor) -> _Live:
+        """Return the points that are nearest to the origin on the equations alone."""
+        x = origin
         active = _Active.none(x)
         none = torch.full_like(x[:, 0], -1, dtype=torch.long)
         for normal, value in zip(within.E.unbind(1), within.e.unbind(1), strict=True):
@@ -226,15 +244,68 @@ class _Live(NamedTuple):
             active = active.with_one(adds, way, shares, force, none)
         rows = torch.arange(len(x), device=x.device)
         force = torch.zeros_like(x[:, 0])
-        return cls(rows, x, x, within, active, active, none, force)
+        rounds = torch.where(excess > 0.0, IK_PROXIMAL, 0)
+        return cls(
+            rows,
+            origin,
+            x,
+            x,
+            within,
+            within.e,
+            excess,
+            rounds,
+            active,
+            active,
+            none,
+            force,
+        )
 
     def choosing(self) -> _Live:
-        """Return the same with the inequality violated most chosen where there was none."""
-        excess = self.within.excess(self.x)
-        violated = torch.where(excess > self.within.rounding(self.x), excess, 0.0)
-        most, worst = violated.max(-1)
-        none = (self.chosen < 0) & (most > 0.0)
-        return self._replace(chosen=torch.where(none, worst, self.chosen))
+        """Return the same with the inequality violated most chosen where there was none.
+
+        Where none is violated the next round begins.
+        """
+        live = self
+        for _ in range(1 + IK_PROXIMAL):
+            beyond = live.within.excess(live.x)
+            violated = torch.where(beyond > live.within.rounding(live.x), beyond, 0.0)
+            most, worst = violated.max(-1)
+            none = (live.chosen < 0) & (most > 0.0)
+            live = live._replace(chosen=torch.where(none, worst, live.chosen))
+            ended = (live.chosen < 0) & (live.rounds > 0)
+            if not ended.any():
+                break
+            live = live._next_round(ended)
+        return live
+
+    def _next_round(self, ended: Tensor) -> _Live:
+        """Return the same with new values of the equations in the rows `ended` (N,)."""
+        m = self.values.shape[-1]
+        ended = ended[:, None]
+        multipliers = apply_rows(self.active.inverse, self.x - self.origin)[:, :m]
+        values = self.values + self.excess[:, None] * multipliers
+        values = torch.where(ended, values, self.within.e)
+        change = values - self.within.e
+        x = self.x + (change[..., None] * self.active.inverse[:, :m]).sum(1)
+        active = self.active.pushing(x - self.origin, ended)
+        # What pulls now is no longer active.
+        while True:
+            least, slot = active.force.min(-1)
+            pulls = least < 0.0
+            if not pulls.any():
+                break
+            leaving = one_hot(slot, x.shape[-1]).bool() & pulls[:, None]
+            way = (active.inverse * leaving[..., None]).sum(1)
+            size = way.square().sum(-1)
+            length = torch.where(pulls, least / size, 0.0)
+            x = x - length[:, None] * way
+            active = active.without(leaving).pushing(x - self.origin, pulls[:, None])
+        return self._replace(
+            x=x,
+            active=active,
+            within=self.within._replace(e=values),
+            rounds=self.rounds - ended[:, 0].long(),
+        )
 
     def after_change(self) -> _Live:
         """Return the same after one constraint more or less, or with a row that is relaxed."""
@@ -291,7 +362,10 @@ class _Live(NamedTuple):
         active = self.active.where(~stuck, self.equations)
         return self._replace(
             x=torch.where(anew, self.start, self.x),
-            within=self.within._replace(b=b),
+            within=self.within._replace(
+                b=b, e=torch.where(anew, self.values, self.within.e)
+            ),
+            rounds=torch.where(stuck & (self.excess > 0.0), IK_PROXIMAL, self.rounds),
             active=active,
             chosen=torch.where(stuck, -1, self.chosen),
             force=torch.where(stuck, 0.0, self.force),
@@ -304,6 +378,14 @@ class _Live(NamedTuple):
         off = torch.where(which >= 0, inequality, 0.0)
         # Row c of `inverse` moves along the inward normal c alone.
         return self.x - (off[..., None] * self.active.inverse).sum(1)
+
+    def at_bounds(self) -> Tensor:
+        """Return x with the coordinates of active bounds exactly there."""
+        n = self.x.shape[-1]
+        active = one_hot(self.active.which + 1, 1 + 2 * n + self.within.b.shape[-1]).any(1)
+        _, lower, upper = active[:, : 1 + 2 * n].split([1, n, n], dim=-1)
+        x = torch.where(lower, self.within.lower, self.x)
+        return torch.where(upper, self.within.upper, x)
 
     def take(self, rows: Tensor) -> _Live:
         """Return some rows."""

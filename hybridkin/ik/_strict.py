@@ -101,29 +101,37 @@ def strict_step(
         Steps within the limits.
     """
     size = torch.linalg.matrix_norm(J @ J.mT).sqrt()  # about sigma_max
-    relative = max(1e-6, math.sqrt(torch.finfo(J.dtype).eps))
+    relative = max(1e-3, torch.finfo(J.dtype).eps ** 0.25)
     # If J is zero it only has to be positive.
     least = torch.where(size > 0.0, relative * size, 1.0)
-    used = torch.maximum(damping, least)
     rows = ((damping > 0.0) & (z != 0.0).any(-1)).nonzero()[:, 0]
     if rows.numel() > 0:
         still = torch.zeros_like(z[rows])
-        task = damped_step(J[rows], v[rows], still, used[rows], limits.take(rows))
+        task = damped_step(
+            J[rows], v[rows], still, damping[rows], limits.take(rows), least[rows]
+        )
         v = v.index_put((rows,), apply_rows(J[rows], task))
         z = z.index_put((rows,), calmed(z[rows], task, calm[rows]))
-        used = used.index_put((rows,), least[rows])
-    return damped_step(J, v, z, used, limits)
+        damping = damping.index_fill(0, rows, 0.0)
+    return damped_step(J, v, z, damping, limits, least)
 
 
 def damped_step(
-    J: Tensor, v: Tensor, z: Tensor, damping: Tensor, limits: StepLimits
+    J: Tensor,
+    v: Tensor,
+    z: Tensor,
+    damping: Tensor,
+    limits: StepLimits,
+    least: Tensor,
 ) -> Tensor:
     """Return the steps with the least |dq - z|^2 + |J dq - v|^2 / lambda^2 within the limits.
 
-    With s = (v - J dq) / lambda it is the point (dq, s) nearest to (z, 0) with J dq + lambda s = v.
+    lambda is at `least` (N,), and proximal rounds take the effect out. With s = (v - J dq) / lambda it is the point (dq, s) nearest to (z, 0) with J dq + lambda s = v.
     """
     N, m, n = J.shape
-    slack = torch.eye(m, dtype=J.dtype, device=J.device) * damping[:, None, None]
+    used = torch.maximum(damping, least)
+    excess = used.square() - damping.square()
+    slack = torch.eye(m, dtype=J.dtype, device=J.device) * used[:, None, None]
     none = torch.full_like(v, math.inf)
     length = limits.A.norm(dim=-1)
     length = torch.where(length > 0.0, length, 1.0)
@@ -138,4 +146,5 @@ def damped_step(
         rows,
         limits.b / length,
     )
-    return nearest(torch.cat([z, torch.zeros_like(v)], dim=-1), within)[:, :n]
+    start = torch.cat([z, torch.zeros_like(v)], dim=-1)
+    return nearest(start, within, excess)[:, :n]
