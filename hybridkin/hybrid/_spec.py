@@ -259,7 +259,7 @@ class Spec:
         groups = rows.groups
         if spec.error_model.chooses:  # it computes errors of held-out rows itself
             groups = Groups.rows(len(rows))
-        result, messages = fit_geometry(
+        result = fit_geometry(
             cast(Chain, spec.mechanical),
             rows.q,
             spec.positions(rows),
@@ -273,7 +273,7 @@ class Spec:
             mechanical=result.chain,
             calibrate=(),
             calibration=result,
-            messages=(*spec.messages, *messages),
+            messages=(*spec.messages, *result.messages),
         )
 
     def recalibrated(self, rows: Rows) -> Spec:
