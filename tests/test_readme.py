@@ -233,13 +233,28 @@ def test_links_lead_to_files_that_are_there():
 # What takes long in an example, and less of it; `make docs` runs each example as it stands.
 SMALLER = {
     "plot_learning_curve": [("ShuffleSplit(3", "ShuffleSplit(1"), ("60, 120, 250]", "40, 50, 60]")],
-    "plot_model_selection": [("[25, 100]", "[5, 100]"), ("10.0, 4)", "10.0, 2)"), (":300]", ":120]")],
+    "plot_model_selection": [
+        ("[25, 100]", "[5, 100]"),
+        ("10.0, 4)", "10.0, 2)"),
+        (":300]", ":120]"),
+    ],
     "plot_motions": [("[::2]", "[::8]")],
     "plot_new_day": [("range(10)", "range(1)"), ("1600", "400"), ("1680", "480")],
-    "plot_next_rows": [("range(5)", "range(1)"), ("(25, 50, 100)", "(25, 30, 40)"), ("100)", "40)")],
+    "plot_next_rows": [
+        ("range(5)", "range(1)"),
+        ("(25, 50, 100)", "(25, 30, 40)"),
+        ("100)", "40)"),
+    ],
     "plot_notebook": [("data.q[::4], data.x[::4]", "data.q[::20], data.x[::20]"), ("0.05", "0.2")],
-    "plot_payload": [("dt=0.1)", "dt=0.1, duration=2.5)"), ("data.q, data.x", "data.q[::4], data.x[::4]")],
-    "plot_rigid_arm": [("cv=10", "cv=3"), ("turns=1.0, dt=0.1", "turns=1.0, dt=0.5"), ("::12", "::3")],
+    "plot_payload": [
+        ("dt=0.1)", "dt=0.1, duration=2.5)"),
+        ("data.q, data.x", "data.q[::4], data.x[::4]"),
+    ],
+    "plot_rigid_arm": [
+        ("cv=10", "cv=3"),
+        ("turns=1.0, dt=0.1", "turns=1.0, dt=0.5"),
+        ("::12", "::3"),
+    ],
     "plot_slack_tendons": [("thin=2", "thin=8")],
     "plot_table1": [("n_splits=4", "n_splits=2")],
     "plot_tracking": [("0.125", "0.5")],
