@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from hybridkin._core.commands import Commands
     from hybridkin._core.model import ForwardModel, as_forward_model, jacobian
     from hybridkin.calibration.calibrate import CalibrationResult, calibrate
+    from hybridkin.calibration.choice import GeometryChoice, choose_geometry
     from hybridkin.chains import robots
     from hybridkin.chains.chain import Chain
     from hybridkin.chains.constant_curvature import ConstantCurvatureChain
@@ -44,6 +45,7 @@ __all__ = [
     "ElasticTendonChain",
     "ForceTendonChain",
     "ForwardModel",
+    "GeometryChoice",
     "HybridForwardModel",
     "Hysteresis",
     "IKSolution",
@@ -58,6 +60,7 @@ __all__ = [
     "__version__",
     "as_forward_model",
     "calibrate",
+    "choose_geometry",
     "choose_rows",
     "cross_fit",
     "datasets",
@@ -76,6 +79,7 @@ _NAMES_OF = {
     "_core.commands": ("Commands",),
     "_core.model": ("ForwardModel", "as_forward_model", "jacobian"),
     "calibration.calibrate": ("CalibrationResult", "calibrate"),
+    "calibration.choice": ("GeometryChoice", "choose_geometry"),
     "chains.chain": ("Chain",),
     "chains.constant_curvature": ("ConstantCurvatureChain",),
     "chains.elastic_tendons": ("ElasticTendonChain",),

@@ -92,14 +92,6 @@ def test_modules_with_an_underscore_are_their_folders_own(path):
 
 API = (ROOT.parent / "docs/api.rst").read_text(encoding="utf-8")
 DOCUMENTED = {*re.findall(r"^   (\w[\w.]*)$", API, flags=re.MULTILINE)}
-# What the application still takes from inside the library.
-NOT_YET = {
-    "hybridkin.calibration.calibrate": {"fit_geometry"},
-    "hybridkin.calibration.choice": {"GeometryChoice", "choose_geometry"},
-    "hybridkin.hysteresis.reversals": {"Coarseness"},
-    "hybridkin.learning.elm_cv": {"growing_network"},
-    "hybridkin.learning.regressor_modules": {"error_module"},
-}
 
 
 def is_public(module, name):
@@ -122,7 +114,6 @@ def test_the_application_imports_public_names_only(path):
         if module.split(".")[0] != "hybridkin" or module.startswith("hybridkin.app"):
             continue
         inside = {name for name in names if not is_public(module, name)}
-        inside -= NOT_YET.get(module, set())
         assert not inside - {"app"}, f"{module}: {inside}"
 
 

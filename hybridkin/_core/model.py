@@ -20,6 +20,7 @@ from hybridkin._core.blocks import check_tensor, check_vectors, in_blocks
 from hybridkin._core.frames import Frames, Marker
 from hybridkin._core.html import html_table
 from hybridkin._core.plan import NoKernel, Plan
+from hybridkin._core.planes import PlaneOfQ
 from hybridkin._core.plausible import PlausibleRows
 from hybridkin._core.portable import PortableModule
 from hybridkin._core.stored import Layout, Stored
@@ -324,9 +325,9 @@ class ForwardModel(PortableModule):
         return torch.ones_like(q[..., 0], dtype=torch.bool)
 
     @property
-    def plane(self) -> tuple[Tensor, Tensor] | None:
-        """A point (n,) and orthonormal normals (n, k) of the plane of q to keep to, if any."""
-        return None
+    def plane(self) -> PlaneOfQ:
+        """The plane of q to keep to: the whole space if nothing is known of one."""
+        return PlaneOfQ.whole()
 
     def frozen(self) -> Self:
         """Return a copy without derivatives by its state, which does not change with this model."""
@@ -459,7 +460,7 @@ class Wrapped(PoseModel):
         return self if tip is self.model else self.around(tip)
 
     @property
-    def plane(self) -> tuple[Tensor, Tensor] | None:
+    def plane(self) -> PlaneOfQ:
         """The plane of the log."""
         return self.model.plane
 
@@ -537,10 +538,9 @@ class Shifted(Wrapped):
         self.n_actuators = len(shift)
 
     @property
-    def plane(self) -> tuple[Tensor, Tensor] | None:
+    def plane(self) -> PlaneOfQ:
         """The plane of the log, where it lies after the shift."""
-        plane = self.model.plane
-        return None if plane is None else (plane[0] - self.shift, plane[1])
+        return self.model.plane.shifted(self.shift)
 
     def around(self, model: ForwardModel) -> ForwardModel:
         """Return another model after the same shift."""

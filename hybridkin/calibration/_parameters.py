@@ -53,12 +53,12 @@ class Parameter(ABC):
         return len(self.labels)
 
     @abstractmethod
-    def moved(self, theta: Tensor) -> Tensor:
+    def entry_at(self, theta: Tensor) -> Tensor:
         """Return the entry at a point of the free directions (size,)."""
 
     @abstractmethod
     def tangents(self, theta: Tensor) -> Tensor:
-        """Return the derivatives of `moved`, shape (size, ...)."""
+        """Return the derivatives of `entry_at`, shape (size, ...)."""
 
     @abstractmethod
     def bounds(self) -> tuple[NDArray, NDArray]:
@@ -86,7 +86,7 @@ class Shifts(Parameter):
     low: float
     high: float
 
-    def moved(self, theta: Tensor) -> Tensor:
+    def entry_at(self, theta: Tensor) -> Tensor:
         return self.start + self._change(theta)
 
     def tangents(self, theta: Tensor) -> Tensor:
@@ -112,11 +112,11 @@ class Factors(Shifts):
     The limits are those of the factor.
     """
 
-    def moved(self, theta: Tensor) -> Tensor:
+    def entry_at(self, theta: Tensor) -> Tensor:
         return self.start * torch.exp(self._change(theta))
 
     def tangents(self, theta: Tensor) -> Tensor:
-        return super().tangents(theta) * self.moved(theta)
+        return super().tangents(theta) * self.entry_at(theta)
 
     def bounds(self) -> tuple[NDArray, NDArray]:
         low = np.full(self.size, np.log(self.low))
@@ -130,7 +130,7 @@ class Factors(Shifts):
 class Pose(Parameter):
     """A pose that changes by a rotation vector and a translation, both in the measuring frame."""
 
-    def moved(self, theta: Tensor) -> Tensor:
+    def entry_at(self, theta: Tensor) -> Tensor:
         turned = rotation(theta[:3])[0] @ self.start[:3, :3]
         position = self.start[:3, 3] + theta[3:] * torch.from_numpy(self.units[3:]).to(
             theta
@@ -257,7 +257,7 @@ class Problem:
             at = torch.from_numpy(theta).to(self.chain.geometry()["base"])
             geometry = {}
             for part, place in self.places():
-                geometry[part.entry] = part.moved(at[place])
+                geometry[part.entry] = part.entry_at(at[place])
             return self.chain.with_geometry(**geometry)
 
     def tangents(self, theta: Tensor) -> dict[str, Tensor]:

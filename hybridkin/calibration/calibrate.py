@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -86,6 +86,8 @@ class CalibrationResult(Portable):
         The same on held-out groups (at most 5 folds), if `groups` was given [m].
     converged : bool
         Whether the solver met its tolerance.
+    messages : tuple of str
+        The warnings that `calibrate` issued.
     """
 
     chain: Chain
@@ -101,6 +103,7 @@ class CalibrationResult(Portable):
     rmse: float
     cv_rmse: float | None
     converged: bool
+    messages: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         lines = [
@@ -213,10 +216,8 @@ def calibrate(
     >>> result.values["radii"]
     tensor([0.0500, 0.0400], dtype=torch.float64)
     """
-    result, messages = fit_geometry(
-        chain, q, x, parameters, loss, prior, groups, sample_weight
-    )
-    for message in messages:
+    result = fit_geometry(chain, q, x, parameters, loss, prior, groups, sample_weight)
+    for message in result.messages:
         warnings.warn(message, stacklevel=2)
     return result
 
@@ -231,8 +232,8 @@ def fit_geometry(
     groups: ArrayLike | None = None,
     sample_weight: Numbers | None = None,
     start: Start | None = None,
-) -> tuple[CalibrationResult, list[str]]:
-    """Return the result of `calibrate` and its warnings as a list; no warning is issued.
+) -> CalibrationResult:
+    """Return the result of `calibrate`; no warning is issued.
 
     A `start` from `search` for the same chain and parameters replaces the search.
     """
@@ -278,7 +279,8 @@ def fit_geometry(
         cv_rmse = _cross_validate(best, rows, groups[first], loss)
     result = _result(best, rows, cv_rmse, unphysical, returns_tensors)
     result.chain.to(device)
-    return result, [message for message in messages if message is not None]
+    issued = tuple(message for message in messages if message is not None)
+    return replace(result, messages=issued)
 
 
 def refitted(start: Start, q: Tensor, x: Tensor, weights: Tensor) -> Chain:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -17,9 +17,15 @@ from hybridkin._core.distinct import distinct_rows, targets_that_count
 from hybridkin._core.model import ForwardModel
 from hybridkin.calibration._least_squares import COMPARED, LOSSES, ROUGH, Rows, solve
 from hybridkin.calibration._search import Start, search, widened
-from hybridkin.calibration.calibrate import check_data
+from hybridkin.calibration.calibrate import (
+    CalibrationResult,
+    check_data,
+    fit_geometry,
+)
 from hybridkin.calibration.measured import evenly_spaced, folds, inner_and_outer
 from hybridkin.chains.chain import Chain
+
+__all__ = ["GeometryChoice", "choose_geometry"]
 
 Starts = tuple[Start | None, ...]
 """Starts of the fits of all sets of parameters; None without parameters."""
@@ -74,7 +80,7 @@ class GeometryChoice:
     parameters : tuple of str
         The parameters to calibrate; may be empty.
     start : Start or None
-        Start of their fit, for `fit_geometry`; None without parameters.
+        Start of their fit; None without parameters, or to search it.
     name : str
         Name of the set in `errors`.
     errors : dict of str to Errors
@@ -91,9 +97,9 @@ class GeometryChoice:
 
     chain: Chain
     parameters: tuple[str, ...]
-    start: Start | None
-    name: str
-    errors: dict[str, Errors]
+    start: Start | None = None
+    name: str = ""
+    errors: Mapping[str, Errors] = field(default_factory=dict)
     messages: tuple[str, ...] = ()
     rivals: tuple[GeometryChoice, ...] = ()
     starts: tuple[Start | None, ...] = ()
@@ -102,6 +108,23 @@ class GeometryChoice:
     def __iter__(self) -> Iterator[str]:
         """Return an iterator over the parameters to calibrate."""
         return iter(self.parameters)
+
+    def calibrate(
+        self, q: Numbers, x: Numbers, *, loss: str = "linear"
+    ) -> CalibrationResult:
+        """Return the calibration of the chosen parameters, which must not be empty.
+
+        Parameters
+        ----------
+        q, x, loss
+            As for `hybridkin.calibrate`, whose search of initial guesses is not repeated.
+
+        Returns
+        -------
+        CalibrationResult
+            Its warnings are not issued: they are its `messages`.
+        """
+        return fit_geometry(self.chain, q, x, self.parameters, loss, start=self.start)
 
     def smaller(self, name: str) -> GeometryChoice:
         """Return the usual set of this name in place of the chosen one, if there is one."""
@@ -185,7 +208,25 @@ def choose_geometry(
     Returns
     -------
     GeometryChoice
-        The parameters to calibrate, and the errors of all sets.
+        The parameters to calibrate, and the errors of all sets. A `HybridForwardModel` takes it as
+        `calibrate`, so that several models share one choice.
+
+    Raises
+    ------
+    ValueError
+        As for `calibrate`.
+
+    Examples
+    --------
+    >>> import torch
+    >>> from hybridkin import ConstantCurvatureChain, choose_geometry
+    >>> q = 0.25 + 0.05 * torch.rand(60, 3, generator=torch.manual_seed(0), dtype=torch.float64)
+    >>> truth = ConstantCurvatureChain([0.05])
+    >>> choice = choose_geometry(ConstantCurvatureChain([0.06]), q, truth(q))
+    >>> choice.parameters
+    ('radii', 'base')
+    >>> choice.calibrate(q, truth(q)).values["radii"]
+    tensor([0.0500], dtype=torch.float64)
     """
     one_of(loss, "loss", LOSSES)
     nominal = chain

@@ -69,7 +69,7 @@ def without_fixed(path: Sequence[Joint]) -> tuple[list[Joint], NDArray]:
     return moving, pending
 
 
-def moved(origin: NDArray, kind: str, axis: NDArray, offset: float) -> NDArray:
+def offset_origin(origin: NDArray, kind: str, axis: NDArray, offset: float) -> NDArray:
     """Return the pose (4, 4) of a joint that stands at `offset` where its actuator is at zero."""
     step = offset * axis / (np.linalg.norm(axis) or 1.0)
     motion = np.eye(4)

@@ -16,7 +16,7 @@ from hybridkin.chains._arm_files import (
     Joint,
     JointLimits,
     check_link,
-    moved,
+    offset_origin,
     source_of,
 )
 
@@ -90,7 +90,7 @@ def mjcf_path(
         origin = np.linalg.solve(before, placed)
         axis = placed[:3, :3].T @ data.xaxis[j]
         coupling = couplings.of(j)
-        origin = moved(origin, kind, axis, coupling.offset)
+        origin = offset_origin(origin, kind, axis, coupling.offset)
         driver = coupling.driver
         if driver == _NONE:
             path.append(Joint(origin))

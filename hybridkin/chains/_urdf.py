@@ -17,7 +17,7 @@ from hybridkin.chains._arm_files import (
     Joint,
     JointLimits,
     check_link,
-    moved,
+    offset_origin,
     source_of,
 )
 
@@ -57,9 +57,8 @@ class Urdf:
         self._by_name = _distinct(
             "joint", (joint.get("name", "") for joint in joints), joints
         )
-        by_child = _distinct(
-            "<child>", (_link(joint, "child") for joint in joints), joints
-        )
+        children = [_attribute(joint, "child", "link") for joint in joints]
+        by_child = _distinct("<child>", children, joints)
         self.path: list[tuple[etree._Element, list[Joint]]] = []
         link = end_link
         while link != root_link and link in by_child:
@@ -69,7 +68,7 @@ class Urdf:
                 )
             joint = by_child[link]
             self.path.append((joint, self._joints(joint)))
-            link = _link(joint, "parent")
+            link = _attribute(joint, "parent", "link")
         if root_link not in (None, link):
             raise ValueError(
                 f"`root_link` must lead to {end_link!r}, but {root_link!r} does not."
@@ -109,11 +108,13 @@ class Urdf:
         origin = _origin(element)
         name = element.get("name", "")
         kind = element.get("type", "")
-        if kind in _FREE and element.find("mimic") is None:
+        mimics = _has(element, "mimic")
+        if kind in _FREE and not mimics:
             return [Joint(origin), *_free_joints(name, kind)]
         actuator, factor, offset = self._mimicked(element)
-        driver = self._by_name.get(actuator)
-        driver_kind = kind if driver is None else driver.get("type", "")
+        unknown = etree.Element("joint", name=actuator, type=kind)
+        driver = self._by_name.get(actuator, unknown)
+        driver_kind = driver.get("type", "")
         if not {kind, driver_kind} <= {*_KINDS}:
             raise ValueError(
                 f"`type` of joint {name!r} and of the joint that it mimics must be one of "
@@ -122,34 +123,33 @@ class Urdf:
         if kind == "fixed":
             return [Joint(origin)]
         axis = np.array(_numbers(element, "axis", "xyz", "1 0 0"))
-        origin = moved(origin, kind, axis, offset)
+        origin = offset_origin(origin, kind, axis, offset)
         if driver_kind == "fixed":
             return [Joint(origin)]
-        limits = _limits(actuator, driver)
+        limits = _limits(driver)
         kind = "prismatic" if kind == "prismatic" else "revolute"
         return [Joint(origin, kind, axis, actuator, actuator, limits, factor)]
 
-    def _mimicked(self, element: etree._Element | None) -> tuple[str, float, float]:
+    def _mimicked(self, element: etree._Element) -> tuple[str, float, float]:
         """Return the joint that a joint follows, at last itself, and its factor and offset.
 
         The joint is at ``factor * q + offset``, where q is the position of the joint followed.
         """
-        assert element is not None
         name = element.get("name", "")
         followed = [name]
         factor = 1.0
         offset = 0.0
-        while element is not None and element.find("mimic") is not None:
+        while _has(element, "mimic"):
             offset += factor * _numbers(element, "mimic", "offset", "0")[0]
             factor *= _numbers(element, "mimic", "multiplier", "1")[0]
-            name = element.find("mimic").get("joint", "")
+            name = _attribute(element, "mimic", "joint")
             if name in followed or len(followed) > _MOST:
                 raise ValueError(
                     f"joints must not mimic each other in a circle, nor more than {_MOST} in a "
                     f"row, got {followed[:9]}."
                 )
             followed.append(name)
-            element = self._by_name.get(name)
+            element = self._by_name.get(name, etree.Element("joint"))
         return name, factor, offset
 
 
@@ -184,16 +184,21 @@ def _distinct(
     return by_name
 
 
-def _link(joint: etree._Element, end: str) -> str:
-    """Return the link at an end of a joint, "parent" or "child"."""
-    tag = joint.find(end)
-    return "" if tag is None else tag.get("link", "")
+def _has(element: etree._Element, tag: str) -> bool:
+    """Return whether an element has a part with this tag."""
+    return bool(element.findall(tag))
+
+
+def _attribute(joint: etree._Element, tag: str, key: str, default: str = "") -> str:
+    """Return an attribute of the part of a joint with this tag, if it has both."""
+    for part in joint.findall(tag)[:1]:
+        return part.get(key, default)
+    return default
 
 
 def _numbers(joint: etree._Element, tag: str, key: str, default: str) -> list[float]:
     """Return the numbers of an attribute, as many as the default has."""
-    element = joint.find(tag)
-    text = default if element is None else element.get(key, default)
+    text = _attribute(joint, tag, key, default)
     n = len(default.split())
     try:
         numbers = [float(word) for word in text.split()]
@@ -207,20 +212,19 @@ def _numbers(joint: etree._Element, tag: str, key: str, default: str) -> list[fl
     return numbers
 
 
-def _limits(name: str, joint: etree._Element | None) -> JointLimits:
+def _limits(joint: etree._Element) -> JointLimits:
     """Return the limits of a joint; a speed or an acceleration of 0 means no limit."""
-    limits = JointLimits()
-    if joint is not None:
-        speed = _numbers(joint, "limit", "velocity", "0")[0]
-        # URDF 1.2; a joint that brakes less than it accelerates must keep to the smaller one.
-        acceleration = _numbers(joint, "limit", "acceleration", "0")[0] or math.inf
-        deceleration = _numbers(joint, "limit", "deceleration", "0")[0] or math.inf
-        limits = JointLimits(
-            speed=speed or math.inf, acceleration=min(acceleration, deceleration)
-        )
-        if joint.get("type") == "continuous":
-            return limits
-    if joint is None or joint.find("limit") is None:
+    name = joint.get("name")
+    speed = _numbers(joint, "limit", "velocity", "0")[0]
+    # URDF 1.2; a joint that brakes less than it accelerates must keep to the smaller one.
+    acceleration = _numbers(joint, "limit", "acceleration", "0")[0] or math.inf
+    deceleration = _numbers(joint, "limit", "deceleration", "0")[0] or math.inf
+    limits = JointLimits(
+        speed=speed or math.inf, acceleration=min(acceleration, deceleration)
+    )
+    if joint.get("type") == "continuous":
+        return limits
+    if not _has(joint, "limit"):
         _warn(
             f"joint {name!r} has no <limit>, which URDF requires; it is unlimited. Add <limit>, or "
             'set type="continuous" if it turns without limits.'
@@ -257,13 +261,13 @@ def _origin(joint: etree._Element) -> NDArray:
     position = _numbers(joint, "origin", "xyz", "0 0 0")
     quaternion = _numbers(joint, "origin", "quat_xyzw", "0 0 0 1")
     angles = _numbers(joint, "origin", "rpy", "0 0 0")
-    element = joint.find("origin")
-    if element is None or element.get("quat_xyzw") is None:
+    if not _attribute(joint, "origin", "quat_xyzw"):
         return _matrix(Rotation.from_euler("xyz", angles), position)
-    if element.get("rpy") is not None or not np.any(quaternion):
+    if _attribute(joint, "origin", "rpy") or not np.any(quaternion):
         raise ValueError(
             f"<origin> of joint {joint.get('name')!r} must have either `rpy` or `quat_xyzw`, a "
-            f"quaternion that is not zero, got {dict(element.attrib)}; correct the URDF."
+            f"quaternion that is not zero, got {dict(joint.find('origin').attrib)}; correct the "
+            "URDF."
         )
     return _matrix(Rotation.from_quat(quaternion), position)
 
@@ -283,9 +287,9 @@ def _write_origin(joint: etree._Element, placed: NDArray) -> None:
     level = Rotation.from_euler("z", -yaw).as_matrix() @ R
     pitch = math.atan2(-level[2, 0], level[0, 0])
     roll = math.atan2(-level[1, 2], level[1, 1])
+    if not _has(joint, "origin"):
+        etree.SubElement(joint, "origin")
     element = joint.find("origin")
-    if element is None:
-        element = etree.SubElement(joint, "origin")
     element.attrib.pop("quat_xyzw", None)
     element.set("xyz", _text(placed[:3, 3]))
     element.set("rpy", _text([roll, pitch, yaw]))

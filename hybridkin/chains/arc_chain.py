@@ -155,7 +155,7 @@ class ArcChain(MarkedChain):
     def absolute(self) -> Tensor:
         """Which actuators (n,) have absolute lengths: those of extensible segments, bool."""
         absolute = np.repeat(self.extensible, self.actuators_per_segment)
-        absolute[: self.stage is not None] = False
+        absolute[: self.n_stages] = False
         return torch.from_numpy(absolute).to(self.radii.device)
 
     @property
@@ -211,7 +211,7 @@ class ArcChain(MarkedChain):
 
         The backbone of an inextensible segment keeps its length.
         """
-        if self.stage is not None:
+        if self.n_stages:
             return np.zeros((self.n_actuators, 0))
         readings = as_array(self._readings().detach())
         fixed = np.append(~np.array(self.extensible), np.zeros(2 * self.n_segments))
@@ -316,7 +316,7 @@ class ArcChain(MarkedChain):
         linear, angular = columns.chunk(2, dim=1)
         both = torch.cat([self.by_arcs(linear), self.by_arcs(angular)], dim=2)
         J = self._along(both, slope)
-        if self.stage is not None:  # the stage turns the tip's frame too
+        if self.n_stages:  # the stage turns the tip's frame too
             spin = self.gains[0] * self.base[:3, 2]
             J[:, 3:, 0] = spin.to(q)
         return J.reshape(*q.shape[:-1], 6, self.n_actuators)
@@ -510,7 +510,7 @@ class ArcChain(MarkedChain):
         """
         length, bending = self.arcs(q)
         poses = self._poses(length, bending, self.arc_offsets, q)
-        if self.stage is not None:  # in the frames that turn with the stage
+        if self.n_stages:  # in the frames that turn with the stage
             turned = poses[..., 0, :3, :3].mT @ poses[..., 1, :3, :3]
             bending = bending @ turned[..., :2, :2]
         # A part of an arc is an arc of that part of its length and of its bending.
@@ -677,7 +677,7 @@ class ArcChain(MarkedChain):
         base = self.base.to(length).expand(*length.shape[:-1], 4, 4)
         frames = itertools.accumulate(steps.unbind(-3), torch.matmul, initial=base)
         poses = torch.stack([*frames], dim=-3)
-        if self.stage is None:
+        if not self.n_stages:
             return poses
         angle = self.gains[:1].to(q) * (q[..., :1] - self.rest[:1].to(q))
         return rolled(poses, angle)

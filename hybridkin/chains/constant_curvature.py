@@ -250,7 +250,7 @@ class ConstantCurvatureChain(LengthDrivenChain):
 
         Tendons in balance bend both alike; a single tendon does not. Empty for chambers.
         """
-        if self.lengths is None or self.stage is not None or any(self.extensible):
+        if self.lengths is None or self.n_stages or any(self.extensible):
             return []
         angles = self.angles.detach().split(self.actuators_per_segment)
         zeros = (self.gains * self.rest).detach()
@@ -463,7 +463,7 @@ class ConstantCurvatureChain(LengthDrivenChain):
             "extensible" if stretches else "inextensible"
             for stretches in self.extensible
         ]
-        if self.stage is not None:
+        if self.n_stages:
             kinds[0] = f"{self.stage} stage"
         return f"{' and '.join(dict.fromkeys(kinds))}, {super().extra_repr()}"
 
@@ -517,7 +517,7 @@ class ConstantCurvatureChain(LengthDrivenChain):
         matrix, offset = self._arc_map()
         matrix = matrix.to(rows)
         arcs = torch.addmm(offset.to(rows)[:, None], matrix, rows.T)
-        if self.stage is None:
+        if not self.n_stages:
             return arcs, matrix
         return turned_by_first(arcs, matrix[..., None])
 
@@ -530,7 +530,7 @@ class ConstantCurvatureChain(LengthDrivenChain):
         by_rows = torch.tensordot(rows, by_matrix, ([1], [2]))  # pyright: ignore[reportArgumentType]
         slope = by_rows + by_rest  # (N, P, 3 S)
         slope = slope.permute(2, 1, 0)
-        if self.stage is not None:
+        if self.n_stages:
             arcs, slope = turned_by_first(arcs, slope)
         return arcs, lambda by_arcs: by_arcs @ slope.permute(2, 0, 1)
 

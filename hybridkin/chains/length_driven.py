@@ -50,7 +50,9 @@ class LengthDrivenChain(ArcChain):
         """Unit of q, or of each actuator; with gains any, for example counts."""
         if not self.in_metres:
             return "as in training"
-        return "m" if self.stage is None else ["rad"] + ["m"] * (self.n_actuators - 1)
+        if not self.n_stages:
+            return "m"
+        return ["rad"] * self.n_stages + ["m"] * (self.n_actuators - self.n_stages)
 
     @property
     def _tendons(self) -> NDArray[np.bool_]:
@@ -111,7 +113,7 @@ class LengthDrivenChain(ArcChain):
 
         (metres,) = in_blocks(size, q)
         beyond = metres > factor * self._largest_metres.to(q)
-        beyond[..., : self.stage is not None] = False  # an angle
+        beyond[..., : self.n_stages] = False  # an angle
         length = self.reach.detach() / self.n_segments
         usual = torch.where(self.absolute, length, self.radii.detach().max())
         usual = usual.to(q).expand_as(metres)[beyond]
@@ -128,5 +130,5 @@ class LengthDrivenChain(ArcChain):
     def plausible_rows(self) -> PlausibleRows:
         """Return bounds of rows that need no warning about their units."""
         weights = torch.diag(self.gains.detach() / self._largest_metres)
-        first = int(self.stage is not None)  # the angle of a stage has no bound
-        return PlausibleRows(as_array(self.rest), as_array(weights[first:]))
+        bounded = weights[self.n_stages :]  # the angle of a stage has no bound
+        return PlausibleRows(as_array(self.rest), as_array(bounded))

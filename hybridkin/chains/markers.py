@@ -35,6 +35,11 @@ class MarkedChain(Chain):
     stage: str | None = None  # "rotation" if the first segment is a rotation stage
 
     @property
+    def n_stages(self) -> int:
+        """Number of leading actuators that turn the whole robot, 1 on a rotation stage, else 0."""
+        return int(self.stage == "rotation")
+
+    @property
     def tip_at(self) -> float:
         """The place of the tip, the last marker, in segments from the base."""
         return self.markers[-1][0]
@@ -116,7 +121,7 @@ class MarkedChain(Chain):
             places.append((float(segment + fraction), x, y, z))
         if not places:
             raise ValueError(f"{need}, got none.")
-        if self.stage is not None and any(x or y for _, x, y, _ in places):
+        if self.n_stages and any(x or y for _, x, y, _ in places):
             raise ValueError(
                 "`markers` must lie on the backbone of a robot on a rotation stage."
             )

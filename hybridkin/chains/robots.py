@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -145,57 +146,50 @@ class LogFormat:
 
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """Limits of the actuators.
+    """Limits of the actuators, infinite where there are none.
 
     Attributes
     ----------
-    q_min, q_max : ndarray of shape (n,) or None
+    q_min, q_max : float or ndarray of shape (n,)
         Smallest and largest value of every actuator, with the chain's sign [unit of q].
-    dq_max, ddq_max : ndarray of shape (n,) or None
+    dq_max, ddq_max : float or ndarray of shape (n,)
         Largest speed [unit of q per s] and acceleration [unit of q per s^2].
     """
 
-    q_min: np.ndarray | None = None
-    q_max: np.ndarray | None = None
-    dq_max: np.ndarray | None = None
-    ddq_max: np.ndarray | None = None
+    q_min: NDArray | float = -math.inf
+    q_max: NDArray | float = math.inf
+    dq_max: NDArray | float = math.inf
+    ddq_max: NDArray | float = math.inf
+
+    @property
+    def are_finite(self) -> bool:
+        """Whether every actuator has a finite range."""
+        return bool(np.isfinite(self.q_min).all() and np.isfinite(self.q_max).all())
 
     def intersect(self, other: Limits) -> Limits:
-        """Return the intersection of two limits; an entry that is None sets no limit."""
+        """Return the intersection of two limits."""
         return Limits(
-            _tighter(self.q_min, other.q_min, np.maximum),
-            _tighter(self.q_max, other.q_max, np.minimum),
-            _tighter(self.dq_max, other.dq_max, np.minimum),
-            _tighter(self.ddq_max, other.ddq_max, np.minimum),
+            np.maximum(self.q_min, other.q_min),
+            np.minimum(self.q_max, other.q_max),
+            np.minimum(self.dq_max, other.dq_max),
+            np.minimum(self.ddq_max, other.ddq_max),
         )
 
     def scaled(self, factor: float | np.ndarray) -> Limits:
         """Return the limits in other units; a negative `factor` swaps low and high."""
-        low = np.multiply(factor, -np.inf if self.q_min is None else self.q_min)
-        high = np.multiply(factor, np.inf if self.q_max is None else self.q_max)
-        q_min = np.minimum(low, high)
-        q_max = np.maximum(low, high)
+        low = np.multiply(factor, self.q_min)
+        high = np.multiply(factor, self.q_max)
         size = np.abs(factor)
         return Limits(
-            None if np.isinf(q_min).all() else q_min,
-            None if np.isinf(q_max).all() else q_max,
-            None if self.dq_max is None else np.multiply(size, self.dq_max),
-            None if self.ddq_max is None else np.multiply(size, self.ddq_max),
+            np.minimum(low, high),
+            np.maximum(low, high),
+            np.multiply(size, self.dq_max),
+            np.multiply(size, self.ddq_max),
         )
 
     def narrowed(self, by: float | np.ndarray) -> Limits:
         """Return the limits with the range of every actuator reduced by `by` at both ends [m]."""
-        q_min = None if self.q_min is None else self.q_min + by
-        q_max = None if self.q_max is None else self.q_max - by
-        return replace(self, q_min=q_min, q_max=q_max)
-
-
-def _tighter(
-    ours: NDArray | None, theirs: NDArray | None, choose: np.ufunc
-) -> NDArray | None:
-    if ours is None or theirs is None:
-        return theirs if ours is None else ours
-    return choose(ours, theirs)
+        return replace(self, q_min=self.q_min + by, q_max=self.q_max - by)
 
 
 @dataclass(frozen=True)
@@ -231,6 +225,11 @@ class RobotDescription:
         if self.chain is not None:
             return self.chain.n_actuators
         return 0 if self.log is None else len(self.log.q)
+
+    @property
+    def has_segments(self) -> bool:
+        """Whether it has a mechanical model; else its model is learned from data alone."""
+        return self.chain is not None
 
     def to_log(self, q: Numbers) -> NDArray:
         """Return actuator vectors (..., n) in unit and sign of the logs, see `LogFormat`."""
@@ -456,7 +455,6 @@ def _limits(table: Mapping[str, Any], robot: RobotDescription) -> Limits:
         raise ValueError(f'`unit` in [limits] must be "{need}" {why}, got "{unit}".')
     arrays = {key: each(values, key, "[limits]", robot.n_actuators) for key in values}
     limits = Limits(**arrays)
-    if limits.q_min is not None and limits.q_max is not None:
-        if (limits.q_min > limits.q_max).any():
-            raise ValueError("`q_min` in [limits] must not exceed `q_max`; swap them.")
+    if np.greater(limits.q_min, limits.q_max).any():
+        raise ValueError("`q_min` in [limits] must not exceed `q_max`; swap them.")
     return limits if log is None or unit == "m" else limits.scaled(log.q_factor)

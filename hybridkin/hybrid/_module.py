@@ -14,6 +14,7 @@ from hybridkin._core.actuation import DIRECT, Actuation
 from hybridkin._core.blocks import in_blocks
 from hybridkin._core.model import ForwardModel
 from hybridkin._core.plan import CHAINS, NoKernel, Plan
+from hybridkin._core.planes import PlaneOfQ
 from hybridkin._core.portable import PortableModule
 from hybridkin._core.stored import Layout, Stored
 from hybridkin.hybrid._guards import GroupDistance, Guard, LeverageGuard, Plane
@@ -322,11 +323,11 @@ class HybridModule(Hybrid):
         return self._has_inner_corrections
 
     @property
-    def plane(self) -> tuple[Tensor, Tensor] | None:
+    def plane(self) -> PlaneOfQ:
         """The plane of the log, see `Plane`."""
         if self.log_plane is None:
-            return None
-        return self.log_plane.point, self.log_plane.normals
+            return PlaneOfQ.whole()
+        return PlaneOfQ(self.log_plane.point, self.log_plane.normals)
 
     @property
     def longest_correction(self) -> Tensor | float:

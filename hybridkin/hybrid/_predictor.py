@@ -280,7 +280,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     @property
     def training_range_(self) -> TrainingRange:
         """The range of q in the fit, where it lies after `adapt` [unit of q]."""
-        return self._fit.training_range.moved(-self.change_.shift)
+        return self._fit.training_range.shifted(-self.change_.shift)
 
     @property
     def _repr_html_(self) -> Callable[[], str]:
@@ -355,7 +355,7 @@ class HybridPredictor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if not self.hysteresis_ or states_of_log is None:
             return np.ones(len(commands), dtype=bool)
         rows = check_inputs(self, commands.q)
-        low, high = states_of_log.moved(-self.change_.shift)
+        low, high = states_of_log.shifted(-self.change_.shift)
         seen = np.ones(len(commands), dtype=bool)
         states = self.hysteresis_.each_inner_state(
             rows, commands.run_of_rows, commands.time

@@ -32,7 +32,7 @@ class TrainingRange(NamedTuple):
         """Return the range of rows q (N, n)."""
         return cls(q.min(axis=0).astype(float), q.max(axis=0).astype(float))
 
-    def moved(self, way: NDArray) -> Self:
+    def shifted(self, way: NDArray) -> Self:
         """Return the range after a change of all actuator vectors by `way` (n,)."""
         return type(self)(self.low + way, self.high + way)
 

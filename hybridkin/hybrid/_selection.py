@@ -241,11 +241,11 @@ class Settled(NamedTuple):
         test = self.rows.take(outer)
         return Outer(self.held_out(inner, outer).tips, test.tips, test.counts, outer)
 
-    def table(self) -> CrossFit:
-        """Return the held-out predictions of folds of groups or rows, and those of outer rows."""
+    def table(self, outer: Outer) -> CrossFit:
+        """Return the held-out predictions of folds of groups or rows, with those of `outer`."""
         splits = folds_of(self.rows.X, self.rows.groups)
         held_out = starmap(self.held_out, splits)
-        return CrossFit.of([*self.models], self.rows, splits, held_out, self.outer())
+        return CrossFit.of([*self.models], self.rows, splits, held_out, outer)
 
 
 def decided(fitted: FittedHybrid, rows: Rows, table: CrossFit) -> FittedHybrid:

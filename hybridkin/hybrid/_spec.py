@@ -250,7 +250,7 @@ class Spec:
             return spec
         if spec.geometry is not None and not spec.error_model.tells_errors:
             return replace(spec.recalibrated(rows), calibrate=())
-        result, messages = fit_geometry(
+        result = fit_geometry(
             cast(Chain, spec.mechanical),
             rows.q,
             spec.positions(rows),
@@ -265,7 +265,7 @@ class Spec:
             mechanical=result.chain,
             calibrate=(),
             calibration=result,
-            messages=(*spec.messages, *messages),
+            messages=(*spec.messages, *result.messages),
         )
 
     def recalibrated(self, rows: Rows) -> Spec:

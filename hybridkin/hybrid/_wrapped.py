@@ -15,6 +15,7 @@ from hybridkin._core.arrays import as_array
 from hybridkin._core.blocks import in_blocks
 from hybridkin._core.model import ForwardModel, PoseModel
 from hybridkin._core.plan import CHAINS, NoKernel, Plan
+from hybridkin._core.planes import PlaneOfQ
 from hybridkin._core.rotations import rotation, rotation_vector
 from hybridkin._core.stored import Layout, Stored
 from hybridkin.hybrid._guards import GroupDistance, Plane
@@ -81,7 +82,7 @@ class Stacked(Hybrid):
         return self.tip_model.tested
 
     @property
-    def plane(self) -> tuple[Tensor, Tensor] | None:
+    def plane(self) -> PlaneOfQ:
         """The plane of the log, which is that of the tip."""
         return self.tip_model.plane
 
@@ -210,7 +211,7 @@ class WithPose(Hybrid, PoseModel):
         return self.learned.tested
 
     @property
-    def plane(self) -> tuple[Tensor, Tensor] | None:
+    def plane(self) -> PlaneOfQ:
         """The plane of the log, see `Plane`."""
         return self.learned.plane
 

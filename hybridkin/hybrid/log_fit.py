@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import starmap
 from typing import NamedTuple
 
@@ -158,11 +159,20 @@ class FitOnce:
         """Return what the candidates predict for the outer rows that count; None without any."""
         if not self.fitted.error.candidates:
             return None
-        outer = Settled.of(self.fitted, self.rows).outer()
+        outer = self._outer_of_rows
         assert self.rows.place is not None
         place = self.rows.place[self.log.counted]
         _, first = np.unique(place, return_index=True)
         return outer._replace(rows=first[outer.rows])
+
+    @cached_property
+    def _outer_of_rows(self) -> Outer:
+        """What the candidates predict for the outer ones of the different rows."""
+        return Settled.of(self.fitted, self.rows).outer()
+
+    def settled_table(self) -> CrossFit:
+        """Return what the candidates predict with their choices, for folds and outer rows."""
+        return Settled.of(self.fitted, self.rows).table(self._outer_of_rows)
 
     def decided(self, table: CrossFit) -> Self:
         """Return the fit with the blend of its candidates by the weights of a table."""
@@ -177,8 +187,7 @@ class FitOnce:
         """
         if not self.fitted.error.candidates:
             return self
-        settled = Settled.of(self.fitted, self.rows).table()
-        return self.decided(settled).expecting(table.expected_error)
+        return self.decided(self.settled_table()).expecting(table.expected_error)
 
     def with_radius(self, table: CrossFit) -> Self:
         """Return the fit with the radius of a table of new choices, if it is asked for."""
@@ -286,7 +295,7 @@ def fit_to_log(spec: Spec, log: Rows) -> HybridFit:
         table = _table_anew(spec, fit)
         fit = fit.decided(table).with_radius(table)
     elif fit.fitted.error.candidates:
-        table = Settled.of(fit.fitted, fit.rows).table()
+        table = fit.settled_table()
         expected = expected_with_new_choices(fit.fitted, fit.rows, table)
         fit = fit.decided(table).expecting(expected)
     by_motion = _by_motion(log, fit.rows, fit.hysteresis)

@@ -20,10 +20,12 @@ from hybridkin._core.arrays import (
     labels,
     real_array,
 )
+from hybridkin._core.commands import Commands
 from hybridkin._core.runs import RunOrder
 from hybridkin._core.stored import Stored
 from hybridkin._core.units import LogUnit
 from hybridkin.hysteresis.follow import follow, followed, n_state_rows, stage_numbers
+from hybridkin.hysteresis.reversals import Coarseness
 from hybridkin.hysteresis.stage import STAGE_OF_KIND, Fixed, Stage
 from hybridkin.hysteresis.stages.backlash import Backlash
 from hybridkin.hysteresis.stages.creep import Creep
@@ -109,6 +111,34 @@ class Hysteresis(Fixed, Actuation):
         self.width: NDArray = np.array(sum(widths))
         times = [np.empty(0), *(stage.time_constants for stage in self.stages)]
         self.time_constants: NDArray = np.concatenate(times)
+
+    @staticmethod
+    def coarseness(commands: Commands) -> Coarseness:
+        """Return how coarsely commands show the reversals that hysteresis depends on.
+
+        Parameters
+        ----------
+        commands : Commands
+            The rows of each run in order of time.
+
+        Returns
+        -------
+        Coarseness
+            ``reversing`` (n,), the share of the rows within runs at which an actuator reverses;
+            ``missed`` (n,), the median way beyond these rows [unit of q]; ``shows_reversals``,
+            whether at most a third of the rows are reversals.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from hybridkin import Commands, Hysteresis
+        >>> slow = np.sin(np.linspace(0.0, 9.0, 60))[:, None]
+        >>> Hysteresis.coarseness(Commands(slow)).shows_reversals
+        True
+        >>> Hysteresis.coarseness(Commands(slow[::12])).shows_reversals
+        False
+        """
+        return Coarseness.of(np.asarray(commands.q), commands.run_of_rows)
 
     @classmethod
     def backlash(cls, width: ArrayLike) -> Self:

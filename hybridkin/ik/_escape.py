@@ -58,7 +58,7 @@ def way_out(
     def allowed(u: Tensor) -> Tensor:
         """Return unit vectors without what moves the tip well, or is forbidden."""
         mu = solve_rows(J, apply_rows(J, u), damping_sq)
-        u = settings.in_plane(u - apply_columns(J, mu))
+        u = settings.plane.along(u - apply_columns(J, mu))
         u = torch.where(torch.where(u > 0.0, up, down), u, 0.0)
         size = u.norm(dim=-1, keepdim=True)
         return torch.where(size > 0.0, u / size, u)

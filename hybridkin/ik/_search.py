@@ -328,7 +328,8 @@ class Search:
         half_turn = 0.5 * settings.periods.to(live.q)
         stays = torch.isinf(half_turn)
         bounds = Bounds(lower.where(stays, -half_turn), upper.where(stays, half_turn))
-        step = limited_step(settings, live.J, live.e, None, bounds, trust * size)
+        still = torch.zeros_like(live.q)
+        step = limited_step(settings, live.J, live.e, still, bounds, trust * size)
         new = self._point(settings.inside(live.q + step.dq), live.target)
         error_new = new.error
         predicted = (live.e - apply_rows(live.J, step.dq)).norm(dim=-1)
@@ -403,7 +404,9 @@ class Search:
         for iteration in range(IK_NULL_STEPS):
             # The last step only corrects the error.
             last = iteration == IK_NULL_STEPS - 1
-            way = None if last else live.fraction[:, None] * live.free
+            way = live.fraction[:, None] * live.free
+            if last:
+                way = torch.zeros_like(way)
             point = self._after_step(live, way)
             new = self._slide(point, wanted, live.fraction)
             dq = new.q - live.q
@@ -442,7 +445,7 @@ class Search:
                 break
         # A step of the free actuators removes what is left of the error.
         best = ends.take(all_rows)
-        corrected = self._after_step(best, None, hold=True)
+        corrected = self._after_step(best, torch.zeros_like(best.q), hold=True)
         better = (corrected.error < best.error) & self._within(corrected.e)
         ends.put(all_rows[better], corrected.take(better))
 
@@ -453,9 +456,7 @@ class Search:
         free = null_step(self.settings, at.J, wish)
         return _Slide(at.q, at.x, at.J, at.e, at.target, wish, free, fraction)
 
-    def _after_step(
-        self, at: Point, posture: Tensor | None, hold: bool = False
-    ) -> Point:
+    def _after_step(self, at: Point, posture: Tensor, hold: bool = False) -> Point:
         """Return the point after a step; `hold` fixes actuators at a limit."""
         bounds = self.settings.step_bounds(at.q)
         if hold:

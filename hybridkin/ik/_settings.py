@@ -34,6 +34,7 @@ from hybridkin._core.kernel_numbers import (
 )
 from hybridkin._core.named_rows import without_warnings
 from hybridkin._core.plan import NoKernel, Plan
+from hybridkin._core.planes import PlaneOfQ
 from hybridkin._core.portable import Portable
 from hybridkin.ik._feedback import expected_innovation
 from hybridkin.ik._half_spaces import HalfSpaces
@@ -200,11 +201,11 @@ class StepSettings(Portable):
         """Return the preferred configurations, on the plane of q."""
         wanted = self.q_pref
         if callable(wanted):
-            return PostureFunction(wanted, self.on_plane)
+            return PostureFunction(wanted, self.plane.nearest)
         if wanted is None:
             wanted = self.middle
         if torch.isfinite(wanted).all():
-            return FixedPosture(self.on_plane(wanted))
+            return FixedPosture(self.plane.nearest(wanted))
         return NoPosture()
 
     def present(self) -> StepSettings:
@@ -334,11 +335,9 @@ class StepSettings(Portable):
         for vector in (self.periods, self.pulls):
             numbers.append(np.broadcast_to(as_array(vector), n))
 
-        n_normals = 0
-        if self.plane is not None:
-            normals = as_array(self.plane[1]).T
-            n_normals = len(normals)
-            numbers.append(normals)
+        n_normals = self.plane.n_normals
+        if n_normals:
+            numbers.append(as_array(self.plane.normals).T)
         if n_normals > IK_NORMALS:
             raise NoKernel(
                 f"the log leaves {n_normals} directions of q out, more than {IK_NORMALS}"
@@ -377,23 +376,9 @@ class StepSettings(Portable):
     # The plane of q to keep to, where the log lies in one.
 
     @property
-    def plane(self) -> tuple[Tensor, Tensor] | None:
-        """A point and orthonormal normals of the plane, if any, see `ForwardModel`."""
+    def plane(self) -> PlaneOfQ:
+        """The plane of q, see `ForwardModel`."""
         return self.task.models[0].plane
-
-    def in_plane(self, motion: Tensor) -> Tensor:
-        """Return motions (..., n) without their part normal to the plane."""
-        if self.plane is None:
-            return motion
-        normals = self.plane[1].to(motion)
-        return motion - motion @ normals @ normals.mT
-
-    def on_plane(self, q: Tensor) -> Tensor:
-        """Return the points of the plane that are nearest to q, shape () or (..., n)."""
-        if self.plane is None:
-            return q
-        point = self.plane[0].to(q)
-        return point + self.in_plane(q - point)
 
     def evaluate(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return x (N, ...) and J (N, m, n) of motions in the plane, at q of shape (N, n)."""
@@ -402,7 +387,7 @@ class StepSettings(Portable):
             return x, q.new_zeros(0, sum(self.task.parts), q.shape[1])
         with without_warnings():  # a status says what is wrong
             x, J = self.task.evaluate(q)
-        return x, self.in_plane(J)
+        return x, self.plane.along(J)
 
     def preferred(self, q: Tensor) -> Tensor:
         """Return the preferred configurations, of shape (n,) or that of q."""
@@ -454,9 +439,9 @@ class StepSettings(Portable):
 
     def start_at(self, q: Tensor) -> Tensor:
         """Return q moved onto the plane and into the limits."""
-        if self.plane is not None:
+        if self.plane.n_normals:
             for _ in range(PLANE_ROUNDS):
-                q = self.inside(self.on_plane(q))
+                q = self.inside(self.plane.nearest(q))
         return self.inside(q)
 
     def allowed(self, x: Tensor) -> Tensor:

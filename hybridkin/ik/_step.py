@@ -64,9 +64,7 @@ class Law(NamedTuple):
     settings: StepSettings
     least: Tensor
 
-    def step(
-        self, J: Tensor, v: Tensor, posture: Tensor | None, bounds: Bounds
-    ) -> StepRows:
+    def step(self, J: Tensor, v: Tensor, posture: Tensor, bounds: Bounds) -> StepRows:
         """Return the step for the task v and the posture step, within the bounds."""
         return limited_step(self.settings, J, v, posture, bounds, least=self.least)
 
@@ -134,7 +132,7 @@ def control_step(
     J = _only_taut(settings, J)
 
     # Limit the speed towards target and posture so that the actuators can brake in time.
-    posture = None
+    posture = torch.zeros_like(q)
     if settings.has_posture:
         posture = beta * (settings.preferred(at) - at)
         posture = torch.where(fine, posture, 0.0)
@@ -143,7 +141,7 @@ def control_step(
         brake = _braking(law, J, e, change)
         fastest_gain = stopping(torch.ones_like(brake), brake)
         gain = fastest_gain.clamp_max(gain)[:, None]
-        if posture is not None:
+        if settings.has_posture:
             fastest = stopping((posture / beta).abs(), change)
             posture = torch.clamp(posture, -fastest, fastest)
 
@@ -185,7 +183,7 @@ def limited_step(
     settings: StepSettings,
     J: Tensor,
     v: Tensor,
-    posture: Tensor | None,
+    posture: Tensor,
     bounds: Bounds,
     damping_sq: Tensor | None = None,
     least: Tensor | float = 0.0,
@@ -199,8 +197,7 @@ def limited_step(
     unit = settings.unit(v)
     J = J * unit
     box = Bounds(bounds.lower / unit, bounds.upper / unit)
-    if posture is not None:
-        posture = posture / unit
+    posture = posture / unit
 
     # Eq. (17): damped least squares, and the part of the posture step that does not move the tip.
     z = torch.zeros_like(J[:, 0])
@@ -216,8 +213,7 @@ def limited_step(
             damping_sq = (settings.damping * gram.sigma_max).square()
         damping_sq = damping_sq.clamp_min(least)
         mu = damped_solve(gram, v, damping_sq)
-        if posture is not None:
-            z = null_projection(J, gram, posture)
+        z = null_projection(J, gram, posture)
     dq = apply_columns(J, mu)
     calm = least + torch.zeros_like(damping_sq) > 0.0
     z = calmed(z, dq, calm)
@@ -227,7 +223,7 @@ def limited_step(
     # of the plane.
     if settings.limits != "off":
         clipped = box.clip(dq)
-        out_of_plane = settings.plane is not None and settings.weighted
+        out_of_plane = settings.plane.n_normals and settings.weighted
         over = ((clipped != dq).any(-1) | out_of_plane).nonzero()[:, 0]
         if over.numel() > 0:
             rows, motion = _with_plane(settings, J, v, posture)
@@ -249,22 +245,20 @@ def null_step(settings: StepSettings, J: Tensor, step: Tensor) -> Tensor:
 
 
 def _with_plane(
-    settings: StepSettings, J: Tensor, v: Tensor, posture: Tensor | None
+    settings: StepSettings, J: Tensor, v: Tensor, posture: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return J and v with further rows: only `posture` leaves the plane, also at the limits.
 
     Else a limit that stops one actuator would unbalance the others.
     """
-    if settings.plane is None:
+    if not settings.plane.n_normals:
         return J, v
     # J is in the unit in which weights are 1, so that only their ratios count.
     unit = settings.unit(v)
     size = J.flatten(1).norm(dim=-1) / unit.square().mean().sqrt()
     stiff = IK_BALANCE * size[:, None, None]
-    rows = stiff * (settings.plane[1].to(J).mT * unit)
-    aside = torch.zeros_like(rows[..., 0])
-    if posture is not None:
-        aside = apply_rows(rows, posture)
+    rows = stiff * (settings.plane.normals.to(J).mT * unit)
+    aside = apply_rows(rows, posture)
     return torch.cat([J, rows], dim=1), torch.cat([v, aside], dim=1)
 
 
@@ -281,7 +275,7 @@ def _norm(rows: Tensor) -> Tensor:
 def _braking(law: Law, J: Tensor, way: Tensor, change: Tensor) -> Tensor:
     """Return the largest change of the tip's motion per period, in multiples of `way` (N,)."""
     free = torch.full_like(J[:, 0], math.inf)
-    step = law.step(J, way, None, Bounds(-free, free))
+    step = law.step(J, way, torch.zeros_like(free), Bounds(-free, free))
     return (change / step.dq.abs()).amin(-1)
 
 
@@ -321,7 +315,7 @@ class _Confined(NamedTuple):
     spaces: HalfSpaces
     margin: Tensor
     J: Tensor
-    posture: Tensor | None
+    posture: Tensor
     bounds: Bounds
 
     @property
@@ -371,7 +365,7 @@ class _Confined(NamedTuple):
         taken; else a start outside several could get worse.
         """
         rest = self.bounds.clip(torch.zeros_like(self.J[:, 0]))
-        without_posture = self._replace(posture=None)
+        without_posture = self._replace(posture=torch.zeros_like(self.posture))
         back, _ = without_posture._projected(rest, apply_rows(self.J, rest))
         start = self.along(rest)
         allowed = torch.maximum(self.margin, start)
@@ -461,7 +455,8 @@ class _Arrival(NamedTuple):
             if not going.any():
                 break
             left = Bounds(lower - end.dq, upper - end.dq)
-            step = self.law.step(end.J, end.missing, None, left)
+            still = torch.zeros_like(end.J[:, 0])
+            step = self.law.step(end.J, end.missing, still, left)
             dq = self.bounds.clip(end.dq + step.dq)
             dq = torch.where(step.dq >= left.upper, upper, dq)
             dq = torch.where(step.dq <= left.lower, lower, dq)

@@ -59,8 +59,8 @@ def statuses(
     known: Tensor,
     held: Tensor,
     singular: Tensor,
-    resting: Tensor | None = None,
-    beyond: Tensor | None = None,
+    resting: Tensor | bool = False,
+    beyond: Tensor | bool = False,
 ) -> Tensor:
     """Return the `IKStatus` of rows, int (N,); later conditions override earlier ones.
 
@@ -86,10 +86,8 @@ def statuses(
     status = torch.full(known.shape, IKStatus.MAX_ITER.value, device=e.device)
     status[singular] = IKStatus.SINGULAR
     status[held] = IKStatus.AT_LIMITS
-    if resting is not None:
-        status[resting] = IKStatus.MAX_ITER
-    if beyond is not None:
-        status[beyond] = IKStatus.UNREACHABLE
+    status[torch.zeros_like(known) | resting] = IKStatus.MAX_ITER
+    status[torch.zeros_like(known) | beyond] = IKStatus.UNREACHABLE
     reached = task.reached(e, tol)
     status[reached] = IKStatus.CONVERGED
     status[reached & ~task.in_domain(q)] = IKStatus.OUT_OF_DOMAIN

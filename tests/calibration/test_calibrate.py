@@ -377,8 +377,8 @@ def test_tendons_that_contradict_each_other_warn_once(rng):
     assert caught[0].filename == __file__
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # the fit itself returns its messages
-        result, messages = fit_geometry(truth, balanced, truth(balanced), ("radii",))
-    assert messages == [str(caught[0].message)]
+        result = fit_geometry(truth, balanced, truth(balanced), ("radii",))
+    assert result.messages == (str(caught[0].message),)
     assert_close(result.values["radii"], truth.radii, rtol=1e-9, atol=0)
 
 

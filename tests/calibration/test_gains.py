@@ -126,7 +126,7 @@ def test_auto_calibrates_the_gain_beside_the_radii():
     choice = choose_geometry(start, q, x)
     assert choice.name == "radii + base + gain"
     assert all(("gain" in name) == ("radii" in name) for name in choice.errors)
-    result, _ = fit_geometry(start, q, x, choice.parameters, start=choice.start)
+    result = fit_geometry(start, q, x, choice.parameters, start=choice.start)
     assert not result.identifiable["radii"].any()
     ratio = result.values["gain"] / result.values["radii"][0]
     assert abs(ratio / (TRUE[0] / RADII[0]) - 1) < 0.01

@@ -43,8 +43,7 @@ def test_commands_stay_as_balanced_as_those_of_the_log(error_model):
     model = HybridForwardModel(CHAIN, error_model, hysteresis=WIDTH, random_state=0)
     model.fit(q, x, groups=motions)
     plane = model.module_.plane
-    assert plane is not None
-    assert plane[1].shape == (6, 2)
+    assert plane.normals.shape == (6, 2)
     np.testing.assert_allclose(np.abs(np.linalg.svd(NORMALS.T @ plane[1].numpy())[1]), 1.0)
     ik = InverseKinematics(tasks.PositionTask(model), dt=0.05)
     path = x[::20] + 0.002

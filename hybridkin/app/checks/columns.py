@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hybridkin import Hysteresis
 from hybridkin.app.checks.report import LogFinding
 from hybridkin.datasets import Log
 from hybridkin.formats import FRAMES, duration_in_words, in_terms, named_places
-from hybridkin.hysteresis.reversals import Coarseness
 
 _FROZEN_ROWS = 3  # fewer rows may be chance
 _FROZEN_WAY = 0.1  # part of an actuator's range over which the tip must have moved
@@ -342,7 +342,7 @@ def reversals(rows: LogRows) -> Iterator[LogFinding]:
     log = rows.log
     if log.groups is None and log.runs is None:
         return
-    coarse = Coarseness.of(log.q, rows.runs)
+    coarse = Hysteresis.coarseness(log.commands)
     if coarse.shows_reversals:
         return
     name, _ = rows.columns("q")[int(coarse.reversing.argmax())]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import inspect
 import json
+import math
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -637,19 +638,17 @@ def _add_limits(command: argparse.ArgumentParser) -> None:
     add(
         "--q-min",
         type=numbers,
+        default=-math.inf,
         metavar="A,...",
         help="least q, in the unit and sign of the log",
     )
-    add("--q-max", type=numbers, metavar="A,...", help="largest q")
-    add(
-        "--dq-max", type=numbers, metavar="A,...", help="largest speed of q, per second"
-    )
-    add(
-        "--ddq-max",
-        type=numbers,
-        metavar="A,...",
-        help="largest acceleration, per second squared",
-    )
+    largest = {
+        "--q-max": "largest q",
+        "--dq-max": "largest speed of q, per second",
+        "--ddq-max": "largest acceleration, per second squared",
+    }
+    for name, text in largest.items():
+        add(name, type=numbers, default=math.inf, metavar="A,...", help=text)
 
 
 def _add_model(

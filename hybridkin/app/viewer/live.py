@@ -47,10 +47,10 @@ def view(
     log: Log | None = None,
     *,
     path: trajectories.Trajectory | None = None,
-    q_min: ArrayLike | None = None,
-    q_max: ArrayLike | None = None,
-    dq_max: ArrayLike | None = None,
-    ddq_max: ArrayLike | None = None,
+    q_min: ArrayLike = -np.inf,
+    q_max: ArrayLike = np.inf,
+    dq_max: ArrayLike = np.inf,
+    ddq_max: ArrayLike = np.inf,
     host: str = "127.0.0.1",
     port: int = 8080,
 ) -> LiveView:
@@ -106,8 +106,8 @@ def view(
             f"got a model without a mechanical part, {model.description_.name}."
         )
     if log is not None and not _has_range(model):
-        q_min = np.nanmin(log.q, axis=0) if q_min is None else q_min
-        q_max = np.nanmax(log.q, axis=0) if q_max is None else q_max
+        q_min = np.where(np.isfinite(q_min), q_min, np.nanmin(log.q, axis=0))
+        q_max = np.where(np.isfinite(q_max), q_max, np.nanmax(log.q, axis=0))
     limits = path_limits(
         model, q_min=q_min, q_max=q_max, dq_max=dq_max, ddq_max=ddq_max
     )
@@ -116,7 +116,7 @@ def view(
 
 def _has_range(model: HybridForwardModel) -> bool:
     """Return whether the model or its description gives a range of the actuators."""
-    return is_fitted(model) or model.description_.limits.q_min is not None
+    return is_fitted(model) or model.description_.limits.are_finite
 
 
 class LiveView:

@@ -71,7 +71,8 @@ class SteeredRobot:
         self.limits = limits
         self.domain = Domain(model, limits)
         self.span = np.maximum(limits.q_max - limits.q_min, np.finfo(float).tiny)
-        speed = self.span / _TRAVEL if limits.dq_max is None else limits.dq_max
+        is_limited = np.isfinite(limits.dq_max)
+        speed = np.where(is_limited, limits.dq_max, self.span / _TRAVEL)
         self.q = self.domain.preferred
         self.x = tips_at(model, self.q[None])[0]
         self.target = self.x

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike
 from sklearn.linear_model import LinearRegression
 
@@ -16,20 +16,24 @@ from hybridkin import (
     CalibrationResult,
     Chain,
     CrossFit,
+    ELMRegressorCV,
     ForwardModel,
+    GeometryChoice,
     HybridForwardModel,
     Hysteresis,
+    as_forward_model,
+    choose_geometry,
     cross_fit,
     robots,
 )
-from hybridkin.app.workflow.calibrated import CalibratedParameter, calibrated_parameters
+from hybridkin.app.workflow.calibrated import (
+    Calibration,
+    calibrated_parameters,
+    deviations,
+)
 from hybridkin.app.workflow.log import MeasuredLog
 from hybridkin.app.workflow.report import Progress, quiet
 from hybridkin.arguments import whole
-from hybridkin.calibration.calibrate import fit_geometry
-from hybridkin.calibration.choice import GeometryChoice, choose_geometry
-from hybridkin.learning.elm_cv import growing_network
-from hybridkin.learning.regressor_modules import error_module
 
 NOMINAL = "mechanical, nominal"
 CALIBRATED = "mechanical, calibrated"
@@ -40,6 +44,9 @@ DATA_ELM = "data-driven, ELM"
 HYBRID_ELM = "hybrid, ELM"
 AUTO = "hybrid, auto"
 _KINDS = ("mechanical", "data-driven", "hybrid")  # in the order of the table
+
+Starts = tuple[Any, ...]
+"""Starts of the searches of parameters to calibrate, see `choose_geometry`."""
 
 
 @dataclass(frozen=True)
@@ -93,91 +100,153 @@ DEFAULTS = FitSettings()
 
 @dataclass(frozen=True, eq=False)
 class Mechanical:
-    """The mechanical model of a robot, calibrated to rows.
+    """The model below the hybrids: without segments of the robot, a linear model of the rows.
 
     Attributes
     ----------
     model : ForwardModel
-        The calibrated chain; for a robot without segments a linear model of the rows.
-    start : Chain or None
-        The chain before its calibration.
-    nominal : Chain or None
-        The described chain, with a fitted base if the base is calibrated.
-    result : CalibrationResult or None
-        None if nothing is calibrated.
-    geometry : GeometryChoice or None
-        How the parameters were chosen, if the robot says "auto".
-    messages : list of str
+        The calibrated chain, or the linear model.
+    messages : tuple of str
         Warnings.
+    calibrate : GeometryChoice, tuple of str, str or None
+        The parameters that "auto" calibrates, see `HybridForwardModel`.
+    parameters : str
+        Name of the set of parameters that is calibrated, if the robot says "auto".
+    tried : dict of str to dict
+        Errors of the sets that were tried, "cv" and "io" [m].
+    starts : tuple
+        Starts of the fits of these sets.
     """
 
     model: ForwardModel
-    start: Chain | None
-    nominal: Chain | None
+    messages: tuple[str, ...] = ()
+    calibrate: GeometryChoice | tuple[str, ...] | str | None = None
+    parameters: str = ""
+    tried: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    starts: Starts = ()
+
+    @property
+    def alone(self) -> dict[str, HybridForwardModel]:
+        """The unfitted models without error model, by name."""
+        return {DATA_LINEAR: HybridForwardModel(self.model, "drop")}
+
+    def suspicions(self, rows: MeasuredLog) -> list[str]:
+        """Return what the calibration says against the log and the description."""
+        return []
+
+    def calibration(
+        self, rows: MeasuredLog, loss: str, messages: Sequence[str]
+    ) -> Calibration | None:
+        """Return what a report says about the calibration; None if nothing is calibrated."""
+        return None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CalibratedChain(Mechanical):
+    """The chain of a robot, calibrated to rows.
+
+    Attributes
+    ----------
+    nominal : Chain
+        The described chain, with a fitted base if the base is calibrated.
+    geometry : GeometryChoice
+        The chain before its calibration, and its parameters.
+    result : CalibrationResult or None
+        None if nothing is calibrated.
+    """
+
+    nominal: Chain
+    geometry: GeometryChoice
     result: CalibrationResult | None
-    geometry: GeometryChoice | None
-    messages: list[str]
 
     @property
-    def parameters(self) -> str:
-        """Name of the set of parameters that is calibrated, if the robot says "auto"."""
-        return "" if self.geometry is None else self.geometry.name
+    def alone(self) -> dict[str, HybridForwardModel]:
+        """The unfitted models without error model, by name."""
+        return {
+            NOMINAL: HybridForwardModel(self.nominal, "drop"),
+            CALIBRATED: HybridForwardModel(self.model, "drop"),
+        }
 
-    @property
-    def tried(self) -> dict[str, dict[str, float]]:
-        """Errors of the sets that were tried, "cv" and "io" [m]."""
-        errors = {} if self.geometry is None else self.geometry.errors
-        return {name: error.known() for name, error in errors.items()}
+    def suspicions(self, rows: MeasuredLog) -> list[str]:
+        """Return what the calibration says against the log and the description."""
+        if self.result is None:
+            return []
+        misread = rows.misread(self.result.chain)
+        return [*misread, *deviations(self.geometry.chain, self.result, rows.q_unit)]
 
-    @classmethod
-    def of(
-        cls,
-        robot: robots.RobotDescription,
-        rows: MeasuredLog,
-        loss: str,
-        of_all: Mechanical | None = None,
-    ) -> Mechanical:
-        """Return the mechanical model of a robot; that of all rows gives starts of its fits."""
-        chain = robot.chain
-        if chain is None:
-            linear = LinearRegression().fit(rows.q, rows.x)
-            model = error_module(linear, torch.from_numpy(rows.q))
-            return cls(model, None, None, None, None, [])
-        nominal = _nominal(robot, chain, rows, loss)
-        names = robot.calibrate
-        geometry = None
-        start = None
-        messages = []
-        if names == "auto":
-            starts = ()
-            if of_all is not None and of_all.geometry is not None:
-                starts = of_all.geometry.starts
-            geometry = choose_geometry(
-                chain,
-                rows.q,
-                rows.x,
-                groups=rows.motions,
-                loss=loss,
-                starts=starts,
-            )
-            chain = geometry.chain
-            names = geometry.parameters
-            start = geometry.start
-            messages = [*geometry.messages]
-        if not names:
-            return cls(chain, chain, nominal, None, geometry, messages)
-        result, of_fit = fit_geometry(chain, rows.q, rows.x, names, loss, start=start)
-        messages += of_fit
-        return cls(result.chain, chain, nominal, result, geometry, messages)
+    def calibration(
+        self, rows: MeasuredLog, loss: str, messages: Sequence[str]
+    ) -> Calibration | None:
+        """Return what a report says about the calibration; None if nothing is calibrated.
 
-    def rivals(self, rows: MeasuredLog, loss: str) -> Iterator[CalibratedParameter]:
-        """Yield the parameters of all other sets with nearly the same errors, calibrated."""
-        rivals = () if self.geometry is None else self.geometry.rivals
-        for rival in rivals:
-            result, _ = fit_geometry(
-                rival.chain, rows.q, rows.x, rival.parameters, loss, start=rival.start
-            )
-            yield from calibrated_parameters(rival.chain, result, rows.q_unit)
+        All other sets with nearly the same errors are calibrated, to see which values they change.
+        """
+        if self.result is None:
+            return None
+        others = []
+        for rival in self.geometry.rivals:
+            result = rival.calibrate(rows.q, rows.x, loss=loss)
+            others += calibrated_parameters(rival.chain, result, rows.q_unit)
+        start = self.geometry.chain
+        return Calibration.of(start, self.result, rows.q_unit, messages, others)
+
+
+def mechanical_of(
+    robot: robots.RobotDescription,
+    rows: MeasuredLog,
+    loss: str,
+    starts: Starts = (),
+) -> Mechanical:
+    """Return the mechanical model of a robot for rows.
+
+    Parameters
+    ----------
+    robot : robots.RobotDescription
+        The robot.
+    rows : MeasuredLog
+        The rows.
+    loss : str
+        Loss of the calibration.
+    starts : tuple, optional
+        Those of the model for more rows.
+    """
+    chain = robot.chain
+    if chain is None:
+        linear = HybridForwardModel(None, LinearRegression(), guard=None)
+        with warnings.catch_warnings():  # the models above it give them
+            warnings.simplefilter("ignore")
+            linear.fit(rows.q, rows.x)
+        return Mechanical(as_forward_model(linear))
+    nominal: Chain = chain
+    if robot.base_is_free:
+        base = GeometryChoice(chain, ("base",))
+        nominal = base.calibrate(rows.q, rows.x, loss=loss).chain
+    calibrate = robot.calibrate
+    if calibrate == "auto":
+        calibrate = choose_geometry(
+            chain, rows.q, rows.x, groups=rows.motions, loss=loss, starts=starts
+        )
+        geometry = calibrate
+    else:
+        geometry = GeometryChoice(chain, tuple(calibrate))
+    result = None
+    messages = geometry.messages
+    calibrated = geometry.chain
+    if geometry.parameters:
+        result = geometry.calibrate(rows.q, rows.x, loss=loss)
+        messages = (*messages, *result.messages)
+        calibrated = result.chain
+    return CalibratedChain(
+        calibrated,
+        messages,
+        calibrate,
+        geometry.name,
+        {name: errors.known() for name, errors in geometry.errors.items()},
+        geometry.starts,
+        nominal=nominal,
+        geometry=geometry,
+        result=result,
+    )
 
 
 def models_of(
@@ -185,25 +254,30 @@ def models_of(
 ) -> dict[str, HybridForwardModel]:
     """Return the unfitted models of the comparison by name."""
     model = mechanical.model
-    models = {}
-    without_error_model = DATA_LINEAR
-    if mechanical.nominal is not None:
-        without_error_model = CALIBRATED
-        models[NOMINAL] = HybridForwardModel(mechanical.nominal, "drop")
-    models[without_error_model] = HybridForwardModel(model, "drop")
+    models = mechanical.alone
     models[DATA_QUADRATIC] = HybridForwardModel(None, "quadratic")
-    network = growing_network(0)
     if settings.auto:
-        models[DATA_ELM] = HybridForwardModel(None, network)
+        models[DATA_ELM] = HybridForwardModel(None, _network())
         models[AUTO] = _auto(robot, mechanical, settings)
     else:
-        if robot.chain is not None:
+        if robot.has_segments:
             models["hybrid, linear"] = HybridForwardModel(model, "linear")
         models["hybrid, quadratic"] = HybridForwardModel(model, "quadratic")
-        models[HYBRID_ELM] = HybridForwardModel(model, network)
+        models[HYBRID_ELM] = HybridForwardModel(model, _network())
     for of_comparison in models.values():
         of_comparison.set_params(coverage=settings.coverage)
     return models
+
+
+def _network() -> ELMRegressorCV:
+    """Return the network of the comparison, the same as that of "auto"."""
+    return ELMRegressorCV(
+        250,
+        weight_scales=(0.1, 0.4, 1.6),
+        relevance_rounds=3,
+        max_hidden=1000,
+        random_state=0,
+    )
 
 
 def _auto(
@@ -214,13 +288,13 @@ def _auto(
     It calibrates by least squares in each of its own folds. For another loss, which bounds
     outliers, it gets the calibrated chain and does not calibrate.
     """
-    chain = mechanical.model
+    model = mechanical.model
     calibrate = None
-    if settings.loss == "linear" and robot.chain is not None:
-        chain = robot.chain
-        calibrate = mechanical.geometry or robot.calibrate
+    if settings.loss == "linear" and robot.has_segments:
+        model = robot.chain
+        calibrate = mechanical.calibrate
     return HybridForwardModel(
-        chain,
+        model,
         "auto",
         calibrate=calibrate,
         hysteresis=settings.hysteresis,
@@ -229,14 +303,17 @@ def _auto(
 
 
 def with_hysteresis_detected(
-    settings: FitSettings, rows: MeasuredLog, mechanical: Mechanical
+    settings: FitSettings,
+    rows: MeasuredLog,
+    robot: robots.RobotDescription,
+    mechanical: Mechanical,
 ) -> FitSettings:
     """Return settings whose `hysteresis` is not "detect"."""
     if settings.hysteresis != "detect":
         return settings
     hysteresis = 0.0
     in_order = rows.named and not rows.n_late
-    if mechanical.start is not None and settings.auto and in_order:
+    if robot.has_segments and settings.auto and in_order:
         model = HybridForwardModel(mechanical.model, "drop", hysteresis="auto")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -312,20 +389,10 @@ def _models_for(
     rows: MeasuredLog,
 ) -> dict[str, HybridForwardModel]:
     """Return the models of the comparison for training rows."""
-    mechanical = Mechanical.of(robot, rows, settings.loss, of_all)
+    mechanical = mechanical_of(robot, rows, settings.loss, of_all.starts)
     return models_of(robot, mechanical, settings)
 
 
 def _in_table(candidate: str) -> str:
     """Return the name of a candidate of "auto" in the table."""
     return BACKLASH if candidate == "mechanical" else f"hybrid, {candidate}"
-
-
-def _nominal(
-    robot: robots.RobotDescription, chain: Chain, rows: MeasuredLog, loss: str
-) -> Chain:
-    """Return the described chain, with a fitted base if the base is calibrated."""
-    if not robot.base_is_free:
-        return chain
-    result, _ = fit_geometry(chain, rows.q, rows.x, ("base",), loss)
-    return result.chain

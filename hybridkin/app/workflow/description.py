@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from torch import Tensor
 
 from hybridkin import robots
@@ -209,7 +210,7 @@ def _write_limits(
     """Add limits in the unit and sign of the logs."""
     unit = "" if log.q_unit == "1" else f" {log.q_unit}"
     for name, values in vars(limits.scaled(1 / log.q_factor)).items():
-        if values is not None:
+        if np.isfinite(values).any():
             numbers = listed(values, ".4g")
             value = f"{numbers}{unit}{_PER_TIME.get(name, '')}"
             report.text(f"{title}: {name} = {{value}}.", value=value)

@@ -21,7 +21,6 @@ from hybridkin.arguments import real_array
 _WALKERS = 256
 _STEPS = 60
 _STEP = 0.12  # length of a step, as a share of the range
-_NAMES = ("q_min", "q_max", "dq_max", "ddq_max")
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,8 +31,8 @@ class PathLimits:
     ----------
     q_min, q_max : ndarray of shape (n,)
         Least and largest value of every actuator [m]; with backlash, of the actuators' motion.
-    dq_max, ddq_max : ndarray of shape (n,) or None
-        Largest speed [m/s] and acceleration [m/s^2].
+    dq_max, ddq_max : ndarray of shape (n,)
+        Largest speed [m/s] and acceleration [m/s^2], infinite without a limit.
     source : str
         Source of `q_min` and `q_max`, in words.
     lead : ndarray of shape (n,) or float
@@ -42,9 +41,9 @@ class PathLimits:
 
     q_min: NDArray
     q_max: NDArray
+    dq_max: NDArray
+    ddq_max: NDArray
     source: str
-    dq_max: NDArray | None = None
-    ddq_max: NDArray | None = None
     lead: NDArray | float = 0.0
 
     @property
@@ -60,10 +59,10 @@ class PathLimits:
 
 def path_limits(
     model: HybridForwardModel,
-    q_min: ArrayLike | None = None,
-    q_max: ArrayLike | None = None,
-    dq_max: ArrayLike | None = None,
-    ddq_max: ArrayLike | None = None,
+    q_min: ArrayLike = -np.inf,
+    q_max: ArrayLike = np.inf,
+    dq_max: ArrayLike = np.inf,
+    ddq_max: ArrayLike = np.inf,
     *,
     within_fit: bool = True,
 ) -> PathLimits:
@@ -76,7 +75,8 @@ def path_limits(
     model : HybridForwardModel
         The model, as from `open_model`.
     q_min, q_max, dq_max, ddq_max : float or array-like of shape (n,), optional
-        Limits of the commands [m], of their speed [m/s] and acceleration [m/s^2].
+        Limits of the commands [m], of their speed [m/s] and acceleration [m/s^2]. An infinite one,
+        the default, is that of the description; of speed and acceleration also that of the model.
     within_fit : bool, default=True
         Whether to stay within the training range if the description gives limits.
 
@@ -91,59 +91,59 @@ def path_limits(
         If the range of the actuators is not known.
     """
     n = model.n_features_in_
-    overrides: dict[str, NDArray] = {}
-    for name, value in zip(_NAMES, (q_min, q_max, dq_max, ddq_max), strict=True):
-        if value is not None:
-            limit = real_array(value, name).astype(float)
-            if limit.shape not in ((), (1,), (n,)):
-                raise ValueError(
-                    f"`{name}` must be one number or {n}, got {limit.size}."
-                )
-            overrides[name] = limit
+    given = {"q_min": q_min, "q_max": q_max, "dq_max": dq_max, "ddq_max": ddq_max}
+    given = {name: _limit(value, name, n) for name, value in given.items()}
     described = model.description_.limits
     trained = robots.Limits()
-    if within_fit or not _has_ends(described):
-        trained = trained_range(model) or trained
-    limits = dict(vars(described.narrowed(half_width(model)).intersect(trained)))
-    given = vars(robots.Limits(**overrides).narrowed(half_width(model)))
-    for name in overrides:
-        limit = given[name]
+    if within_fit or not described.are_finite:
+        trained = trained_range(model)
+    usual = described.narrowed(half_width(model)).intersect(trained)
+    usual = usual.intersect(_rates_of(model))
+    chosen = robots.Limits(**given).narrowed(half_width(model))
+    limits = {}
+    for name, limit in vars(chosen).items():
         # Of one given end, scaled to actuators of both signs, some entries are open.
-        if name in ("q_min", "q_max") and limits[name] is not None:
-            limit = np.where(np.isfinite(limit), limit, limits[name])
-        limits[name] = limit
-    values = {}
-    for name, value in limits.items():
-        if value is not None:
-            values[name] = np.broadcast_to(value, n).astype(float)
-    if not _has_ends(robots.Limits(**values)):
+        limit = np.where(np.isfinite(limit), limit, vars(usual)[name])
+        limits[name] = np.broadcast_to(limit, n).astype(float)
+    if not robots.Limits(**limits).are_finite:
         raise ValueError(
             "`q_min` and `q_max` must be given (--q-min, --q-max), or written as [limits] in the "
             "robot description, because this model has no training range."
         )
-    if (values["q_min"] > values["q_max"]).any():
+    if (limits["q_min"] > limits["q_max"]).any():
         raise ValueError(
             "`q_min` must not exceed `q_max`, including half the backlash and the training range, "
-            f"got {values['q_min']} and {values['q_max']} m; check their unit and sign."
+            f"got {limits['q_min']} and {limits['q_max']} m; check their unit and sign."
         )
     sources = []
-    if described.q_min is not None:
+    if np.isfinite(described.q_min).any():
         sources.append("robot description")
-    if trained.q_min is not None:
+    if np.isfinite(trained.q_min).any():
         sources.append("training range")
     source = ", within the ".join(sources)
-    if "q_min" in overrides and "q_max" in overrides:
+    ends = [np.isfinite(given[name]).any() for name in ("q_min", "q_max")]
+    if all(ends):
         source = "given"
-    elif "q_min" in overrides or "q_max" in overrides:
+    elif any(ends):
         source = f"given and {source}"
-    return PathLimits(**values, source=source, lead=half_width(model))
+    return PathLimits(**limits, source=source, lead=half_width(model))
 
 
-def _has_ends(limits: robots.Limits) -> bool:
-    """Return whether every actuator has a finite range."""
-    if limits.q_min is None or limits.q_max is None:
-        return False
-    return bool(np.isfinite(limits.q_min).all() and np.isfinite(limits.q_max).all())
+def _limit(value: ArrayLike, name: str, n: int) -> NDArray:
+    """Return a limit of all actuators, or one for each."""
+    limit = real_array(value, name).astype(float)
+    if limit.shape not in ((), (1,), (n,)):
+        raise ValueError(f"`{name}` must be one number or {n}, got {limit.size}.")
+    if np.isnan(limit).any():
+        raise ValueError(f"`{name}` must not hold NaN, got {limit.tolist()}.")
+    return limit
+
+
+def _rates_of(model: HybridForwardModel) -> robots.Limits:
+    """Return the limits of speed and acceleration of the model itself."""
+    own = model.module_.tip_model.robot.limits
+    rates = {name: real_array(own[name], name) for name in ("dq_max", "ddq_max")}
+    return robots.Limits(**rates)
 
 
 @dataclass(frozen=True, eq=False)

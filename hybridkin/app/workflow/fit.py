@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import warnings
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -12,7 +11,6 @@ from pathlib import Path
 import numpy as np
 
 from hybridkin import CrossFit, HybridForwardModel, robots, save_model
-from hybridkin.app.workflow.calibrated import Calibration, deviations
 from hybridkin.app.workflow.choices import (
     auto_in_words,
     choice_in_words,
@@ -24,8 +22,8 @@ from hybridkin.app.workflow.compare import (
     DEFAULTS,
     NOMINAL,
     FitSettings,
-    Mechanical,
     compare,
+    mechanical_of,
     with_hysteresis_detected,
 )
 from hybridkin.app.workflow.counts import Counts
@@ -101,11 +99,11 @@ def fit_log(
     rows = complete.thinned(settings.max_rows)
     measured = rows.measured
     progress("calibration", 0, 1)
-    mechanical = Mechanical.of(robot, measured, settings.loss)
-    messages = [*mechanical.messages, *_suspicions(measured, mechanical)]
+    mechanical = mechanical_of(robot, measured, settings.loss)
+    messages = [*mechanical.messages, *mechanical.suspicions(measured)]
     for message in messages:
         warnings.warn(message, stacklevel=2)
-    settings = with_hysteresis_detected(settings, rows, mechanical)
+    settings = with_hysteresis_detected(settings, rows, robot, mechanical)
     if not settings.follows_order:
         rows = measured
     compared = compare(
@@ -113,7 +111,7 @@ def fit_log(
     )
     saved = AUTO if settings.auto else _best_to_save(compared)
     model = compared.models[saved]
-    if model.calibrate == mechanical.geometry:
+    if model.calibrate is mechanical.calibrate:
         model.set_params(calibrate=robot.calibrate)
     model.count_as_fitted(complete.q, complete.x)
     model.described(replace(model.description_, robot=robot))
@@ -154,7 +152,7 @@ def fit_log(
         ],
         tried=mechanical.tried,
         calibrated=mechanical.parameters,
-        calibration=_calibration(mechanical, measured, settings.loss, messages),
+        calibration=mechanical.calibration(measured, settings.loss, messages),
     )
     report = Report(f"{robot.name}: hybrid model of {record.log}", record)
     write_comparison(report)
@@ -177,20 +175,12 @@ def _check(
         )
     if settings.hysteresis == "detect" or not settings.follows_order:
         return
-    if robot.chain is None or not settings.auto or not log.named:
+    if not robot.has_segments or not settings.auto or not log.named:
         raise ValueError(
             "`hysteresis` requires a robot with segments, `auto=True` (no --no-auto), and motions "
             "that a column names (--groups COLUMN, or groups = in [log])."
         )
     log.check_order("`hysteresis`")
-
-
-def _suspicions(log: MeasuredLog, mechanical: Mechanical) -> list[str]:
-    """Return what the calibration says against the log and the description."""
-    if mechanical.start is None or mechanical.result is None:
-        return []
-    misread = log.misread(mechanical.result.chain)
-    return [*misread, *deviations(mechanical.start, mechanical.result, log.q_unit)]
 
 
 def _best_to_save(compared: CrossFit) -> str:
@@ -200,17 +190,6 @@ def _best_to_save(compared: CrossFit) -> str:
         if name not in (NOMINAL, DATA_QUADRATIC):
             means[name] = errors.mean
     return min(means, key=means.__getitem__)
-
-
-def _calibration(
-    mechanical: Mechanical, rows: MeasuredLog, loss: str, messages: Sequence[str]
-) -> Calibration | None:
-    if mechanical.start is None or mechanical.result is None:
-        return None
-    others = [*mechanical.rivals(rows, loss)]
-    return Calibration.of(
-        mechanical.start, mechanical.result, rows.q_unit, messages, others
-    )
 
 
 def _in_words(model: HybridForwardModel) -> list[str]:

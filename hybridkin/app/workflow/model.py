@@ -35,9 +35,7 @@ def trained_range(model: HybridForwardModel) -> robots.Limits:
 
     With backlash it is the range of the actuators' motion.
     """
-    return (
-        robots.Limits(*model.training_range_) if is_fitted(model) else robots.Limits()
-    )
+    return robots.Limits(*model.training_range_)
 
 
 def has_body(model: HybridForwardModel) -> bool:
@@ -165,10 +163,10 @@ def expected_errors(model: HybridForwardModel, q: NDArray) -> dict[str, NDArray]
 def plane_in_words(model: HybridForwardModel) -> str:
     """Return which motions the log lacks and no command makes, in its names; "" if none."""
     plane = model.module_.plane
-    if plane is None:
+    if not plane.n_normals:
         return ""
     log = model.description_.log
-    normals = plane[1].numpy(force=True) * np.reshape(log.q_factor, (-1, 1))
+    normals = plane.normals.numpy(force=True) * np.reshape(log.q_factor, (-1, 1))
     motions = in_terms(normals / np.abs(normals).max(axis=0), log.q)
     return (
         f"The log has no motion along {motions}, and the mechanical model knows no effect of it: "

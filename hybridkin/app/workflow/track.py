@@ -384,12 +384,11 @@ def _lead_in(track: Track, start: NDArray | None, domain: Domain) -> NDArray:
         end = led[1].clip(*domain.limits.commands)
     way = end - start
     dt = _period(track)
-    speed = limits.dq_max
-    if speed is None:
-        speed = _SLOW * max(limits.span.max(), np.abs(way).max())
+    usual = _SLOW * max(limits.span.max(), np.abs(way).max())
+    speed = np.where(np.isfinite(limits.dq_max), limits.dq_max, usual)
     moves = math.ceil((_PEAK * np.abs(way) / (speed * dt)).max())
     n = moves
-    if limits.ddq_max is not None:
+    if np.isfinite(limits.ddq_max).any():
         seconds = np.sqrt(_PUSH * np.abs(way) / limits.ddq_max).max()
         moves = max(moves, math.ceil(seconds / dt))
         n = moves + 1  # the path begins at rest
@@ -515,18 +514,15 @@ def _within_speeds(q: NDArray, track: Track, domain: Domain) -> NDArray | None:
     """Return commands (N, n) within the limits of speed; None if they accelerate too much."""
     limits = domain.limits
     seconds = _steps(track)[:, None]
-    if limits.dq_max is not None:
+    if np.isfinite(limits.dq_max).any():
         q = q.copy()
         for k in range(1, len(q)):
             most = limits.dq_max * seconds[k]
             q[k] = q[k - 1] + (q[k] - q[k - 1]).clip(-most, most)
-    if limits.ddq_max is not None:
-        speed = np.diff(q, axis=0, prepend=q[:1]) / np.where(
-            seconds > 0.0, seconds, 1.0
-        )
-        change = np.abs(np.diff(speed, axis=0)) / seconds[1:]
-        if (change > limits.ddq_max * (1.0 + 1e-9)).any():
-            return None
+    speed = np.diff(q, axis=0, prepend=q[:1]) / np.where(seconds > 0.0, seconds, 1.0)
+    change = np.abs(np.diff(speed, axis=0)) / seconds[1:]
+    if (change > limits.ddq_max * (1.0 + 1e-9)).any():
+        return None
     return q
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from hybridkin import Commands, HybridForwardModel, robots
@@ -422,10 +423,8 @@ def _separation(compared: CauseComparison) -> str:
 
 def _off_plane(model: HybridForwardModel, q: NDArray) -> NDArray:
     """Return the part (N, n) of commands off the plane of the log, 0 if they keep to it."""
-    if model.module_.tip_model.plane is None:
-        return np.zeros_like(q)
-    point, normals = (part.numpy(force=True) for part in model.module_.tip_model.plane)
-    off = (q - point) @ normals @ normals.T
+    plane = model.module_.tip_model.plane
+    off = q - plane.nearest(torch.from_numpy(q)).numpy(force=True)
     return np.where(np.abs(off).max() > _OFF * np.ptp(q, axis=0).max(), off, 0.0)
 
 

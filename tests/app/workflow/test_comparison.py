@@ -13,9 +13,9 @@ from hybridkin.app.workflow import FitSettings
 from hybridkin.app.workflow.choices import choices_by_fold
 from hybridkin.app.workflow.compare import (
     AUTO,
-    Mechanical,
     _models_for,
     compare,
+    mechanical_of,
     models_of,
     with_hysteresis_detected,
 )
@@ -40,8 +40,8 @@ def measured(n_motions, n_rows=14):
 def compared(robot, rows, **settings):
     """Return the calibration to all rows, the comparison, and its settings."""
     settings = FitSettings(**settings)
-    mechanical = Mechanical.of(robot, rows, settings.loss)
-    settings = with_hysteresis_detected(settings, rows, mechanical)
+    mechanical = mechanical_of(robot, rows, settings.loss)
+    settings = with_hysteresis_detected(settings, rows, robot, mechanical)
     return mechanical, compare(rows, robot, settings, mechanical, n_jobs=1), settings
 
 

@@ -4,12 +4,9 @@ import numpy as np
 import pytest
 
 from hybridkin import datasets, robots
-from hybridkin._core.units import LogUnit
-from hybridkin.app.workflow.calibrated import Calibration, calibrated_parameters
-from hybridkin.app.workflow.compare import Mechanical
+from hybridkin.app.workflow.calibrated import calibrated_parameters
+from hybridkin.app.workflow.compare import mechanical_of
 from hybridkin.app.workflow.log import checked
-
-MILLIMETRES = LogUnit.of("m")
 
 
 def measured(q, x, motions):
@@ -18,10 +15,9 @@ def measured(q, x, motions):
 
 def entries(robot, rows):
     """Parameters of the calibration on rows, as in their report, and those without other sets."""
-    mechanical = Mechanical.of(robot, rows, "linear")
-    others = [*mechanical.rivals(rows, "linear")]
-    reported = Calibration.of(mechanical.start, mechanical.result, MILLIMETRES, (), others)
-    alone = calibrated_parameters(mechanical.start, mechanical.result, MILLIMETRES)
+    mechanical = mechanical_of(robot, rows, "linear")
+    reported = mechanical.calibration(rows, "linear", ())
+    alone = calibrated_parameters(mechanical.geometry.chain, mechanical.result, rows.q_unit)
     by_name = [{entry.name: entry for entry in found} for found in (reported.entries, alone)]
     return mechanical.geometry, *by_name
 

@@ -18,7 +18,7 @@ from hybridkin import (
 )
 from hybridkin.app import workflow
 from hybridkin.app.workflow import FitSettings
-from hybridkin.app.workflow.compare import Mechanical, compare
+from hybridkin.app.workflow.compare import compare, mechanical_of
 from hybridkin.app.workflow.domain import Domain
 from hybridkin.app.workflow.errors import Errors, HeldOutErrors, Promise
 from hybridkin.app.workflow.fit_record import largest_errors
@@ -151,7 +151,7 @@ def test_limits_are_those_of_metres(tmp_path, learned):
     """
     metres = loaded(np.ones(6), tmp_path, learned=learned)
     motors = loaded(GAINS, tmp_path, learned=learned)
-    given = robots.Limits(np.full(6, -0.003), np.full(6, 0.002), None, np.full(6, 0.1))
+    given = robots.Limits(np.full(6, -0.003), np.full(6, 0.002), ddq_max=np.full(6, 0.1))
     for limits in (robots.Limits(), given, robots.Limits(q_min=np.full(6, -0.002))):
         plain = workflow.path_limits(metres, **vars(limits))
         other = workflow.path_limits(motors, **vars(limits.scaled(1.0 / GAINS)))
@@ -377,7 +377,7 @@ def test_a_comparison_does_not_depend_on_units_and_names(tmp_path, sign):
         robot = robots.RobotDescription("r", chain, ("rest_bends", "base"), None)
         log = Log(q / gains, x, labels, time=0.1 * np.arange(60.0) + 1e3 * (sign < 0.0))
         rows = checked(log, chain, base_is_free=True)
-        mechanical = Mechanical.of(robot, rows, "linear")
+        mechanical = mechanical_of(robot, rows, "linear")
         found.append(compare(rows, robot, settings, mechanical, n_jobs=1))
     ours, theirs = found
     assert_array_equal(ours.fold, theirs.fold)

@@ -20,8 +20,8 @@ from hybridkin.app import workflow
 from hybridkin.app.cli.main import main
 from hybridkin.app.workflow.choices import choices_by_fold
 from hybridkin.app.workflow.compare import (
-    Mechanical,
     compare,
+    mechanical_of,
     with_hysteresis_detected,
 )
 from hybridkin.app.workflow.domain import Domain
@@ -77,7 +77,7 @@ def test_play_lowers_the_errors_of_auto_on_held_out_motions(playful):
     robot, log = playful
     settings = workflow.FitSettings(n_folds=2, hysteresis=4e-4)
     log = checked(log, robot.chain, base_is_free=True)
-    mechanical = Mechanical.of(robot, log, settings.loss)
+    mechanical = mechanical_of(robot, log, settings.loss)
     compared = compare(log, robot, settings, mechanical, n_jobs=1)
     errors, choices = compared.errors, choices_by_fold(compared, log.q_unit)
     assert errors["hybrid, auto"].mean < 0.1 * errors["mechanical, calibrated"].mean
@@ -90,9 +90,9 @@ def test_play_is_tried_by_itself_where_the_order_of_the_rows_matters(playful):
 
     def detected(log, **settings):
         rows = checked(log, robot.chain, base_is_free=False)
-        mechanical = Mechanical.of(robot, rows, "linear")
+        mechanical = mechanical_of(robot, rows, "linear")
         return with_hysteresis_detected(
-            workflow.FitSettings(**settings), rows, mechanical
+            workflow.FitSettings(**settings), rows, robot, mechanical
         ).hysteresis
 
     assert detected(log) == "auto"
@@ -133,7 +133,7 @@ def test_given_limits_replace_those_of_the_description():
     assert found.q_max.tolist() == [0.002] * 3
     assert found.dq_max.tolist() == [0.02] * 3
     assert found.ddq_max.tolist() == [0.5] * 3
-    assert workflow.path_limits(loaded).ddq_max is None
+    assert np.isinf(workflow.path_limits(loaded).ddq_max).all()
     assert found.source == "given and robot description"
     with pytest.raises(ValueError, match="`q_min` must not exceed `q_max`"):
         workflow.path_limits(loaded, q_min=0.02)

@@ -106,7 +106,7 @@ class MovedBase(Cause):
         """Return the one cause of this kind."""
         return [cls()]
 
-    def moved(self, evidence: Evidence) -> NDArray:
+    def moved_rows(self, evidence: Evidence) -> NDArray:
         """Return the rows (N,) of bool that are measured from the other place."""
         return np.ones(len(evidence.rows), dtype=bool)
 
@@ -118,7 +118,7 @@ class MovedBase(Cause):
         self, evidence: Evidence, used: NDArray, start: NDArray, rounds: int
     ) -> NDArray:
         """Return the rigid motion (12,) that brings some rows nearest to the measured tips."""
-        rows = used & self.moved(evidence)
+        rows = used & self.moved_rows(evidence)
         if rows.sum() < 3:
             return start
         tips = evidence.tips[rows]
@@ -136,7 +136,7 @@ class MovedBase(Cause):
         motion = parameters.reshape(3, 4)
         tips = evidence.tips
         moved = tips @ motion[:, :3].T + motion[:, 3]
-        return np.where(self.moved(evidence)[:, None], moved, tips)
+        return np.where(self.moved_rows(evidence)[:, None], moved, tips)
 
     def amount(self, evidence: Evidence, parameters: NDArray) -> str:
         """Return the angle, and how far the middle of the tips moves, in words."""
@@ -170,7 +170,7 @@ class Bump(MovedBase):
         gain = np.square(after).sum(axis=1) / total
         return [cls(row) for row in evidence.sudden_rows(gain)]
 
-    def moved(self, evidence: Evidence) -> NDArray:
+    def moved_rows(self, evidence: Evidence) -> NDArray:
         """Return the rows (N,) of bool after the bump."""
         return evidence.rows >= self.row
 
