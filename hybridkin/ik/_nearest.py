@@ -41,10 +41,18 @@ class Polyhedron(NamedTuple):
 
     def rounding(self, x: Tensor) -> Tensor:
         """Return what rounding may leave of the excess of x, shape (N, 2 n + k)."""
-        sizes = (self.A.abs() @ x.abs()[..., None])[..., 0] + self.b.abs()
-        bounds = [x.abs() + end.abs() for end in (self.lower, self.upper)]
-        unit = 32.0 * torch.finfo(x.dtype).eps
-        return unit * torch.cat([*bounds, sizes], dim=-1)
+        largest = x.abs().amax(-1, keepdim=True)
+        ends = torch.cat([self.lower, self.upper, self.b], dim=-1)
+        return 8.0 * torch.finfo(x.dtype).eps * (largest + ends.abs())
+
+    def snapped(self, x: Tensor) -> Tensor:
+        """Return x within the bounds, and exactly at those that it reaches up to rounding."""
+        n = x.shape[-1]
+        excess = self.excess(x)
+        # Points without a choice end beside a bound by the rounding of all that led there.
+        beyond = (excess >= -100.0 * self.rounding(x)) & torch.isfinite(excess)
+        x = torch.where(beyond[:, :n], self.lower, x)
+        return torch.where(beyond[:, n : 2 * n], self.upper, x)
 
     def normals(self, which: Tensor) -> Tensor:
         """Return the inward normals (N, n) of inequalities (N,), one for every row."""
@@ -125,6 +133,11 @@ class _Active(NamedTuple):
             torch.where(slot, -1, self.which),
         )
 
+    def chosen_of(self, inequalities: Tensor) -> Tensor:
+        """Return which inequalities (N, K) are active, bool (N, K)."""
+        K = inequalities.shape[-1]
+        return one_hot(self.which.clamp_min(-1) + 1, K + 1)[..., 1:].bool().any(1)
+
     def pushing(self, way: Tensor, rows: Tensor) -> _Active:
         """Return the constraints with the forces of points `way` from the origin, in some rows."""
         force = apply_rows(self.inverse, way)
@@ -183,13 +196,13 @@ def nearest(x: Tensor, within: Polyhedron, excess: Tensor | float = 0.0) -> Tens
         live = live.choosing()
         done = live.chosen < 0
         if done.any():
-            ends[live.rows[done]] = live.take(done).at_bounds()
+            ends[live.rows[done]] = live.x[done]
             live = live.take((~done).nonzero()[:, 0])
         if live.rows.numel() == 0:
             break
         live = live.after_change()
     ends[live.rows] = live.x
-    return torch.clamp(ends, within.lower, within.upper)
+    return within.snapped(ends)
 
 
 class _Live(NamedTuple):
@@ -269,6 +282,7 @@ class _Live(NamedTuple):
         for _ in range(1 + IK_PROXIMAL):
             beyond = live.within.excess(live.x)
             violated = torch.where(beyond > live.within.rounding(live.x), beyond, 0.0)
+            violated = violated.masked_fill(live.active.chosen_of(beyond), 0.0)
             most, worst = violated.max(-1)
             none = (live.chosen < 0) & (most > 0.0)
             live = live._replace(chosen=torch.where(none, worst, live.chosen))
@@ -378,14 +392,6 @@ class _Live(NamedTuple):
         off = torch.where(which >= 0, inequality, 0.0)
         # Row c of `inverse` moves along the inward normal c alone.
         return self.x - (off[..., None] * self.active.inverse).sum(1)
-
-    def at_bounds(self) -> Tensor:
-        """Return x with the coordinates of active bounds exactly there."""
-        n = self.x.shape[-1]
-        active = one_hot(self.active.which + 1, 1 + 2 * n + self.within.b.shape[-1]).any(1)
-        _, lower, upper = active[:, : 1 + 2 * n].split([1, n, n], dim=-1)
-        x = torch.where(lower, self.within.lower, self.x)
-        return torch.where(upper, self.within.upper, x)
 
     def take(self, rows: Tensor) -> _Live:
         """Return some rows."""
