@@ -70,15 +70,12 @@ HK_ASIDE = (
 )
 IK_HEALTHY = 0.02  # sigma_min / sigma_max above which no damping is needed
 IK_CHANGES = 400  # of the active constraints of a step; a handful is usual
-IK_NEWTON = 60  # Newton steps in a box; a handful is usual
 IK_SWEEPS = 30  # of Jacobi's method for eigenvalues; six are usual
 IK_PROXIMAL = 2  # rounds that remove the effect of the least damping
 IK_NORMALS = 6  # most normals of the plane of a log
 IK_BALANCE = (
     30.0  # weight of a motion that leaves the plane, relative to that of the tip
 )
-IK_PROJECTIONS = 8  # of a step that would leave the half-spaces of the tip
-IK_EXCESS = 1.5  # factor on the way back into them
 IK_CORRECTIONS = 3  # corrections of a step whose tip must move as promised
 IK_SLACK = 0.02  # a tendon that moves the tip less, relative to the most, is slack
 IK_SLIP = (

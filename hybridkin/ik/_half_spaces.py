@@ -49,7 +49,8 @@ class HalfSpaces(Portable):
         infinite = torch.full_like(still, math.inf)
         none = still.new_empty(len(still), 0)
         equations = normals[:, :0]
-        within = Polyhedron(equations, none, -infinite, infinite, normals, margin)
+        most = torch.full_like(margin, math.inf)
+        within = Polyhedron(equations, none, -infinite, infinite, normals, margin, most)
         return nearest(still, within)
 
 

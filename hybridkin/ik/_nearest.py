@@ -25,6 +25,8 @@ class Polyhedron(NamedTuple):
         Bounds, lower <= upper, infinite where there are none.
     A, b : Tensor of shape (N, k, n) and (N, k)
         Rows of length one, the most important ones first, and their offsets.
+    most : Tensor of shape (N, k)
+        The largest offsets to which rows may be relaxed.
     """
 
     E: Tensor
@@ -33,6 +35,7 @@ class Polyhedron(NamedTuple):
     upper: Tensor
     A: Tensor
     b: Tensor
+    most: Tensor
 
     def excess(self, x: Tensor) -> Tensor:
         """Return by how much x violates every inequality, shape (N, 2 n + k): the bounds first."""
@@ -44,15 +47,6 @@ class Polyhedron(NamedTuple):
         largest = x.abs().amax(-1, keepdim=True)
         ends = torch.cat([self.lower, self.upper, self.b], dim=-1)
         return 8.0 * torch.finfo(x.dtype).eps * (largest + ends.abs())
-
-    def snapped(self, x: Tensor) -> Tensor:
-        """Return x within the bounds, and exactly at those that it reaches up to rounding."""
-        n = x.shape[-1]
-        excess = self.excess(x)
-        # Points without a choice end beside a bound by the rounding of all that led there.
-        beyond = (excess >= -100.0 * self.rounding(x)) & torch.isfinite(excess)
-        x = torch.where(beyond[:, :n], self.lower, x)
-        return torch.where(beyond[:, n : 2 * n], self.upper, x)
 
     def normals(self, which: Tensor) -> Tensor:
         """Return the inward normals (N, n) of inequalities (N,), one for every row."""
@@ -202,7 +196,7 @@ def nearest(x: Tensor, within: Polyhedron, excess: Tensor | float = 0.0) -> Tens
             break
         live = live.after_change()
     ends[live.rows] = live.x
-    return within.snapped(ends)
+    return torch.clamp(ends, within.lower, within.upper)
 
 
 class _Live(NamedTuple):
@@ -363,6 +357,11 @@ class _Live(NamedTuple):
         first_row = 2 * n
         which = torch.where(shares < -_rounding(shares), self.active.which, -1)
         which = torch.cat([which, self.chosen[:, None]], dim=-1)
+        room = self.within.most - self.within.b
+        every = torch.cat(
+            [torch.zeros_like(self.within.excess(self.x))[:, :first_row], room], dim=-1
+        )
+        which = torch.where(every.gather(-1, which.clamp_min(0)) > 0.0, which, -1)
         factors = torch.cat([-shares, torch.ones_like(missing)[:, None]], dim=-1)
         least, slot = which.max(-1)
         has_row = stuck & (least >= first_row)
@@ -371,7 +370,7 @@ class _Live(NamedTuple):
         over = torch.where(has_row, by, 0.0)
         b = self.within.b
         if b.shape[-1]:
-            b = b.scatter_add(-1, row[:, None], over[:, None])
+            b = b.scatter_add(-1, row[:, None], over[:, None]).minimum(self.within.most)
         anew = stuck[:, None]
         active = self.active.where(~stuck, self.equations)
         return self._replace(

@@ -11,6 +11,8 @@ from torch import Tensor
 from hybridkin.ik._gram import apply_rows
 from hybridkin.ik._nearest import Polyhedron, nearest
 
+_CLOSE = 100.0  # rounding of a step [eps]
+
 
 class StepLimits(NamedTuple):
     """Steps dq with lower <= dq <= upper and A dq <= b.
@@ -50,6 +52,23 @@ class StepLimits(NamedTuple):
         """Return whether steps are beyond a limit, bool (N,)."""
         beyond = apply_rows(self.A, dq) > self.b
         return (self.clip(dq) != dq).any(-1) | beyond.any(-1)
+
+    def snapped(self, dq: Tensor) -> Tensor:
+        """Return steps exactly at the bounds that they reach up to rounding.
+
+        Where a step has no choice it ends beside a bound by the rounding of all that led there.
+        """
+        close = _CLOSE * torch.finfo(dq.dtype).eps
+        largest = dq.abs().amax(-1, keepdim=True)
+        at_lower = (dq - self.lower) <= close * (largest + self.lower.abs())
+        at_upper = (self.upper - dq) <= close * (largest + self.upper.abs())
+        dq = torch.where(at_lower & torch.isfinite(self.lower), self.lower, dq)
+        return torch.where(at_upper & torch.isfinite(self.upper), self.upper, dq)
+
+    def at_rest(self) -> Tensor:
+        """Return b, or where the bounds do not allow it at rest what rest has, shape (N, k)."""
+        rest = self.clip(torch.zeros_like(self.lower))
+        return torch.maximum(self.b, apply_rows(self.A, rest))
 
     def in_unit(self, unit: Tensor) -> StepLimits:
         """Return the limits of dq / unit."""
@@ -126,7 +145,8 @@ def damped_step(
 ) -> Tensor:
     """Return the steps with the least |dq - z|^2 + |J dq - v|^2 / lambda^2 within the limits.
 
-    lambda is at `least` (N,), and proximal rounds take the effect out. With s = (v - J dq) / lambda it is the point (dq, s) nearest to (z, 0) with J dq + lambda s = v.
+    lambda is at `least` (N,), and proximal rounds take the effect out. With s = (v - J dq) / lambda
+    it is the point (dq, s) nearest to (z, 0) with J dq + lambda s = v.
     """
     N, m, n = J.shape
     used = torch.maximum(damping, least)
@@ -145,6 +165,7 @@ def damped_step(
         torch.cat([limits.upper, none], dim=-1),
         rows,
         limits.b / length,
+        limits.at_rest() / length,
     )
     start = torch.cat([z, torch.zeros_like(v)], dim=-1)
-    return nearest(start, within, excess)[:, :n]
+    return limits.snapped(nearest(start, within, excess)[:, :n])

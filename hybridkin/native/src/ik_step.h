@@ -236,7 +236,8 @@ static inline void ik_in_plane(const ik_settings *ik, int rows, real *a) {
    none) leaves the plane: else a limit that stops one actuator would unbalance the others. */
 static HK_NOINLINE void ik_limited_in_plane(const ik_settings *ik, const real *J, const real *v,
                                             const real *z, const real *aside, const real *lower,
-                                            const real *upper, real damping_sq, real *dq) {
+                                            const real *upper, const ik_rows_t *limits,
+                                            real damping_sq, real *dq) {
     const int n = ik->n, m = ik->m;
     real *rows = ik_slot(ik, IK_IN_PLANE), motion[IK_MOST_ROWS], g[IK_MOST_PAIRS];
     /* J is in the unit in which weights are 1, so that only their ratios count. */
@@ -252,14 +253,16 @@ static HK_NOINLINE void ik_limited_in_plane(const ik_settings *ik, const real *J
         }
     }
     ik_products(m + ik->n_normals, n, rows, NULL, g);
-    ik_strict_box(m + ik->n_normals, n, rows, g, motion, z, lower, upper, damping_sq,
-                  ik->least > R(0.0), dq);
+    ik_strict_step(m + ik->n_normals, n, rows, g, motion, z, lower, upper, limits, damping_sq,
+                   ik->least > R(0.0), dq);
 }
 
 /* Fill in a step for the task v within its bounds; `slides`: with its posture step. `trust` is
-   lambda^2 / sigma_max^2 in place of the settings' damping, NULL where that counts. */
+   lambda^2 / sigma_max^2 in place of the settings' damping, NULL where that counts; `margin` (NULL:
+   none) is what the half-spaces of the tip leave. */
 HK_INLINE void ik_limited_step_of(int m, int n, const ik_settings *ik, const real *J, const real *v,
-                                  int slides, const real *trust, ik_step_t *s) {
+                                  int slides, const real *trust, const real *margin,
+                                  ik_step_t *s) {
     real ends[2 * HK_MAX_N], z[HK_MAX_N], mu[IK_ROWS], g[IK_PAIRS];
     real low = R(0.0), high, damping_sq, *dq = s->dq;
     const int exact = m != 3 && !trust && (!ik->quick || ik->n_free > 0);
@@ -303,12 +306,25 @@ HK_INLINE void ik_limited_step_of(int m, int n, const ik_settings *ik, const rea
     if (ik->flags & IK_LIMITED) {
         int over =
             ik->n_normals > 0 && ik->flags & IK_WEIGHTS; /* weights turn J out of the plane */
+        real A[HK_SPACES ? HK_MAX_N * HK_MAX_N : 1];
+        const ik_rows_t rows = {margin ? ik->n_spaces : 0, A, margin};
         for (int j = 0; j < n; j++) over |= ik_clip(dq[j], lower[j], upper[j]) != dq[j];
+        for (int i = 0; i < rows.k; i++) {
+            real along = R(0.0);
+            for (int j = 0; j < n; j++) {
+                A[n * i + j] = R(0.0);
+                for (int r = 0; r < m; r++)
+                    A[n * i + j] += ik->spaces[r * rows.k + i] * J[n * r + j];
+                along += A[n * i + j] * dq[j];
+            }
+            over |= along > margin[i];
+        }
         if (over && ik->n_normals > 0)
-            ik_limited_in_plane(ik, J, v, z, slides ? s->posture : NULL, lower, upper, damping_sq,
-                                dq);
+            ik_limited_in_plane(ik, J, v, z, slides ? s->posture : NULL, lower, upper, &rows,
+                                damping_sq, dq);
         else if (over)
-            ik_strict_box(m, n, J, g, v, z, lower, upper, damping_sq, ik->least > R(0.0), dq);
+            ik_strict_step(m, n, J, g, v, z, lower, upper, &rows, damping_sq, ik->least > R(0.0),
+                           dq);
     }
     for (int j = 0; j < n; j++) {
         s->held[j] = (unsigned char)((dq[j] <= lower[j]) | (dq[j] >= upper[j]));
@@ -319,12 +335,13 @@ HK_INLINE void ik_limited_step_of(int m, int n, const ik_settings *ik, const rea
 }
 
 static HK_NOINLINE void ik_limited_step(const ik_settings *ik, const real *J, const real *v,
-                                        int slides, const real *trust, ik_step_t *s) {
+                                        int slides, const real *trust, const real *margin,
+                                        ik_step_t *s) {
     switch (HK_COMMON(100 * ik->m + ik->n)) {
-    case 306: ik_limited_step_of(3, 6, ik, J, v, slides, trust, s); break;
-    case 309: ik_limited_step_of(3, 9, ik, J, v, slides, trust, s); break;
-    case 606: ik_limited_step_of(6, 6, ik, J, v, slides, trust, s); break;
-    default: IK_OF(ik->m, ik_limited_step_of, ik->n, ik, J, v, slides, trust, s);
+    case 306: ik_limited_step_of(3, 6, ik, J, v, slides, trust, margin, s); break;
+    case 309: ik_limited_step_of(3, 9, ik, J, v, slides, trust, margin, s); break;
+    case 606: ik_limited_step_of(6, 6, ik, J, v, slides, trust, margin, s); break;
+    default: IK_OF(ik->m, ik_limited_step_of, ik->n, ik, J, v, slides, trust, margin, s);
     }
 }
 
@@ -382,7 +399,7 @@ static inline real ik_braking(const ik_settings *ik, const real *J, const real *
                               ik_step_t *s) {
     real least = R(INFINITY);
     for (int j = 0; j < ik->n; j++) s->lower[j] = -least, s->upper[j] = least;
-    ik_limited_step(ik, J, way, 0, NULL, s);
+    ik_limited_step(ik, J, way, 0, NULL, NULL, s);
     for (int j = 0; j < ik->n; j++) {
         const real ratio = ik->accel[j] * seconds * seconds / ik_abs(s->dq[j]);
         least = ratio < least ? ratio : least;
@@ -411,134 +428,26 @@ static inline void ik_along(const ik_settings *ik, const real *way, real *along)
     }
 }
 
-/* The shortest motion (m) of the tip that goes along no normal farther than `margin` (n_spaces).
-
-   It is -A^T nu, where nu >= 0 minimises |A^T nu|^2 / 2 + nu . margin: a change of nu is a step in a
-   box. Rounds on the multipliers take out the effect of its damping. */
-static HK_NOINLINE void ik_way_in(const ik_settings *ik, const real *margin, real *way) {
+/* A motion v (m), moved by the shortest way into what the margins (n_spaces) allow. */
+static HK_NOINLINE void ik_allowed(const ik_settings *ik, const real *margin, const real *v,
+                                   real *allowed) {
     const int k = ik->n_spaces, m = ik->m;
-    const real rounding = HK_MATH(sqrt)(HK_EPS), small = rounding > R(1e-6) ? rounding : R(1e-6);
-    real nu[HK_MAX_N], z[HK_MAX_N], lower[HK_MAX_N], upper[HK_MAX_N], change[HK_MAX_N];
-    real still[IK_ROWS], moved[IK_ROWS];
-    int out = 0;
-    for (int r = 0; r < m; r++) way[r] = still[r] = R(0.0);
-    for (int i = 0; i < k; i++) {
-        nu[i] = R(0.0), upper[i] = R(INFINITY);
-        out |= margin[i] < R(0.0);
-    }
-    for (int round = 0; out && round <= IK_PROXIMAL; round++) {
-        real mu[IK_MOST_ROWS] = {R(0.0)};
-        ik_along(ik, way, z);
-        for (int i = 0; i < k; i++) z[i] = (z[i] - margin[i]) / small, lower[i] = -nu[i];
-        ik_box(m, k, ik->spaces, still, z, lower, upper, small, mu, change);
-        for (int i = 0; i < k; i++) nu[i] += change[i];
-        IK_OF(m, ik_rows_of, k, ik->spaces, change, moved);
-        for (int r = 0; r < m; r++) way[r] -= moved[r];
-    }
+    real normals[HK_MAX_N * IK_ROWS], ends[HK_MAX_N], low[IK_ROWS], high[IK_ROWS], to[IK_ROWS];
+    for (int i = 0; i < k; i++)
+        for (int r = 0; r < m; r++) normals[m * i + r] = ik->spaces[r * k + i], ends[i] = margin[i];
+    for (int r = 0; r < m; r++) low[r] = -R(INFINITY), high[r] = R(INFINITY);
+    const near_problem p = {m, 0, k, NULL, NULL, v, low, high, normals, ends, NULL, R(1.0), R(0.0)};
+    ik_nearest(&p, to);
+    for (int r = 0; r < m; r++) allowed[r] = to[r];
 }
 
-/* A motion v (m), moved into what the margins allow. */
-static inline void ik_allowed(const ik_settings *ik, const real *margin, const real *v,
-                              real *allowed) {
-    real along[HK_MAX_N], way[IK_ROWS];
-    ik_along(ik, v, along);
-    for (int i = 0; i < ik->n_spaces; i++) along[i] = margin[i] - along[i];
-    ik_way_in(ik, along, way);
-    for (int r = 0; r < ik->m; r++) allowed[r] = v[r] + way[r];
-}
-
-/* How far a step leads beyond the margins, over (n_spaces); whether anywhere by more than
-   rounding. */
-static inline int ik_leaves(const ik_settings *ik, const real *J, const real *dq,
-                            const real *margin, real *over) {
-    real moved[IK_ROWS];
+/* Whether a motion v (m) of the tip would leave the margins, by more than rounding. */
+static inline int ik_leaves(const ik_settings *ik, const real *margin, const real *v) {
+    real along[HK_MAX_N];
     int any = 0;
-    ik_motion(ik, J, dq, moved);
-    ik_along(ik, moved, over);
-    for (int i = 0; i < ik->n_spaces; i++) {
-        over[i] -= margin[i];
-        any |= over[i] > R(32.0) * HK_EPS;
-    }
+    ik_along(ik, v, along);
+    for (int i = 0; i < ik->n_spaces; i++) any |= along[i] - margin[i] > R(32.0) * HK_EPS;
     return any;
-}
-
-/* The share of the way from one step to another after which it leaves no margin, where the other is
-   beyond one, `over`, and this one is not, `least`. */
-static inline real ik_share(const ik_settings *ik, const real *least, const real *over) {
-    const real close = R(32.0) * HK_EPS;
-    real share = R(1.0);
-    for (int i = 0; i < ik->n_spaces; i++) {
-        if (!(over[i] > close)) continue;
-        const real here = ik_clip((close - least[i]) / (over[i] - least[i]), R(0.0), R(1.0));
-        share = here < share ? here : share;
-    }
-    return share;
-}
-
-/* Move a step towards the margins by alternating projections, with some excess so that they end;
-   `wanted` (m) is the motion that it was solved for. Returns whether it leaves them yet, `over`. */
-static HK_NOINLINE int ik_project(const ik_settings *ik, const real *J, const real *margin,
-                                  int slides, real *wanted, real *over, ik_step_t *s) {
-    int out = ik_leaves(ik, J, s->dq, margin, over);
-    for (int round = 0; out && round < IK_PROJECTIONS; round++) {
-        real moved[IK_ROWS];
-        /* A bit farther in, because a step in a box is right to rounding only. */
-        for (int i = 0; i < ik->n_spaces; i++) over[i] = -over[i] - R(256.0) * HK_EPS;
-        ik_way_in(ik, over, wanted);
-        ik_motion(ik, J, s->dq, moved);
-        for (int r = 0; r < ik->m; r++) wanted[r] = moved[r] + IK_EXCESS * wanted[r];
-        ik_limited_step(ik, J, wanted, slides, NULL, s);
-        out = ik_leaves(ik, J, s->dq, margin, over);
-    }
-    return out;
-}
-
-/* A step `safe` (n) into the half-spaces, or as near to them as found; the margins of those that it
-   does not reach are widened up to it. It starts at rest, or at the hardest braking, and leads
-   farther out of none than this start. */
-static inline void ik_safe_step(const ik_settings *ik, const real *J, const ik_step_t *s,
-                                real *margin, real *safe) {
-    real rest[HK_MAX_N] = {R(0.0)}, least[HK_MAX_N], over[HK_MAX_N], wanted[IK_ROWS];
-    ik_step_t back;
-    for (int j = 0; j < ik->n; j++) {
-        back.lower[j] = s->lower[j], back.upper[j] = s->upper[j];
-        back.dq[j] = rest[j] = ik_clip(R(0.0), s->lower[j], s->upper[j]);
-    }
-    ik_leaves(ik, J, rest, margin, least);
-    ik_project(ik, J, margin, 0, wanted, over, &back);
-    for (int i = 0; i < ik->n_spaces; i++) /* no farther out than at rest */
-        if (least[i] > R(0.0)) over[i] -= least[i], least[i] = R(0.0);
-    const real share = ik_share(ik, least, over);
-    for (int j = 0; j < ik->n; j++)
-        safe[j] = ik_clip(rest[j] + share * (back.dq[j] - rest[j]), s->lower[j], s->upper[j]);
-    ik_leaves(ik, J, safe, margin, over);
-    for (int i = 0; i < ik->n_spaces; i++) margin[i] += over[i] > R(0.0) ? over[i] : R(0.0);
-}
-
-/* A step within its bounds after which, to first order, the tip is within the half-spaces: it has
-   `margin` (n_spaces) left. If the bounds move it out, alternating projections look for a motion
-   that meets both, and at last a share of the way from a safe step. */
-static HK_NOINLINE void ik_step_inside(const ik_settings *ik, const real *J, const real *v,
-                                       real *margin, int slides, ik_step_t *s) {
-    const int n = ik->n, m = ik->m;
-    real wanted[IK_ROWS] = {R(0.0)}, over[HK_MAX_N];
-    int stopped = 0;
-    ik_allowed(ik, margin, v, wanted);
-    ik_limited_step(ik, J, wanted, slides, NULL, s);
-    if (ik_leaves(ik, J, s->dq, margin, over)) {
-        real least[HK_MAX_N], safe[HK_MAX_N] = {R(0.0)};
-        ik_safe_step(ik, J, s, margin, safe);
-        if (ik_project(ik, J, margin, slides, wanted, over, s)) {
-            ik_leaves(ik, J, safe, margin, least);
-            const real share = ik_share(ik, least, over);
-            for (int j = 0; j < n; j++) {
-                s->dq[j] = ik_clip(safe[j] + share * (s->dq[j] - safe[j]), s->lower[j], s->upper[j]);
-                s->held[j] = (unsigned char)((s->dq[j] <= s->lower[j]) | (s->dq[j] >= s->upper[j]));
-            }
-        }
-    }
-    for (int r = 0; r < m; r++) stopped |= ik_abs(wanted[r] - v[r]) > R(32.0) * HK_EPS;
-    s->stopped = stopped;
 }
 
 /* The model at one configuration: x (width) and its derivative J (m, n). Every step and tick calls
@@ -608,7 +517,7 @@ static void ik_approach(const ik_settings *ik, const real *q, const real *x, con
             more.lower[j] = s->lower[j] - end.dq[j];
             more.upper[j] = s->upper[j] - end.dq[j];
         }
-        ik_limited_step(ik, end.J, end.missing, 0, NULL, &more);
+        ik_limited_step(ik, end.J, end.missing, 0, NULL, NULL, &more);
         for (int j = 0; j < ik->n; j++) {
             end.dq[j] = ik_clip(end.dq[j] + more.dq[j], s->lower[j], s->upper[j]);
             if (more.dq[j] <= more.lower[j]) end.dq[j] = s->lower[j]; /* to the last bit */
@@ -707,13 +616,13 @@ static HK_NOINLINE void ik_control(const ik_settings *ik, const real *q, const r
                 for (int r = 0; r < m; r++) normal[r] = ik->spaces[r * k + i];
                 margin[i] = ik_stopping(margin[i], ik_braking(ik, J, normal, seconds, s));
             }
-            for (int i = 0; i < k; i++) left[i] = margin[i];
             ik_bound(ik, q, seconds, last, ends, s);
-            ik_step_inside(ik, J, v, left, slides, s);
-            ik_allowed(ik, margin, v, v);
+            ik_limited_step(ik, J, v, slides, NULL, margin, s);
+            s->stopped = ik_leaves(ik, margin, v);
+            if (s->stopped) ik_allowed(ik, margin, v, v);
         } else {
             ik_bound(ik, q, seconds, last, ends, s);
-            ik_limited_step(ik, J, v, slides, NULL, s);
+            ik_limited_step(ik, J, v, slides, NULL, NULL, s);
             ik_motion(ik, J, s->dq, s->promised);
             const real damping_sq = s->damping * s->damping;
             const int lost = !(s->sigma_min > R(0.0)) || damping_sq > R(1.001) * ik->least;
