@@ -51,7 +51,7 @@ class HalfSpaces(Portable):
         equations = normals[:, :0]
         most = torch.full_like(margin, math.inf)
         within = Polyhedron(equations, none, -infinite, infinite, normals, margin, most)
-        return nearest(still, within)
+        return nearest(still, within)[0]
 
 
 def everywhere() -> HalfSpaces:

@@ -155,7 +155,12 @@ class _Active(NamedTuple):
         return _Active(*(a[rows] for a in self))
 
 
-def nearest(x: Tensor, within: Polyhedron, excess: Tensor | float = 0.0) -> Tensor:
+def nearest(
+    x: Tensor,
+    within: Polyhedron,
+    excess: Tensor | float = 0.0,
+    centre: Tensor | float = 0.0,
+) -> tuple[Tensor, Tensor]:
     """Return the points of polyhedra that are nearest to x (N, n).
 
     The dual active-set method of Goldfarb & Idnani with the distance as the objective: starting
@@ -174,29 +179,37 @@ def nearest(x: Tensor, within: Polyhedron, excess: Tensor | float = 0.0) -> Tens
     excess : Tensor of shape (N,)
         Proximal rounds move the values e of the equations by `excess` times their multipliers:
         what has been added to lambda^2, if the points hold the slack of the equations.
+    centre : Tensor of shape (N, m)
+        Multipliers of the equations that the first round takes.
 
     Returns
     -------
-    Tensor of shape (N, n)
+    x : Tensor of shape (N, n)
         Points within the bounds exactly, on equations and within rows up to rounding.
+    multipliers : Tensor of shape (N, m)
+        Those of the equations.
 
     References
     ----------
     Goldfarb & Idnani, Math. Program. 27 (1983), with their operators H and N*.
     """
     ends = x.clone()
-    live = _Live.on_equations(x, within, torch.zeros_like(x[:, 0]) + excess)
+    multipliers = torch.zeros_like(within.e)
+    excess = torch.zeros_like(x[:, 0]) + excess
+    live = _Live.on_equations(x, within, excess, centre)
     for _ in range(IK_CHANGES):
         live = live.choosing()
         done = live.chosen < 0
         if done.any():
             ends[live.rows[done]] = live.x[done]
+            multipliers[live.rows[done]] = live.multipliers[done]
             live = live.take((~done).nonzero()[:, 0])
         if live.rows.numel() == 0:
             break
         live = live.after_change()
     ends[live.rows] = live.x
-    return torch.clamp(ends, within.lower, within.upper)
+    multipliers[live.rows] = live.multipliers
+    return torch.clamp(ends, within.lower, within.upper), multipliers
 
 
 class _Live(NamedTuple):
@@ -236,9 +249,13 @@ class _Live(NamedTuple):
     force: Tensor
 
     @classmethod
-    def on_equations(cls, origin: Tensor, within: Polyhedron, excess: Tensor) -> _Live:
+    def on_equations(
+        cls, origin: Tensor, within: Polyhedron, excess: Tensor, centre: Tensor | float
+    ) -> _Live:
         """Return the points that are nearest to the origin on the equations alone."""
         x = origin
+        values = within.e
+        within = within._replace(e=values + excess[:, None] * centre)
         active = _Active.none(x)
         none = torch.full_like(x[:, 0], -1, dtype=torch.long)
         for normal, value in zip(within.E.unbind(1), within.e.unbind(1), strict=True):
@@ -258,7 +275,7 @@ class _Live(NamedTuple):
             x,
             x,
             within,
-            within.e,
+            values,
             excess,
             rounds,
             active,
@@ -266,6 +283,12 @@ class _Live(NamedTuple):
             none,
             force,
         )
+
+    @property
+    def multipliers(self) -> Tensor:
+        """Those of the equations (N, m)."""
+        m = self.values.shape[-1]
+        return apply_rows(self.active.inverse[:, :m], self.x - self.origin)
 
     def choosing(self) -> _Live:
         """Return the same with the inequality violated most chosen where there was none.
@@ -290,8 +313,7 @@ class _Live(NamedTuple):
         """Return the same with new values of the equations in the rows `ended` (N,)."""
         m = self.values.shape[-1]
         ended = ended[:, None]
-        multipliers = apply_rows(self.active.inverse, self.x - self.origin)[:, :m]
-        values = self.values + self.excess[:, None] * multipliers
+        values = self.values + self.excess[:, None] * self.multipliers
         values = torch.where(ended, values, self.within.e)
         change = values - self.within.e
         x = self.x + (change[..., None] * self.active.inverse[:, :m]).sum(1)

@@ -123,16 +123,25 @@ def strict_step(
     relative = max(1e-3, torch.finfo(J.dtype).eps ** 0.25)
     # If J is zero it only has to be positive.
     least = torch.where(size > 0.0, relative * size, 1.0)
+    centre = torch.zeros_like(v)
     rows = ((damping > 0.0) & (z != 0.0).any(-1)).nonzero()[:, 0]
     if rows.numel() > 0:
         still = torch.zeros_like(z[rows])
-        task = damped_step(
-            J[rows], v[rows], still, damping[rows], limits.take(rows), least[rows]
+        task, mu = damped_step(
+            J[rows],
+            v[rows],
+            still,
+            damping[rows],
+            limits.take(rows),
+            least[rows],
+            centre[rows],
         )
         v = v.index_put((rows,), apply_rows(J[rows], task))
         z = z.index_put((rows,), calmed(z[rows], task, calm[rows]))
         damping = damping.index_fill(0, rows, 0.0)
-    return damped_step(J, v, z, damping, limits, least)
+        # They keep the active limits, also where v is out of reach.
+        centre = centre.index_put((rows,), mu)
+    return damped_step(J, v, z, damping, limits, least, centre)[0]
 
 
 def damped_step(
@@ -142,10 +151,12 @@ def damped_step(
     damping: Tensor,
     limits: StepLimits,
     least: Tensor,
-) -> Tensor:
+    centre: Tensor,
+) -> tuple[Tensor, Tensor]:
     """Return the steps with the least |dq - z|^2 + |J dq - v|^2 / lambda^2 within the limits.
 
-    lambda is at `least` (N,), and proximal rounds take the effect out. With s = (v - J dq) / lambda
+    lambda is at `least` (N,), and proximal rounds from the multipliers `centre` (N, m) take the
+    effect out. With s = (v - J dq) / lambda
     it is the point (dq, s) nearest to (z, 0) with J dq + lambda s = v.
     """
     N, m, n = J.shape
@@ -168,4 +179,5 @@ def damped_step(
         limits.at_rest() / length,
     )
     start = torch.cat([z, torch.zeros_like(v)], dim=-1)
-    return limits.snapped(nearest(start, within, excess)[:, :n])
+    x, multipliers = nearest(start, within, excess, centre)
+    return limits.snapped(x[:, :n]), multipliers

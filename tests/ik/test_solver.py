@@ -75,10 +75,11 @@ def test_a_limited_step_is_the_optimum_of_a_reference_qp(rng, relative, m):
     lower[::7, 0], upper[::5, 1] = -torch.inf, torch.inf
     upper[::11, 3] = lower[::11, 3]
     damping_sq = relative * row_gram(J).sigma_max ** 2
-    dq = damped_step(
-        J, v, z, damping_sq.sqrt(), StepLimits.of_bounds(lower, upper, z), torch.zeros(N).double()
+    dq, mu = damped_step(
+        J, v, z, damping_sq.sqrt(), StepLimits.of_bounds(lower, upper, z), torch.zeros(N).double(), 0.0 * v
     )
     assert ((dq >= lower) & (dq <= upper)).all()
+    assert_close(damping_sq[:, None] * mu, v - apply_rows(J, dq), rtol=0.0, atol=1e-8)
     problems = (a.numpy() for a in (J, v, z, lower, upper, damping_sq))
     expected = np.stack([reference_qp(*row) for row in zip(*problems, strict=True)])
     assert_close(dq, torch.from_numpy(expected), rtol=0.0, atol=1e-8)

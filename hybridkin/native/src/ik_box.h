@@ -250,6 +250,7 @@ static void ik_strict_step(int m, int n, const real *J, const real *g, const rea
                            const ik_rows_t *rows, real damping_sq, int calm, real *dq) {
     real sum = R(0.0), moved[IK_MOST_ROWS], none[HK_MAX_N], slower[HK_MAX_N];
     real A[HK_MAX_N * HK_MAX_N], b[HK_MAX_N], most[HK_MAX_N];
+    real mu[IK_MOST_ROWS] = {R(0.0)};
     int preferred = 0;
     for (int k = 0, at = 0; k < m; k++)
         for (int i = k; i < m; i++, at++) sum += (i == k ? g[at] : R(2.0) * g[at]) * g[at];
@@ -269,7 +270,7 @@ static void ik_strict_step(int m, int n, const real *J, const real *g, const rea
         }
         most[i] = most[i] > rows->b[i] / unit ? most[i] : rows->b[i] / unit;
     }
-    near_problem p = {n, m, rows->k, J, v, z, lower, upper, A, b, most, R(0.0), R(0.0)};
+    near_problem p = {n, m, rows->k, J, v, z, lower, upper, A, b, most, R(0.0), R(0.0), mu};
     for (int stage = damping_sq > R(0.0) && preferred ? 0 : 1; stage < 2; stage++) {
         for (int i = 0; i < rows->k; i++) {
             const real length = ik_norm(n, rows->A + n * i);
@@ -283,6 +284,6 @@ static void ik_strict_step(int m, int n, const real *J, const real *g, const rea
         if (stage == 1) return;
         ik_rows_of(m, n, J, dq, moved);
         if (calm) ik_calm(n, dq, slower);
-        p.v = moved, damping_sq = R(0.0);
+        p.v = moved, damping_sq = R(0.0); /* mu keeps the active limits, also out of reach */
     }
 }

@@ -436,7 +436,7 @@ static HK_NOINLINE void ik_allowed(const ik_settings *ik, const real *margin, co
     for (int i = 0; i < k; i++)
         for (int r = 0; r < m; r++) normals[m * i + r] = ik->spaces[r * k + i], ends[i] = margin[i];
     for (int r = 0; r < m; r++) low[r] = -R(INFINITY), high[r] = R(INFINITY);
-    const near_problem p = {m, 0, k, NULL, NULL, v, low, high, normals, ends, NULL, R(1.0), R(0.0)};
+    const near_problem p = {m, 0, k, NULL, NULL, v, low, high, normals, ends, NULL, R(1.0), R(0.0), NULL};
     ik_nearest(&p, to);
     for (int r = 0; r < m; r++) allowed[r] = to[r];
 }

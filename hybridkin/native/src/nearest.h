@@ -17,7 +17,8 @@ typedef struct {
     real *b;          /* relaxed where rows contradict the bounds or more important ones, */
     const real *most; /* at most to these (NULL: no limit) */
     real damping;   /* lambda > 0 */
-    real excess;    /* what has been added to lambda^2: proximal rounds take its effect out */
+    real excess;    /* what has been added to lambda^2: proximal rounds take its effect out, */
+    real *mu;       /* from these multipliers (m) on, (v - J dq) / lambda^2, which they improve */
 } near_problem;
 
 /* The active constraints: inequality j is the lower bound of x_j, N + j the upper one and 2 N + i
@@ -95,7 +96,7 @@ static inline void near_begin(const near_problem *p, near_state *s) {
     for (int j = 0; j < N; j++) s->x[j] = j < n ? p->z[j] : R(0.0);
     for (int i = 0; i < N * N; i++) s->free[i] = i % (N + 1) ? R(0.0) : R(1.0);
     for (int i = 0; i < p->m; i++) {
-        real missing = s->e[i] = p->v[i];
+        real missing = s->e[i] = p->v[i] + p->excess * p->mu[i];
         for (int j = 0; j < N; j++) {
             normal[j] = j < n ? p->J[n * i + j] : j == n + i ? p->damping : R(0.0);
             missing -= normal[j] * s->x[j];
@@ -159,15 +160,22 @@ static inline void near_refine(const near_problem *p, near_state *s) {
         for (int j = 0; j < N; j++) s->x[j] += off[c] * s->inverse[N * c + j];
 }
 
+/* The multipliers of the equations. */
+static inline void near_multipliers(const near_problem *p, const near_state *s) {
+    for (int i = 0; i < p->m; i++) {
+        p->mu[i] = R(0.0);
+        for (int j = 0; j < s->N; j++)
+            p->mu[i] += s->inverse[s->N * i + j] * (s->x[j] - (j < p->n ? p->z[j] : R(0.0)));
+    }
+}
+
 /* Begin a proximal round: new values of the equations; what pulls then is no longer active. */
 static inline void near_next_round(const near_problem *p, near_state *s) {
-    const int n = p->n, N = s->N;
+    const int N = s->N;
     real change[IK_MOST_ROWS];
+    near_multipliers(p, s);
     for (int i = 0; i < p->m; i++) {
-        real multiplier = R(0.0);
-        for (int j = 0; j < N; j++)
-            multiplier += s->inverse[N * i + j] * (s->x[j] - (j < n ? p->z[j] : R(0.0)));
-        change[i] = p->v[i] + p->excess * multiplier - s->e[i];
+        change[i] = p->v[i] + p->excess * p->mu[i] - s->e[i];
         s->e[i] += change[i];
     }
     for (int i = 0; i < p->m; i++)
@@ -244,6 +252,7 @@ static HK_NOINLINE void ik_nearest(const near_problem *p, real *dq) {
         } else if (!near_change(p, &s))
             break;
     }
+    near_multipliers(p, &s);
     s.N = p->n; /* without the slack */
     const real unit = NEAR_ROUNDING, close = unit * near_largest(&s);
     for (int j = 0; j < p->n; j++) {
