@@ -321,9 +321,7 @@ def test_parts_add_up(crossing):
     columns = slice(None, 3 if case["output"] == "pose" else None)
     np.testing.assert_allclose((mechanical + error)[:, columns], whole[:, columns], atol=1e-9)
     if case["error_model"] == "drop" and case["change"] in ("none", "adapted"):
-        # Gravity stays where it is when a base turns; what the model learned of it turns.
-        sag = 1e-4 if case["robot"] == "forces" and case["change"] == "adapted" else 0.0
-        np.testing.assert_allclose(error, 0.0, atol=1e-12 + sag)
+        np.testing.assert_allclose(error, 0.0, atol=1e-12)
 
 
 def test_the_core_agrees_with_torch(crossing):

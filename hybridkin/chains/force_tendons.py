@@ -9,10 +9,12 @@ from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
+from typing_extensions import Self
 
 from hybridkin._core.arrays import Numbers, Transform, whole
 from hybridkin._core.blocks import in_blocks
 from hybridkin._core.frames import Marker
+from hybridkin._core.model import is_at_rest
 from hybridkin._core.named_rows import first_row
 from hybridkin._core.stored import Layout, Restore, Stored
 from hybridkin.chains._checks import filled, float_dtype, numeric, stiffnesses
@@ -336,6 +338,17 @@ class ForceTendonChain(ElasticBody):
         k = self.arcs_per_segment
         middles = torch.arange(k, dtype=torch.float64, device=taper.device) + 0.5
         return taper.double()[..., None] * middles / k
+
+    def moved(self, motion: Tensor) -> Self:
+        """Return the chain after a motion (4, 4) of its base, with which gravity turns.
+
+        It is the same robot in another measuring frame, as for every model.
+        """
+        moved = super().moved(motion)
+        if not is_at_rest(motion):
+            down = torch.tensor(self.gravity, dtype=torch.float64)
+            moved.gravity = tuple((motion[:3, :3].to(down) @ down).tolist())
+        return moved
 
     def _statics(self) -> Statics:
         """Return the energy of shapes, in float64."""

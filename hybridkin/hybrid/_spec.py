@@ -18,6 +18,7 @@ from typing_extensions import Self
 from hybridkin._core.arrays import countable
 from hybridkin._core.groups import Groups
 from hybridkin._core.model import ForwardModel
+from hybridkin._core.progress import Progress
 from hybridkin.calibration.calibrate import CalibrationResult, fit_geometry, refitted
 from hybridkin.calibration.choice import (
     NOT_CHOSEN,
@@ -64,6 +65,10 @@ class ErrorModel(ABC):
         model = copy.copy(self)
         model.tells_errors = False
         return model
+
+    def reporting(self, progress: Progress) -> ErrorModel:
+        """Return this model for a fit that tells how many of its candidates are fitted."""
+        return self
 
     def refinement(
         self, spec: Spec, geometry: GeometryChoice, rows: Rows

@@ -12,6 +12,7 @@ from joblib import Parallel, delayed, effective_n_jobs
 from numpy.typing import ArrayLike, NDArray
 
 from hybridkin._core.arrays import one_of, whole
+from hybridkin._core.progress import quiet
 from hybridkin._core.turns import one_thread
 from hybridkin.calibration.choice import Starts
 from hybridkin.datasets.logs import Log
@@ -27,10 +28,6 @@ SomeLog = TypeVar("SomeLog", bound=Log)
 _ROWS_PER_PROCESS = {True: 150, False: 1500}
 
 
-def _ignore(what: str, done: int, total: int) -> None:
-    pass
-
-
 def cross_fit(
     models: Models,
     log: SomeLog,
@@ -40,7 +37,7 @@ def cross_fit(
     sample_weight: ArrayLike | None = None,
     models_for: Callable[[SomeLog], Models] | None = None,
     n_jobs: int | None = 1,
-    progress: Callable[[str, int, int], None] = _ignore,
+    progress: Callable[[str, int, int], None] = quiet,
 ) -> CrossFit:
     """Fit models to a log, and predict each part of it by fits to the others.
 
@@ -102,8 +99,9 @@ def cross_fit(
     weighted = _WeightedLog(log, weights)
     fits = {}
     for name, model in models.items():
-        progress(f"fitting {name} to all motions", 0, 1)
-        fits[name] = fit_once(*weighted.prepared(model))
+        of_fit = partial(progress, f"fitting {name} to all motions")
+        of_fit(0, 1)
+        fits[name] = fit_once(*weighted.prepared(model), of_fit)
     if choices == "settled":
         held_out = partial(_held_out_settled, fits)
     else:

@@ -14,6 +14,7 @@ from torch import Tensor
 from typing_extensions import Self
 
 from hybridkin._core.groups import Groups
+from hybridkin._core.progress import Progress, quiet
 from hybridkin.calibration.calibrate import CalibrationResult
 from hybridkin.calibration.choice import NOT_CHOSEN, GeometryChoice, Starts
 from hybridkin.hybrid._drift import Drift, too_far
@@ -236,8 +237,18 @@ class FitOnce:
         )
 
 
-def fit_once(spec: Spec, log: Rows) -> FitOnce:
-    """Return the hybrid of a log, after the choices of its geometry and its hysteresis."""
+def fit_once(spec: Spec, log: Rows, progress: Progress = quiet) -> FitOnce:
+    """Return the hybrid of a log, after the choices of its geometry and its hysteresis.
+
+    Parameters
+    ----------
+    spec : Spec
+        The settings.
+    log : Rows
+        The rows as they were measured.
+    progress : callable, optional
+        Called with the number of candidates of "auto" that are fitted, and of all of them.
+    """
     commands = log.distinct()
     chosen = spec.with_geometry_chosen(commands)
     hysteresis, messages = chosen.hysteresis.of(chosen, log.in_runs())
@@ -245,7 +256,7 @@ def fit_once(spec: Spec, log: Rows) -> FitOnce:
     if hysteresis:
         rows = log.effective(hysteresis).distinct()
         rows = replace(rows, commanded=commands.directions)
-    fitted = fit_hybrid(chosen, rows)
+    fitted = fit_hybrid(chosen, rows, progress)
     return FitOnce(chosen, log, rows, hysteresis, fitted, messages)
 
 
