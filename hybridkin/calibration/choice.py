@@ -247,6 +247,7 @@ def choose_geometry(
     if weights is None:
         weights = np.ones(len(q))
     weights = as_tensor(weights, "weights").to(q)
+    given = tuple(parameters or ())
     first, counts, _ = distinct_rows(q, x, weights, motions.apart)
     motions = motions.take(first)
     order = np.argsort(motions.labels, kind="stable")
@@ -254,8 +255,8 @@ def choose_geometry(
     rows = Rows(q[first], x[first], torch.from_numpy(counts).to(q)).take(chosen)
     motions = motions.take(chosen)
     with torch.no_grad():
-        candidates = _candidates(chain, q, parameters)
-        messages = () if parameters is not None else unmoved(chain, q)
+        candidates = _candidates(chain, q, given)
+        messages = () if given else unmoved(chain, q)
     if len(starts) < len(candidates):
         starts = _starts(candidates, rows, loss)
     starts = starts[: len(candidates)]
@@ -264,16 +265,16 @@ def choose_geometry(
     errors = {}
     if len(candidates) > 1:
         splits = _splits(motions)
-        outer = None
+        outer = []
         if outside and len(chosen) >= _FEW:
-            outer = _Split(*inner_and_outer(rows.q.numpy()))
+            outer = [_Split(*inner_and_outer(rows.q.numpy()))]
         for candidate, start in zip(candidates, starts, strict=True):
             cv = _mean_distance(start, rows, splits, loss)
             io = np.nan
-            if outer is not None:
-                io = _mean_distance(start, rows, [outer], loss)
+            if outer:
+                io = _mean_distance(start, rows, outer, loss)
             errors[candidate.name] = Errors(cv, io)
-        n_inner = len((outer or splits[-1]).fitted)
+        n_inner = len([*splits, *outer][-1].fitted)
         table = np.maximum([*errors.values()], _EXACT * float(chain.reach))
         best = _best(table, candidates, starts, len(chosen), n_inner)
         near = np.flatnonzero(~(table > _WORSE * table[best]).any(axis=1)).tolist()
@@ -319,17 +320,13 @@ def _best(
     return simplest_within(np.where(good, scores, np.inf), _EQUAL)
 
 
-def _candidates(
-    chain: Chain, q: Tensor, parameters: Sequence[str] | None
-) -> list[_Candidate]:
-    """Return the sets to choose from, the smaller ones first."""
-    sets = chain.parameter_sets
-    if parameters is not None:
-        sets = [tuple(parameters)]
+def _candidates(chain: Chain, q: Tensor, given: tuple[str, ...]) -> list[_Candidate]:
+    """Return the sets to choose from, the smaller ones first; or of given parameters one."""
+    sets = [given] if given else chain.parameter_sets
     candidates = [_Candidate(_name(names), chain, names) for names in sets]
     for elastic in chain.rivals(q):
         elastic_sets = [names for names in elastic.parameter_sets if len(names) > 1]
-        if parameters is not None:
+        if given:
             elastic_sets = [_elastic_parameters(chain, elastic, sets[0])]
         for names in elastic_sets:
             candidates.append(_Candidate(_RIVAL + _name(names), elastic, names))

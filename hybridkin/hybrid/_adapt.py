@@ -86,8 +86,8 @@ def likeliest_change(
     noise: float,
     scale: NDArray,
     parameters: Sequence[str],
-) -> tuple[Change, str | None]:
-    """Return the most probable change, given new rows, and a warning or None.
+) -> tuple[Change, list[str]]:
+    """Return the most probable change, given new rows, and warnings.
 
     The change theta = (rotation, translation, shift) is in natural units: a rotation about the base
     in radians, a translation of the base in reaches of the robot, a shift of an actuator zero in
@@ -146,15 +146,15 @@ def _least_cost(
     return theta, residual
 
 
-def _misfit(rms: float, noise: float) -> str | None:
+def _misfit(rms: float, noise: float) -> list[str]:
     """Return a warning if the errors are far larger than those of the fit; `rms` is the ratio."""
     if rms <= _LARGE:
-        return None
-    return (
+        return []
+    return [
         f"`y` differs from the adapted model by {1e3 * 3**0.5 * rms * noise:.3g} mm (rms); the "
         f"held-out error of the fit is {1e3 * 3**0.5 * noise:.3g} mm. The robot has changed in a "
         "way that `parameters` do not cover, for example by a payload. Record a new log and `fit`."
-    )
+    ]
 
 
 def check_parameters(parameters: Sequence[str], in_space: bool) -> None:

@@ -117,10 +117,12 @@ class Drift(NamedTuple):
         evidence -= 2.0 * SWITCH * (_ALPHAS < inf)  # offset and slope
         return float(_ALPHAS[evidence.max(0).argmax()])
 
-    def correction(self) -> AffineModule | None:
-        """Return the correction as a torch module q (..., n) -> (..., m), None if it is zero."""
-        if self.alpha == inf:
-            return None
+    def __bool__(self) -> bool:
+        """Return whether there is a correction."""
+        return self.alpha < inf
+
+    def correction(self) -> AffineModule:
+        """Return the correction as a torch module q (..., n) -> (..., m)."""
         largest = self.gram.trace(axis1=1, axis2=2).max()
         least = np.finfo(float).eps * largest + np.finfo(float).tiny
         system = self.gram + max(self.alpha, least) * np.eye(len(self.moment))

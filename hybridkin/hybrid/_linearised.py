@@ -41,11 +41,13 @@ class Products:
     def __init__(self, phi: Tensor) -> None:
         self.phi = phi.numpy(force=True)
         self._rows = max(_BLOCK // _pairs(phi.shape[1]), 1)
-        self._kept = [*self._blocks()] if len(phi) <= self._rows else None
+        self._kept: list[tuple[slice, NDArray]] = []
+        if len(phi) <= self._rows:
+            self._kept = [*self._blocks()]
 
     def __iter__(self) -> Iterator[tuple[slice, NDArray]]:
         """Yield blocks of n rows, and their products (K (K + 1) / 2, n)."""
-        return self._blocks() if self._kept is None else iter(self._kept)
+        return iter(self._kept or self._blocks())
 
     def _blocks(self) -> Iterator[tuple[slice, NDArray]]:
         for rows in gen_batches(len(self.phi), self._rows):

@@ -449,14 +449,14 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         measured = torch.from_numpy(rows.tips[:, : self._robot.n_outputs])
         for message in self._robot.far_messages(measured, "y"):  # wherever its base is
             warnings.warn(message, stacklevel=2)
-        self.change_, message = likeliest_change(
+        self.change_, messages = likeliest_change(
             self.fitted_module_,
             rows,
             self._fit.error.noise,
             self._drift.scale,
             parameters,
         )
-        if message is not None:
+        for message in messages:
             warnings.warn(message, stacklevel=2)
         self._drift = self._fit.no_drift
         self._past = NO_PAST
@@ -796,9 +796,8 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """Set the module and its mechanical model after the change and the drift of the robot."""
         hybrid = self.fitted_module_
         mechanical = hybrid.mechanical
-        drift = self._drift.correction()
-        if drift is not None:
-            hybrid = hybrid.with_drift(drift)
+        if self._drift:
+            hybrid = hybrid.with_drift(self._drift.correction())
         self.module_ = self.change_.after(hybrid)
         if mechanical is not None:
             mechanical = self.change_.after(mechanical.without_errors)
@@ -935,7 +934,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if not X.flags.writeable:
             X = X.copy()
         rows = Rows.of(X, y, weights, groups, commands.runs, commands.time)
-        if rows.time is not None and self.follows_order:
+        if rows.timed and self.follows_order:
             times = checked_times(rows.time, rows.runs)
             if reset:  # a fit may find creep, which depends on the unit of time
                 check_seconds(times, rows.runs)

@@ -361,7 +361,7 @@ class ELMRegressor(FittedNetwork):
         y = y.reshape(len(y), -1)
         if first:
             elm = draw_layer(self, X, sample_weight)
-            stats = None
+            stats = Statistics.none(len(elm.output_weights) + y.shape[1])
         else:
             elm = self.module_
             n, mean, scatter = self._stats

@@ -23,7 +23,7 @@ from hybridkin._core.groups import Groups
 from hybridkin._core.stored import plain
 from hybridkin._core.turns import TURNS
 from hybridkin.learning._left_out import LeftOut, left_out
-from hybridkin.learning._ridge import gather
+from hybridkin.learning._ridge import Statistics, gather
 from hybridkin.learning.elm import ELMRegressor, FittedNetwork
 from hybridkin.learning.hidden_layer import (
     check_rows,
@@ -318,7 +318,8 @@ class _Search:
         elm = draw_layer(candidate, self.X, self.weights)
         elm = elm.to(device_named(candidate.device))
         rows = self.X, self.targets, self.weights
-        stats = gather(None, elm, *rows, candidate.block_size)
+        none = Statistics.none(len(elm.output_weights) + self.targets.shape[1])
+        stats = gather(none, elm, *rows, candidate.block_size)
         held_out = left_out(elm, stats, *rows, candidate.fit_intercept)
         if isinstance(self.alphas, str):
             alphas = _AUTO_ALPHAS * (held_out.eigenvalues[-1] or 1.0)
