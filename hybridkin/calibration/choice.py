@@ -17,7 +17,7 @@ from hybridkin._core.distinct import distinct_rows, targets_that_count
 from hybridkin._core.groups import Groups
 from hybridkin._core.model import ForwardModel
 from hybridkin._core.simplest import simplest_within
-from hybridkin.calibration._least_squares import COMPARED, LOSSES, ROUGH, Rows, solve
+from hybridkin.calibration._least_squares import COMPARED, LOSSES, ROUGH, TipRows, solve
 from hybridkin.calibration._search import NO_START, Start, search, widened
 from hybridkin.calibration.calibrate import (
     CalibrationResult,
@@ -58,7 +58,7 @@ _RIVAL = "elastic tendons: "  # prefix of sets that replace those of a plain cha
 _STIFF = ("bending_stiffness", "axial_stiffness")
 
 
-class Errors(NamedTuple):
+class SetErrors(NamedTuple):
     """Mean tip distances of a set of parameters [m]; NaN if they were not needed."""
 
     cv: float  # held-out motions, or rows
@@ -85,7 +85,7 @@ class GeometryChoice:
         Start of their fit. Default: it is searched.
     name : str
         Name of the set in `errors`.
-    errors : dict of str to Errors
+    errors : dict of str to SetErrors
         Errors of all sets that were tried; empty if there was no choice.
     messages : tuple of str
         Warnings about the log.
@@ -101,7 +101,7 @@ class GeometryChoice:
     parameters: tuple[str, ...]
     start: Start = NO_START
     name: str = ""
-    errors: Mapping[str, Errors] = field(default_factory=dict)
+    errors: Mapping[str, SetErrors] = field(default_factory=dict)
     messages: tuple[str, ...] = ()
     rivals: tuple[GeometryChoice, ...] = ()
     starts: Starts = ()
@@ -252,7 +252,7 @@ def choose_geometry(
     motions = motions.take(first)
     order = np.argsort(motions.labels, kind="stable")
     chosen = np.sort(order[evenly_spaced(len(first), _MOST)])
-    rows = Rows(q[first], x[first], torch.from_numpy(counts).to(q)).take(chosen)
+    rows = TipRows(q[first], x[first], torch.from_numpy(counts).to(q)).take(chosen)
     motions = motions.take(chosen)
     with torch.no_grad():
         candidates = _candidates(chain, q, given)
@@ -273,7 +273,7 @@ def choose_geometry(
             io = np.nan
             if outer:
                 io = _mean_distance(start, rows, outer, loss)
-            errors[candidate.name] = Errors(cv, io)
+            errors[candidate.name] = SetErrors(cv, io)
         n_inner = len([*splits, *outer][-1].fitted)
         table = np.maximum([*errors.values()], _EXACT * float(chain.reach))
         best = _best(table, candidates, starts, len(chosen), n_inner)
@@ -302,7 +302,7 @@ def _best(
     n_rows: int,
     n_inner: int,
 ) -> int:
-    """Return the index of the chosen one of K sets, with `Errors` (K, 2), smaller sets first."""
+    """Return the index of the chosen one of K sets, with `SetErrors` (K, 2), smaller sets first."""
     n_free = np.array([start.n_free for start in starts])
     usual = np.array([candidate.name in _USUAL for candidate in candidates])
     cv, io = errors.T
@@ -354,7 +354,7 @@ def _name(names: tuple[str, ...]) -> str:
     return " + ".join(words) or "nothing"
 
 
-def _starts(candidates: Sequence[_Candidate], rows: Rows, loss: str) -> list[Start]:
+def _starts(candidates: Sequence[_Candidate], rows: TipRows, loss: str) -> list[Start]:
     """Return the start of the fit of every set; initial guesses are searched if rings become free.
 
     Other sets start from the previous one; elastic tendons also from a plain chain with the same
@@ -387,7 +387,7 @@ def _starts(candidates: Sequence[_Candidate], rows: Rows, loss: str) -> list[Sta
     return starts
 
 
-def _refitted(starts: list[Start], rows: Rows, loss: str) -> Start:
+def _refitted(starts: list[Start], rows: TipRows, loss: str) -> Start:
     """Return the start with the smallest error of a rough fit; the first one if nearly equal."""
     fits = [solve(start.problem, rows, start.theta, loss, ROUGH) for start in starts]
     best = simplest_within([fit.rmse for fit in fits], _ALIKE)
@@ -402,7 +402,7 @@ def _splits(motions: Groups) -> list[_Split]:
 
 def _mean_distance(
     start: Start,
-    rows: Rows,
+    rows: TipRows,
     splits: Sequence[_Split],
     loss: str,
 ) -> float:

@@ -111,7 +111,7 @@ def likeliest_change(
     ----------
     MacKay, Bayesian interpolation, Neural Computation 4 (1992), for the evidence.
     """
-    problem = _Problem(fitted, rows, scale)
+    problem = _ChangeProblem(fitted, rows, scale)
     try:
         with np.errstate(over="raise", invalid="raise"):
             theta, residual = _least_cost(problem, rows.groups, noise, parameters)
@@ -124,7 +124,7 @@ def likeliest_change(
 
 
 def _least_cost(
-    problem: _Problem, groups: Groups, noise: float, parameters: Sequence[str]
+    problem: _ChangeProblem, groups: Groups, noise: float, parameters: Sequence[str]
 ) -> tuple[NDArray, NDArray]:
     """Return the most probable change theta, and the residual after it, relative to the noise."""
     theta = std = np.zeros(6 + len(problem.scale))
@@ -174,7 +174,7 @@ def check_parameters(parameters: Sequence[str], in_space: bool) -> None:
         )
 
 
-class _Problem:
+class _ChangeProblem:
     """The new rows, and the model as a function of the change of the robot."""
 
     def __init__(self, fitted: Hybrid, rows: Rows, scale: NDArray) -> None:

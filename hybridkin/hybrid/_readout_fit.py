@@ -112,7 +112,7 @@ def fit_readout(
     x = torch.from_numpy(rows.tips.astype(np.float64))
     weight = torch.from_numpy(rows.counts.astype(np.float64))
     with torch.no_grad():
-        problem = _Problem(
+        problem = _ReadoutProblem(
             mechanical, features, rows.q, x, weight, rows.groups, coupling == "serial"
         )
         if alphas is None:
@@ -128,7 +128,7 @@ def fit_readout(
     return fit._replace(residual=rows.as_given(fit.residual), rmse=rmse)
 
 
-def _chosen_with_noise(problem: _Problem) -> ReadoutFit:
+def _chosen_with_noise(problem: _ReadoutProblem) -> ReadoutFit:
     """Return the fit with chosen penalties, in metres or in units of the actuators' noise."""
     fit = _chosen(problem, None, problem.nothing)
     noise_ratio = problem.likeliest_ratio(torch.from_numpy(fit.residual))
@@ -141,7 +141,7 @@ def _chosen_with_noise(problem: _Problem) -> ReadoutFit:
 
 
 def _chosen(
-    problem: _Problem,
+    problem: _ReadoutProblem,
     alphas: Pair | None,
     weights: Tensor,
     rounds: int = 2,
@@ -164,7 +164,7 @@ def _chosen(
 
 
 def _fit_with_penalties(
-    problem: _Problem, alphas: Pair, weights: Tensor, held_out: bool = True
+    problem: _ReadoutProblem, alphas: Pair, weights: Tensor, held_out: bool = True
 ) -> ReadoutFit:
     """Return the fit with given penalties, from a start; its residuals are those of held-out rows.
 
@@ -180,7 +180,7 @@ def _fit_with_penalties(
     return ReadoutFit(readout, alphas, left_out.numpy(force=True), {}, gradient, ratio)
 
 
-class _Problem:
+class _ReadoutProblem:
     """The rows of a fit, in scaled coordinates and a basis of the features with data."""
 
     def __init__(
@@ -217,7 +217,7 @@ class _Problem:
         self.products = _linearised.Products(self.phi)
         self.nothing = phi.new_zeros(len(self.units), self.phi.shape[1])
 
-    def in_noise(self, ratio: float) -> _Problem:
+    def in_noise(self, ratio: float) -> _ReadoutProblem:
         """Return the problem for noise of covariance dx/dq dx/dq' + ratio, up to a factor."""
         if ratio == inf:
             return self

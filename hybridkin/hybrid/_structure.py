@@ -215,7 +215,7 @@ class StructureDesign:
         return torch.cat([by_base, by_arcs.flatten(1, 2) @ fields], dim=2)
 
 
-class _Problem:
+class _StructureProblem:
     """The rows of a fit, and the fit of theta."""
 
     def __init__(self, design: StructureDesign, rows: Rows) -> None:
@@ -322,7 +322,7 @@ def fit_structure(
     with torch.no_grad():
         design = StructureDesign(chain, rows.q, factor, scales)
         try:
-            problem = _Problem(design, rows)
+            problem = _StructureProblem(design, rows)
             theta, rest, A = problem.minimum()
         except torch.linalg.LinAlgError as error:  # pyright: ignore
             raise too_far() from error

@@ -15,7 +15,7 @@ from typing_extensions import Self
 
 from hybridkin._core.groups import Groups
 from hybridkin._core.simplest import simplest_within
-from hybridkin.calibration.choice import NOT_CHOSEN, Errors, GeometryChoice
+from hybridkin.calibration.choice import NOT_CHOSEN, GeometryChoice, SetErrors
 from hybridkin.calibration.measured import distance, distances
 from hybridkin.hybrid._guards import GroupDistance
 from hybridkin.hybrid._radius import Radius, covering_distance
@@ -346,7 +346,7 @@ class CrossFit:
         parameters = geometry.name or "nothing"
         tried = geometry.errors
         if not tried:
-            errors = Errors(float(held_out_means[0]), float(outer_means[0]))
+            errors = SetErrors(float(held_out_means[0]), float(outer_means[0]))
             tried = {parameters: errors}
         return {
             "candidate": [*self.names, "blend"],
