@@ -226,8 +226,7 @@ def _evaluate(arguments: argparse.Namespace, stages: Stages) -> _Result:
         model, log, arguments.out, force=arguments.force
     )
     mean = 1000.0 * report.record.judged.mean
-    limit = arguments.fail_above
-    return report, int(limit is not None and mean > limit)
+    return report, int(mean > arguments.fail_above)
 
 
 def _view(arguments: argparse.Namespace, stages: Stages) -> _Result:
@@ -301,16 +300,16 @@ def _track(arguments: argparse.Namespace, stages: Stages) -> _Result:
     return report, int(not good)
 
 
-def _counts(arguments: argparse.Namespace, model: HybridForwardModel) -> Counts | None:
-    """Return the numbers to which commands are rounded, None without `--round`."""
+def _counts(arguments: argparse.Namespace, model: HybridForwardModel) -> Counts:
+    """Return the numbers to which commands are rounded, any without `--round`."""
     Counts = hybridkin.app.workflow.Counts
-    if arguments.round is None:
-        return None
+    if not arguments.round:
+        return Counts()
     if arguments.round is not True:
         n = model.n_features_in_
         return Counts([arguments.round] * n, [0.0] * n)
     counts = Counts.read(model.description_.training)
-    if counts is None or not any(counts.steps):
+    if not counts:
         raise ValueError(
             "`--round` needs a model that was fitted by `hybridkin fit` to a log with whole "
             "numbers; give the step of the actuators in the unit of the log: --round 1."

@@ -240,7 +240,7 @@ def verify_track(
         if part.any():
             parts[name] = _errors_of(part, errors, promised)
     kept = None
-    if promised is not None:
+    if promised.known:
         kept = bool(parts["path"].mean <= _KEPT * parts["path"].promised)
     compared = compare_causes(_evidence(model, sent, motion, rows, x, promised))
     cause = None
@@ -342,11 +342,7 @@ def _parts(model: HybridForwardModel, q: NDArray) -> dict[str, NDArray]:
     return parts
 
 
-def _errors_of(
-    rows: NDArray, errors: NDArray, promised: ExpectedErrors | None
-) -> PartErrors:
-    if promised is None:
-        return PartErrors.of(errors[rows])
+def _errors_of(rows: NDArray, errors: NDArray, promised: ExpectedErrors) -> PartErrors:
     return PartErrors.of(
         errors[rows],
         promised=promised.mean[rows].mean(),
@@ -370,7 +366,7 @@ def _evidence(
     motion: NDArray,
     rows: NDArray,
     x: NDArray,
-    promised: ExpectedErrors | None,
+    promised: ExpectedErrors,
 ) -> Evidence:
     """Return the evidence of measured tips x (N, 3) at rows (N,) of a motion (T, n)."""
     order = np.argsort(rows, kind="stable")
@@ -384,7 +380,7 @@ def _evidence(
     if is_fitted(model):
         low, high = model.training_range_
     expected = 0.0
-    if promised is not None:
+    if promised.known:
         expected = float(promised.mean.mean())
     return Evidence(
         motion=Motion.of(motion, sent.time, None),
