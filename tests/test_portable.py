@@ -10,7 +10,8 @@ FILES = (
     "tests/core/test_directions.py",
     "tests/app/checks/test_check_log.py::test_clean_logs_pass",
     "tests/hybrid/test_guards.py",
-    "tests/ik/test_hysteresis.py::test_the_core_commands_what_torch_does",
+    "tests/ik/test_hysteresis.py::test_the_core_commands_what_torch_does[speed-plays, creep]",
+    "tests/ik/test_hysteresis.py::test_the_core_commands_what_torch_does[acceleration-play]",
 )
 RUNS = (0, 1)  # without the core and with two threads; other instructions of everything
 
@@ -38,6 +39,9 @@ def test_what_computes():
     assert torch.backends.cpu.get_cpu_capability() == "DEFAULT"
     assert os.environ["MKL_ENABLE_INSTRUCTIONS"] == "AVX2"
     assert torch.get_num_threads() == 2
+
+def test_that_fails():
+    assert "hk_v2" in library.library()._name
 """
 
 
@@ -57,9 +61,9 @@ def test_the_settings_arrive_and_a_failure_is_one(tmp_path):
     seen.write_text(SEEN)
     arguments = ["-c", "pyproject.toml", "--confcutdir=tests", "-p", "conftest", str(seen)]
     done = portable.tested(settings, 0, *arguments)
-    assert done.returncode == 0, done.stdout
-    other = portable.tested({**settings, "HYBRIDKIN_NATIVE": "v2"}, 0, *arguments)
-    assert other.returncode == 1
+    assert "1 failed, 1 passed" in done.stdout
+    assert "test_that_fails" in done.stdout
+    assert done.returncode == 1
 
 
 def test_every_setting_stands_twice_and_every_core_meets_every_blas():
