@@ -172,8 +172,9 @@ class Log:
     def rows(self, chosen: NDArray | slice) -> Self:
         """Return a log of some of the rows."""
         columns = self._columns
-        some = {name: column[chosen] for name, column in columns.items()}
-        return replace(self, **some)
+        for name, column in columns.items():
+            columns[name] = column[chosen]
+        return replace(self, **columns)
 
     def column_names(self, which: str) -> list[str]:
         """Return the names of the columns of "q" or "x"; without names, their numbers."""

@@ -30,6 +30,7 @@ from hybridkin.app.workflow.report import Report, check_out, millimetres, percen
 from hybridkin.app.workflow.track import LEAD_IN, read_track
 from hybridkin.arguments import check_tips, number
 from hybridkin.datasets import Log, load_log, log_columns
+from hybridkin.native import evaluate
 
 _KEPT = 1.5  # largest mean error of a kept promise, relative to the promised one
 _OFF = 0.01  # least distance from the plane of the log, as a share of the range of the commands
@@ -387,6 +388,7 @@ def _evidence(
         rows=rows,
         x=x[order],
         model=model.module_.tip_model,
+        path=evaluate(model.module_.tip_model, motion)[0],
         bodies=bodies,
         actuators=_actuators(model.description_.log, robot.actuator_layout),
         inside=domain_distance(model, q - off_plane) <= 1.0,
