@@ -30,15 +30,14 @@ from hybridkin.app.cli._terminal import Stages, write
 from hybridkin.formats import FRAMES, METRES, check_outputs, visible, write_file
 
 if TYPE_CHECKING:
-    from hybridkin import ForwardModel, robots, trajectories
+    from hybridkin import ForwardModel, HybridForwardModel, robots, trajectories
     from hybridkin.app import LogReport
     from hybridkin.app.workflow import (
         Counts,
-        HybridForwardModel,
-        MeasuredLog,
         PathLimits,
         Report,
     )
+    from hybridkin.app.workflow.log import MeasuredLog
     from hybridkin.datasets import Log
 
 _DT = 0.02
@@ -386,8 +385,8 @@ def _describe(arguments: argparse.Namespace, stages: Stages) -> _Result:
     workflow = hybridkin.app.workflow
     if arguments.log.suffix.lower() == ".toml":
         robot = hybridkin.robots.read_description(arguments.log)
-        return workflow.describe_robot(robot), 0
-    if not workflow.is_log(arguments.log):
+        return workflow.description.describe_robot(robot), 0
+    if not workflow.model.is_log(arguments.log):
         model = hybridkin.open_model(arguments.log, arguments.robot)
         return workflow.describe(model), 0
     if arguments.robot is None:
