@@ -193,7 +193,8 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         With `coverage`: the radius ``inside`` the domain [m], infinite with too few groups.
         `adapt` and `partial_fit` do not change it.
     description_ : ModelDescription
-        Robot, log and file of the model; of one from `open_model`, what these say.
+        Robot, log and file of the model; of one from `open_model`, what these say. `fit` makes a
+        new model, of which no file and no notes tell.
     training_range_ : TrainingRange
         ``low`` and ``high`` (n,), the least and the largest q of the fit [unit of q]; with
         `hysteresis` of the motion of the actuators. `adapt` moves it with the actuator zeros.

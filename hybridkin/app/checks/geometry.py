@@ -42,6 +42,7 @@ from hybridkin.app.checks.order import (
 from hybridkin.app.checks.report import LogFinding
 from hybridkin.datasets import Log
 from hybridkin.formats import METRES, in_terms
+from hybridkin.native import evaluate
 
 if TYPE_CHECKING:
     from hybridkin import LengthDrivenChain, robots
@@ -201,6 +202,7 @@ class _Comparison:
             rows=np.arange(n_rows),
             x=self.few_x,
             model=self.chain,
+            path=evaluate(self.chain, q)[0],
             bodies=[self.chain],
             actuators=Actuators(self.q_names, "mm", per_unit, self.layout),
             inside=np.ones(n_rows, dtype=bool),

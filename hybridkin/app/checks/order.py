@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from hybridkin.app.checks.rotations import nearest_turn
+from hybridkin.rotations import nearest_rotation
 
 if TYPE_CHECKING:
     from hybridkin import LengthDrivenChain
@@ -101,7 +101,7 @@ def misses(
     """
     tips, measured = _centred(chain, qs, x)
     if base_is_free:
-        turn, trace = nearest_turn(measured.T @ tips)
+        turn, trace = nearest_rotation(measured.T @ tips)
         size = np.square(tips).sum(axis=(-2, -1)).clip(min=np.finfo(float).tiny)
         tips = (trace / size)[:, None, None] * tips @ turn.swapaxes(-2, -1)
     squared_error = np.square(tips - measured).sum(axis=-1).mean(axis=-1)
@@ -113,7 +113,7 @@ def base_turn(chain: LengthDrivenChain, q: NDArray, x: NDArray) -> tuple[float, 
     """Return the rotation of the base about its axis that fits the tips, and its tilt [deg]."""
     tips, measured = _centred(chain, q[None], x)
     base = chain.base[:3, :3].numpy(force=True).astype(float)
-    motion, _ = nearest_turn(measured.T @ tips[0])
+    motion, _ = nearest_rotation(measured.T @ tips[0])
     turn = base.T @ motion @ base
     sine = turn[1, 0] - turn[0, 1]
     cosine = turn[0, 0] + turn[1, 1]

@@ -13,7 +13,9 @@ import hybridkin
 from hybridkin.formats import write_file
 
 if TYPE_CHECKING:
-    from hybridkin.app.workflow import FitRecord, Report, TrackRecord
+    from hybridkin.app.workflow import Report
+    from hybridkin.app.workflow.fit_record import FitRecord
+    from hybridkin.app.workflow.track import TrackRecord
 
 _ROWS = 240
 _BLOCK = 12

@@ -27,7 +27,7 @@ from hybridkin.app.cli._values import (
 from hybridkin.formats import METRES, UNITS, toml_value, visible
 
 if TYPE_CHECKING:
-    from hybridkin.app.workflow import MeasuredLog
+    from hybridkin.app.workflow.log import MeasuredLog
 
 _NEEDED = object()  # the default of what must be given
 _Answers = dict[str, Any]

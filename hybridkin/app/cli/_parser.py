@@ -343,6 +343,7 @@ def _evaluate(command: argparse.ArgumentParser) -> None:
     add(
         "--fail-above",
         type=float,
+        default=float("inf"),
         metavar="MM",
         help="exit with 1 if the mean error is larger",
     )
@@ -484,6 +485,7 @@ def _track(command: argparse.ArgumentParser) -> None:
         nargs="?",
         type=positive,
         const=True,
+        default=False,
         metavar="STEP",
         help=whole,
     )

@@ -30,15 +30,14 @@ from hybridkin.app.cli._terminal import Stages, write
 from hybridkin.formats import FRAMES, METRES, check_outputs, visible, write_file
 
 if TYPE_CHECKING:
-    from hybridkin import ForwardModel, robots, trajectories
+    from hybridkin import ForwardModel, HybridForwardModel, robots, trajectories
     from hybridkin.app import LogReport
     from hybridkin.app.workflow import (
         Counts,
-        HybridForwardModel,
-        MeasuredLog,
         PathLimits,
         Report,
     )
+    from hybridkin.app.workflow.log import MeasuredLog
     from hybridkin.datasets import Log
 
 _DT = 0.02
@@ -226,8 +225,7 @@ def _evaluate(arguments: argparse.Namespace, stages: Stages) -> _Result:
         model, log, arguments.out, force=arguments.force
     )
     mean = 1000.0 * report.record.judged.mean
-    limit = arguments.fail_above
-    return report, int(limit is not None and mean > limit)
+    return report, int(mean > arguments.fail_above)
 
 
 def _view(arguments: argparse.Namespace, stages: Stages) -> _Result:
@@ -301,16 +299,16 @@ def _track(arguments: argparse.Namespace, stages: Stages) -> _Result:
     return report, int(not good)
 
 
-def _counts(arguments: argparse.Namespace, model: HybridForwardModel) -> Counts | None:
-    """Return the numbers to which commands are rounded, None without `--round`."""
+def _counts(arguments: argparse.Namespace, model: HybridForwardModel) -> Counts:
+    """Return the numbers to which commands are rounded, any without `--round`."""
     Counts = hybridkin.app.workflow.Counts
-    if arguments.round is None:
-        return None
+    if not arguments.round:
+        return Counts()
     if arguments.round is not True:
         n = model.n_features_in_
         return Counts([arguments.round] * n, [0.0] * n)
     counts = Counts.read(model.description_.training)
-    if counts is None or not any(counts.steps):
+    if not counts:
         raise ValueError(
             "`--round` needs a model that was fitted by `hybridkin fit` to a log with whole "
             "numbers; give the step of the actuators in the unit of the log: --round 1."
@@ -387,8 +385,8 @@ def _describe(arguments: argparse.Namespace, stages: Stages) -> _Result:
     workflow = hybridkin.app.workflow
     if arguments.log.suffix.lower() == ".toml":
         robot = hybridkin.robots.read_description(arguments.log)
-        return workflow.describe_robot(robot), 0
-    if not workflow.is_log(arguments.log):
+        return workflow.description.describe_robot(robot), 0
+    if not workflow.model.is_log(arguments.log):
         model = hybridkin.open_model(arguments.log, arguments.robot)
         return workflow.describe(model), 0
     if arguments.robot is None:

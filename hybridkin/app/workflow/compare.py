@@ -21,7 +21,6 @@ from hybridkin import (
     GeometryChoice,
     HybridForwardModel,
     Hysteresis,
-    as_forward_model,
     choose_geometry,
     cross_fit,
     robots,
@@ -216,7 +215,9 @@ def mechanical_of(
         with warnings.catch_warnings():  # the models above it give them
             warnings.simplefilter("ignore")
             linear.fit(rows.q, rows.x)
-        return Mechanical(as_forward_model(linear))
+        module: Any = linear.module_  # of one correction, without mechanical model
+        (correction,) = module.corrections
+        return Mechanical(correction.module)
     nominal: Chain = chain
     if robot.base_is_free:
         base = GeometryChoice(chain, ("base",))

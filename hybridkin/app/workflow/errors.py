@@ -98,10 +98,20 @@ class HeldOutErrors(Errors):
 
 @dataclass(frozen=True)
 class ExpectedErrors:
-    """Mean errors (N,) to expect of a robot, and the errors that 95 % do not exceed [m]."""
+    """Mean errors (N,) to expect of a robot, and what 95 % do not exceed [m]; NaN: unknown."""
 
     mean: NDArray
     p95: NDArray
+
+    @classmethod
+    def unknown(cls, n: int) -> Self:
+        """Return those of n commands for a model that promises nothing."""
+        return cls(np.full(n, np.nan), np.full(n, np.nan))
+
+    @property
+    def known(self) -> bool:
+        """Whether the model promises an error of any command."""
+        return bool(np.isfinite(self.mean).any())
 
 
 @dataclass(frozen=True)

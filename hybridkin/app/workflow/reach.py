@@ -53,7 +53,7 @@ def placed(
     best = int(good[0])
     q = solution.q[good]
     promised = promised_errors(domain.model, q.reshape(-1, q.shape[-1]))
-    if promised is not None:
+    if promised.known:
         best = int(good[promised.mean.reshape(len(good), -1).mean(axis=1).argmin()])
     return trajectories.Trajectory(path.t, path.x + shifts[best]), float(inside[best])
 

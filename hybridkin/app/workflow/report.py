@@ -97,7 +97,7 @@ class Report(Generic[Record]):
     title : str
         Heading of the report.
     record : dataclass or dict
-        Every number of the report; the content of its JSON.
+        Every number of the report; the content of its JSON. ``help(report.record)`` explains it.
 
     Attributes
     ----------

@@ -51,6 +51,7 @@ _PUSH = 10.0 / math.sqrt(3.0)  # its largest acceleration
 _MOST_OUTSIDE = 0.05  # share of the points outside the domain that is not worth a word
 _SLOW = 0.1  # share of the range per second, without known limits
 _DT = 0.02  # period of a path of one point [s]
+_ANY_NUMBER = Counts()
 _FINER = (1, 4)  # times as many steps, in each attempt
 _SHOWN = 100  # times that a track reports its progress
 
@@ -152,7 +153,7 @@ def _write(report: Report[TrackRecord], model: HybridForwardModel, better: str) 
     report.text(_outcome(record, better))
 
 
-def _about_counts(record: TrackRecord, counts: Counts | None) -> list[str]:
+def _about_counts(record: TrackRecord, counts: Counts) -> list[str]:
     """Return what rounding costs, or that it is possible."""
     if record.rounded is not None:
         before = millimetres(record.rounded["before"])
@@ -161,7 +162,7 @@ def _about_counts(record: TrackRecord, counts: Counts | None) -> list[str]:
             f"Commands are rounded to whole steps of the actuators. Mean error of the solver: "
             f"{before} before, {after} after."
         ]
-    if counts is not None and counts.whole.all():
+    if counts and counts.whole.all():
         return [
             "The columns of the log hold whole numbers; these commands are not rounded: --round."
         ]
@@ -203,7 +204,7 @@ def track_path(
     start: ArrayLike | str = "rest",
     tol: float = 1e-4,
     delay: float = 0.0,
-    counts: Counts | None = None,
+    counts: Counts = _ANY_NUMBER,
     out_of_reach: bool = False,
     force: bool = False,
     progress: Progress = quiet,
@@ -274,7 +275,7 @@ def track_path(
         track = best_track(domain, path, tol, attempts, lead_in)
     n_lead = len(lead_in) - 1
     rounded = None
-    if counts is not None:
+    if counts:
         exact = track
         lead_in = _rounded(lead_in, counts, domain)
         track = _with_commands(
@@ -323,7 +324,7 @@ def track_path(
     _add_path(report, model, track)
     _add_commands(report, domain, whole.t, commands, n_lead)
     statuses = [LEAD_IN] * n_lead + statuses
-    digits = 9 if counts is None else 15
+    digits = 15 if counts else 9
     _add_track(report, whole, commands, statuses, model.description_.log, digits)
     report.write(out)
     return report
@@ -337,7 +338,7 @@ def _expected(
     The directions in which the solver and the model miss a point do not depend on each other.
     """
     promised = promised_errors(model, track.effective[rows])
-    if promised is None or len(promised.mean) == 0:
+    if not promised.known:
         return {}
     missed = track.error[rows]
     means = np.hypot(promised.mean, missed)

@@ -17,7 +17,7 @@ from hybridkin.app.checks.causes.cause import (
     robust_weights,
 )
 from hybridkin.app.checks.causes.evidence import Evidence
-from hybridkin.app.checks.rotations import angle_of, rigid_motion
+from hybridkin.rotations import rigid_motion, rotation_angle
 
 _ROUNDS = 4  # of the weights of a rigid motion
 _UNITS = {
@@ -141,7 +141,7 @@ class MovedBase(Cause):
     def amount(self, evidence: Evidence, parameters: NDArray) -> str:
         """Return the angle, and how far the middle of the tips moves, in words."""
         motion = parameters.reshape(3, 4)
-        turn = angle_of(motion[:, :3])
+        turn = rotation_angle(motion[:, :3])
         middle = evidence.tips.mean(axis=0)
         shift = motion[:, :3] @ middle + motion[:, 3] - middle
         return (
