@@ -395,8 +395,10 @@ def test_limits_of_a_track_leave_room(crossing, tmp_path):
 
 def test_a_clone_fits_the_same(crossing):
     case, (_, model, log, _) = crossing
-    if case["error_model"] == "auto" and case["hysteresis"] != "none":
-        return  # takes as long as the fit itself; those without backlash are enough
+    if case["error_model"] == "auto" and (
+        case["hysteresis"] != "none" or case["robot"] == "forces"
+    ):
+        return  # takes as long as the fit itself; quick robots without backlash are enough
     again = clone(model).fit(log.commands, log.x, groups=log.groups)
     np.testing.assert_allclose(
         again.predict(log.commands),
