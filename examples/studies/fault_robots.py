@@ -71,7 +71,7 @@ class FaultRobot(ABC):
     def log_format(self) -> robots.LogFormat:
         """Return the format of the robot's logs."""
         names = tuple(f"m{i + 1}" for i in range(self.chain.n_actuators))
-        return robots.LogFormat(names, ("x", "y", "z"), self.unit)
+        return robots.LogFormat(names, ("x", "y", "z"), q_unit=self.unit)
 
 
 class _Sagging(FaultRobot):

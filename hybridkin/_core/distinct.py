@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from torch import Tensor
 
-from hybridkin._core.arrays import Numbers, as_array, table
+from hybridkin._core.arrays import as_array, table
 
 
 def targets_that_count(y: Any, weights: Any, name: str) -> Any:
@@ -34,10 +34,10 @@ def targets_that_count(y: Any, weights: Any, name: str) -> Any:
 def distinct_rows(
     X: NDArray | Tensor,
     y: NDArray | Tensor,
-    weights: Numbers | None = None,
-    groups: ArrayLike | None = None,
+    weights: NDArray | Tensor,
+    apart: NDArray,
     runs: bool = False,
-) -> tuple[NDArray, NDArray | None, NDArray]:
+) -> tuple[NDArray, NDArray, NDArray]:
     """Return the different rows, in order of first occurrence, and how often each counts.
 
     With them a weight of k and k equal rows give the same fit, and equal rows are held out
@@ -47,10 +47,10 @@ def distinct_rows(
     ----------
     X, y : array or Tensor of shape (N, n) and (N, m)
         Measured rows.
-    weights : array or Tensor of shape (N,), optional
-        Weights. Default: ones.
-    groups : array-like of shape (N,), optional
-        Labels; equal rows of different groups stay apart.
+    weights : array or Tensor of shape (N,)
+        Weights.
+    apart : ndarray of shape (N, k)
+        Further columns in which rows must be equal to be merged, for example `Groups.apart`.
     runs : bool, default=False
         Merge only equal rows that follow each other, and keep rows of weight 0.
 
@@ -58,20 +58,15 @@ def distinct_rows(
     -------
     first : ndarray of int of shape (K,)
         The first of each set of equal rows, ascending.
-    weights : ndarray of shape (K,) or None
-        Sums of the weights of equal rows; None if all are 1.
+    weights : ndarray of shape (K,)
+        Sums of the weights of equal rows.
     place : ndarray of int of shape (N,)
         Index into `first` for each row; -1 for rows of weight 0.
     """
-    columns = [as_array(X), as_array(y)]
-    if groups is not None:
-        _, motions = np.unique(groups, return_inverse=True)
-        columns.append(motions)
+    columns = as_array(X), as_array(y), apart
     rows = np.column_stack(columns).astype(np.float64)
     rows += 0.0  # -0.0 equals 0.0
-    times = np.ones(len(rows))
-    if weights is not None:
-        times = as_array(weights)
+    times = as_array(weights)
 
     # One key for each row that counts; equal rows have equal keys.
     if runs:
@@ -91,8 +86,6 @@ def distinct_rows(
     place[counted] = rank[inverse]
     counts = np.bincount(place[counted], weights=times[counted])
     first = counted[first[order]]
-    if (counts == 1.0).all():
-        return first, None, place
     return first, counts, place
 
 

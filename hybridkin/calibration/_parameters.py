@@ -211,8 +211,8 @@ class Problem:
     ) -> Problem:
         """Return the problem for these names; the priors have the same standard deviation."""
         parameters = tuple(parameter(chain, name) for name in names)
-        lows = []
-        highs = []
+        lows = [np.empty(0)]
+        highs = [np.empty(0)]
         for part in parameters:
             low, high = part.bounds()
             lows.append(low)

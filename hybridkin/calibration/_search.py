@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from hybridkin._core.model import ZeroModel
 from hybridkin.calibration._initial_guesses import Guess, initial_guesses
-from hybridkin.calibration._least_squares import ROUGH, Fit, Rows, solve
+from hybridkin.calibration._least_squares import ROUGH, Accuracy, Fit, Rows, solve
 from hybridkin.calibration._parameters import Problem
 from hybridkin.calibration.natural_scales import GEOMETRY
 from hybridkin.chains.chain import Chain
@@ -24,7 +25,28 @@ class Start(NamedTuple):
 
     problem: Problem
     theta: NDArray
-    message: str | None = None
+    messages: tuple[str, ...] = ()
+
+    @classmethod
+    def fixed(cls, chain: Chain) -> Start:
+        """Return the start of a fit of no parameters."""
+        return cls(Problem.of(chain, ()), np.empty(0))
+
+    @property
+    def n_free(self) -> int:
+        """Number of free numbers."""
+        return self.theta.size
+
+    def fitted(self, rows: Rows, loss: str, accuracy: Accuracy) -> Chain:
+        """Return the chain of a fit to rows; the chain itself if nothing is free."""
+        if not self.n_free:
+            return self.problem.chain
+        return solve(self.problem, rows, self.theta, loss, accuracy).chain()
+
+
+_NO_CHAIN = cast(Chain, ZeroModel(0, 0))
+NO_START = Start.fixed(_NO_CHAIN)
+"""No start of any fit."""
 
 
 def search(
@@ -64,7 +86,7 @@ def widened(
     theta = np.zeros(len(problem.prior_std))
     for part, place in problem.places():
         theta[place] = values.get(part.name, 0.0)
-    return Start(problem, theta, start.message)
+    return Start(problem, theta, start.messages)
 
 
 def _best(fits: list[Fit], guesses: list[Guess], free_angles: bool) -> Start:
@@ -73,22 +95,23 @@ def _best(fits: list[Fit], guesses: list[Guess], free_angles: bool) -> Start:
     Among equal fits the first is taken; a mirror image is taken only if it is clearly better.
     """
     best = fits[0]
-    image = None
+    images = []
     for fit, guess in zip(fits[1:], guesses[1:], strict=True):
-        if not guess.mirrored:
-            if fit.rmse < _EQUAL * best.rmse:
-                best = fit
-        elif image is None or fit.rmse < image.rmse:
-            image = fit
+        if guess.mirrored:
+            images.append(fit)
+        elif fit.rmse < _EQUAL * best.rmse:
+            best = fit
     better = _BETTER if free_angles else _FAR_BETTER
-    if image is None or image.rmse >= better * best.rmse:
+    clearly_better = [fit for fit in images if fit.rmse < better * best.rmse]
+    if not clearly_better:
         return Start(best.problem, best.theta)
-    message = None
+    image = min(clearly_better, key=lambda fit: fit.rmse)
+    messages = ()
     if not free_angles:
-        message = (
+        messages = (
             "the actuators run in the opposite direction to `chain`: its mirror image has an "
             f"error of {1e3 * image.rmse:.3g} mm rms, the given chain {1e3 * best.rmse:.3g} mm. "
             "The mirror image is returned; negate `angles` of the chain, or list 'turns' in "
-            "`parameters`."
+            "`parameters`.",
         )
-    return Start(image.problem, image.theta, message)
+    return Start(image.problem, image.theta, messages)

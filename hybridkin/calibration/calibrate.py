@@ -18,21 +18,16 @@ from hybridkin._core.arrays import (
     Numbers,
     as_tensor,
     check_shape,
-    labels,
     number,
     one_of,
 )
 from hybridkin._core.distinct import distinct_rows, targets_that_count
+from hybridkin._core.groups import Groups
 from hybridkin._core.portable import Portable
 from hybridkin.calibration._least_squares import HELD_OUT, LOSSES, Fit, Rows, solve
-from hybridkin.calibration._search import Start, search
+from hybridkin.calibration._search import NO_START, Start, search
 from hybridkin.calibration._unidentified import sentences
-from hybridkin.calibration.measured import (
-    evenly_spaced,
-    folds,
-    points,
-    with_missing_markers,
-)
+from hybridkin.calibration.measured import evenly_spaced, points, with_missing_markers
 from hybridkin.calibration.natural_scales import GEOMETRY
 from hybridkin.chains.chain import Chain
 
@@ -229,9 +224,9 @@ def fit_geometry(
     parameters: Sequence[str],
     loss: str = "linear",
     prior: float = GEOMETRY,
-    groups: ArrayLike | None = None,
+    groups: ArrayLike | Groups | None = None,
     sample_weight: Numbers | None = None,
-    start: Start | None = None,
+    start: Start = NO_START,
 ) -> CalibrationResult:
     """Return the result of `calibrate`; no warning is issued.
 
@@ -254,33 +249,29 @@ def fit_geometry(
     chain = chain.frozen().cpu()  # the solver runs on the CPU, without a graph
     x = targets_that_count(x, sample_weight, "x")
     q, x, unit_messages = check_data(chain, q, x)
-    if groups is not None:
-        groups = labels(groups, len(q))
+    motions = Groups.of(groups, len(q))
     weights = _check_weights(sample_weight, q)
-    first, counts, _ = distinct_rows(q, x, weights, groups)
-    if counts is None:
-        counts = np.ones(len(first))
+    first, counts, _ = distinct_rows(q, x, weights, motions.apart)
     rows = Rows(q[first], x[first], torch.from_numpy(counts).to(q))
-    if start is None:
+    if not start.n_free:
         start = search(chain, rows, names, loss, prior)
     best = solve(start.problem, rows, start.theta, loss)
-    unphysical, unphysical_message = _unphysical(best)
+    unphysical, doubts = _unphysical(best)
     messages = [
         *unit_messages,
-        start.message,
-        _few(best, rows),
-        unphysical_message,
+        *start.messages,
+        *_few(best, rows),
+        *doubts,
         *best.chain().contradictions(q),
     ]
     if not unit_messages:
-        messages.append(_unexplained(best, rows))
+        messages += _unexplained(best, rows)
     cv_rmse = None
-    if groups is not None:
-        cv_rmse = _cross_validate(best, rows, groups[first], loss)
+    if motions.whole:
+        cv_rmse = _cross_validate(best, rows, motions.take(first), loss)
     result = _result(best, rows, cv_rmse, unphysical, returns_tensors)
     result.chain.to(device)
-    issued = tuple(message for message in messages if message is not None)
-    return replace(result, messages=issued)
+    return replace(result, messages=tuple(messages))
 
 
 def refitted(start: Start, q: Tensor, x: Tensor, weights: Tensor) -> Chain:
@@ -292,37 +283,37 @@ def refitted(start: Start, q: Tensor, x: Tensor, weights: Tensor) -> Chain:
     like = start.problem.chain.geometry()["base"]
     rows = Rows(q.to(like), x.to(like), weights.to(like))
     rows = rows.take(evenly_spaced(len(q), _ENOUGH))
-    return solve(start.problem, rows, start.theta, "linear", HELD_OUT).chain()
+    return start.fitted(rows, "linear", HELD_OUT)
 
 
-def _few(fit: Fit, rows: Rows) -> str | None:
+def _few(fit: Fit, rows: Rows) -> list[str]:
     """Return a warning if there are fewer rows than free parameters: `rmse` is then too small."""
     n_rows = len(rows.q)
     n_free = fit.theta.size
     if n_rows >= n_free:
-        return None
-    return (
+        return []
+    return [
         f"`q` holds {n_rows} different rows for {n_free} free parameters: `rmse` is far below the "
         f"error on new rows. Record at least {4 * n_free}, or list fewer `parameters`."
-    )
+    ]
 
 
-def _unexplained(fit: Fit, rows: Rows) -> str | None:
+def _unexplained(fit: Fit, rows: Rows) -> list[str]:
     """Return a warning if the median residual is large, which a few outliers cannot cause."""
     residual = np.median(np.linalg.norm(rows.residual(fit.chain()), axis=1))
     centred = points((rows.x - rows.x.nanmedian(dim=0).values).numpy())[rows.seen]
     spread = np.median(np.linalg.norm(centred, axis=1))
     if len(rows.x) < _FEW or not 0 < _LEFT * spread < residual:
-        return None
-    return (
+        return []
+    return [
         f"the calibrated model has a median residual of {1e3 * residual:.3g} mm, but the tip moves "
         f"by only {1e3 * spread:.3g} mm. Order or sign of the columns of `q`, or the description "
         "of the robot, may be wrong: app.check_log(Log(q, x), chain=chain) looks for better "
         "ones."
-    )
+    ]
 
 
-def _unphysical(fit: Fit) -> tuple[tuple[str, ...], str | None]:
+def _unphysical(fit: Fit) -> tuple[tuple[str, ...], list[str]]:
     """Return the parameters at a bound or outside the physical range, and a warning."""
     problem = fit.problem
     problems = []
@@ -346,14 +337,14 @@ def _unphysical(fit: Fit) -> tuple[tuple[str, ...], str | None]:
                     length = f"{1e3 * float(after[k]):.3g} mm"
                     problems.append((part.name, f"{label} is {length}"))
     if not problems:
-        return (), None
+        return (), []
     names = dict.fromkeys(name for name, _ in problems)
     words = "; ".join(problem for _, problem in problems)
-    return tuple(names), (
+    return tuple(names), [
         f"calibration gave unphysical values: {words}. Check the units and the start, "
         "narrow the `prior`, or fit fewer `parameters`; the robot may have effects that this model "
         "does not describe (slack tendons, gravity, twist)."
-    )
+    ]
 
 
 def _result(
@@ -403,9 +394,9 @@ def _result(
     )
 
 
-def _cross_validate(best: Fit, rows: Rows, groups: NDArray, loss: str) -> float:
+def _cross_validate(best: Fit, rows: Rows, motions: Groups, loss: str) -> float:
     squares = 0.0
-    for train, test in folds(groups, groups):
+    for train, test in motions.folds():
         fit = solve(best.problem, rows.take(train), best.theta, loss, HELD_OUT)
         held_out = rows.take(test)
         squares += held_out.rmse(fit.chain()) ** 2 * float(held_out.weights.sum())

@@ -11,24 +11,26 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from hybridkin._core.arrays import Numbers, as_tensor, labels, one_of
+from hybridkin._core.arrays import Numbers, as_tensor, one_of
 from hybridkin._core.directions import in_terms, moved_directions
 from hybridkin._core.distinct import distinct_rows, targets_that_count
+from hybridkin._core.groups import Groups
 from hybridkin._core.model import ForwardModel
+from hybridkin._core.simplest import simplest_within
 from hybridkin.calibration._least_squares import COMPARED, LOSSES, ROUGH, Rows, solve
-from hybridkin.calibration._search import Start, search, widened
+from hybridkin.calibration._search import NO_START, Start, search, widened
 from hybridkin.calibration.calibrate import (
     CalibrationResult,
     check_data,
     fit_geometry,
 )
-from hybridkin.calibration.measured import evenly_spaced, folds, inner_and_outer
+from hybridkin.calibration.measured import evenly_spaced, inner_and_outer
 from hybridkin.chains.chain import Chain
 
 __all__ = ["GeometryChoice", "choose_geometry"]
 
-Starts = tuple[Start | None, ...]
-"""Starts of the fits of all sets of parameters; None without parameters."""
+Starts = tuple[Start, ...]
+"""Starts of the fits of all sets of parameters."""
 
 # rows and folds for the scores
 _MOST = 400
@@ -79,8 +81,8 @@ class GeometryChoice:
         The given chain, or elastic tendons with its geometry.
     parameters : tuple of str
         The parameters to calibrate; may be empty.
-    start : Start or None
-        Start of their fit; None without parameters, or to search it.
+    start : Start
+        Start of their fit. Default: it is searched.
     name : str
         Name of the set in `errors`.
     errors : dict of str to Errors
@@ -89,7 +91,7 @@ class GeometryChoice:
         Warnings about the log.
     rivals : tuple of GeometryChoice
         The other sets whose errors are at most a tenth above those of the chosen one.
-    starts : tuple of Start or None
+    starts : tuple of Start
         Starts of the fits of all sets.
     usual : tuple of GeometryChoice
         The sets that suit few rows: nothing, the base, and base and radii of the given chain.
@@ -97,13 +99,17 @@ class GeometryChoice:
 
     chain: Chain
     parameters: tuple[str, ...]
-    start: Start | None = None
+    start: Start = NO_START
     name: str = ""
     errors: Mapping[str, Errors] = field(default_factory=dict)
     messages: tuple[str, ...] = ()
     rivals: tuple[GeometryChoice, ...] = ()
-    starts: tuple[Start | None, ...] = ()
+    starts: Starts = ()
     usual: tuple[GeometryChoice, ...] = ()
+
+    def __bool__(self) -> bool:
+        """Return whether there was a choice, maybe of nothing to calibrate."""
+        return self.chain.n_actuators > 0
 
     def __iter__(self) -> Iterator[str]:
         """Return an iterator over the parameters to calibrate."""
@@ -140,6 +146,10 @@ class GeometryChoice:
         return self
 
 
+NOT_CHOSEN = GeometryChoice(NO_START.problem.chain, ())
+"""No choice of parameters; it is falsy."""
+
+
 class _Candidate(NamedTuple):
     """One set of parameters to choose from."""
 
@@ -165,12 +175,12 @@ def choose_geometry(
     q: Numbers,
     x: Numbers,
     *,
-    groups: ArrayLike | None = None,
+    groups: ArrayLike | Groups | None = None,
     weights: Numbers | None = None,
     loss: str = "linear",
     outside: bool = True,
     parameters: Sequence[str] | None = None,
-    starts: Sequence[Start | None] = (),
+    starts: Sequence[Start] = (),
 ) -> GeometryChoice:
     """Return the parameters with the smallest calibration error on new motions and extrapolation.
 
@@ -202,7 +212,7 @@ def choose_geometry(
         Whether the score uses `io`, because a correction will be learned; else it is `cv`.
     parameters : sequence of str, optional
         The set to calibrate. The only choice is then whether the tendons are elastic.
-    starts : sequence of Start or None, optional
+    starts : sequence of Start, optional
         Starts of the fits from a choice on more rows of the same log. Default: they are searched.
 
     Returns
@@ -233,20 +243,16 @@ def choose_geometry(
     chain = chain.frozen().cpu()
     x = targets_that_count(x, weights, "x")
     q, x, _ = check_data(chain, q, x)
-    motions = None if groups is None else labels(groups, len(q))
-    if weights is not None:
-        weights = as_tensor(weights, "weights").to(q)
-    first, counts, _ = distinct_rows(q, x, weights, motions)
-    if counts is None:
-        counts = np.ones(len(first))
-    order = np.arange(len(first))
-    if motions is not None:
-        motions = motions[first]
-        order = np.argsort(motions, kind="stable")
+    motions = Groups.of(groups, len(q))
+    if weights is None:
+        weights = np.ones(len(q))
+    weights = as_tensor(weights, "weights").to(q)
+    first, counts, _ = distinct_rows(q, x, weights, motions.apart)
+    motions = motions.take(first)
+    order = np.argsort(motions.labels, kind="stable")
     chosen = np.sort(order[evenly_spaced(len(first), _MOST)])
     rows = Rows(q[first], x[first], torch.from_numpy(counts).to(q)).take(chosen)
-    if motions is not None:
-        motions = motions[chosen]
+    motions = motions.take(chosen)
     with torch.no_grad():
         candidates = _candidates(chain, q, parameters)
         messages = () if parameters is not None else unmoved(chain, q)
@@ -257,15 +263,15 @@ def choose_geometry(
     near = []
     errors = {}
     if len(candidates) > 1:
-        splits = _splits(rows, motions)
+        splits = _splits(motions)
         outer = None
         if outside and len(chosen) >= _FEW:
             outer = _Split(*inner_and_outer(rows.q.numpy()))
         for candidate, start in zip(candidates, starts, strict=True):
-            cv = _mean_distance(candidate, start, rows, splits, loss)
+            cv = _mean_distance(start, rows, splits, loss)
             io = np.nan
             if outer is not None:
-                io = _mean_distance(candidate, start, rows, [outer], loss)
+                io = _mean_distance(start, rows, [outer], loss)
             errors[candidate.name] = Errors(cv, io)
         n_inner = len((outer or splits[-1]).fitted)
         table = np.maximum([*errors.values()], _EXACT * float(chain.reach))
@@ -291,12 +297,12 @@ def choose_geometry(
 def _best(
     errors: NDArray,
     candidates: Sequence[_Candidate],
-    starts: Sequence[Start | None],
+    starts: Sequence[Start],
     n_rows: int,
     n_inner: int,
 ) -> int:
     """Return the index of the chosen one of K sets, with `Errors` (K, 2), smaller sets first."""
-    n_free = np.array([0 if start is None else start.theta.size for start in starts])
+    n_free = np.array([start.n_free for start in starts])
     usual = np.array([candidate.name in _USUAL for candidate in candidates])
     cv, io = errors.T
     # Where the inner rows do not suffice, `io` is at most that of the last set for which they do.
@@ -310,7 +316,7 @@ def _best(
     sure = usual | (n_free <= n_rows / _ROWS)
     sure = sure | (scores < _CLEARLY * scores[sure].min(initial=np.inf))
     good = sure & (cv <= _WORSE * cv[sure].min())
-    return int(np.argmax(good & (scores <= (1.0 + _EQUAL) * scores[good].min())))
+    return simplest_within(np.where(good, scores, np.inf), _EQUAL)
 
 
 def _candidates(
@@ -351,37 +357,33 @@ def _name(names: tuple[str, ...]) -> str:
     return " + ".join(words) or "nothing"
 
 
-def _starts(
-    candidates: Sequence[_Candidate], rows: Rows, loss: str
-) -> list[Start | None]:
+def _starts(candidates: Sequence[_Candidate], rows: Rows, loss: str) -> list[Start]:
     """Return the start of the fit of every set; initial guesses are searched if rings become free.
 
     Other sets start from the previous one; elastic tendons also from a plain chain with the same
     free rings.
     """
-    starts: list[Start | None] = []
+    starts: list[Start] = []
     for candidate in candidates:
         names = candidate.parameters
         free = candidate.free_rings
-        previous = None
-        plain = None
+        previous: list[Start] = []
+        plain: list[Start] = []
         searched = False
         for other, start in zip(candidates, starts, strict=False):
-            if start is None:
+            if not start.n_free:
                 continue
             if other.chain is candidate.chain:
-                previous = start
+                previous = [start]
                 searched = free <= other.free_rings
             elif ("angles" in free) == ("angles" in other.free_rings):
-                plain = start
+                plain = [start]
         if not names:
-            starts.append(None)
-        elif previous is not None and searched:
-            starts.append(_refitted([widened(previous, names)], rows, loss))
-        elif plain is not None:
-            tried = [widened(plain, names, elastic=True)]
-            if previous is not None:
-                tried.insert(0, widened(previous, names))
+            starts.append(Start.fixed(candidate.chain))
+        elif searched or plain:
+            tried = [widened(start, names) for start in previous]
+            if not searched:
+                tried += [widened(start, names, elastic=True) for start in plain]
             starts.append(_refitted(tried, rows, loss))
         else:
             starts.append(search(candidate.chain, rows, names, loss))
@@ -390,27 +392,19 @@ def _starts(
 
 def _refitted(starts: list[Start], rows: Rows, loss: str) -> Start:
     """Return the start with the smallest error of a rough fit; the first one if nearly equal."""
-    best = starts[0]
-    least = np.inf
-    for start in starts:
-        fit = solve(start.problem, rows, start.theta, loss, ROUGH)
-        if fit.rmse * (1.0 + _ALIKE) < least:
-            best = start._replace(theta=fit.theta)
-            least = fit.rmse
-    return best
+    fits = [solve(start.problem, rows, start.theta, loss, ROUGH) for start in starts]
+    best = simplest_within([fit.rmse for fit in fits], _ALIKE)
+    return starts[best]._replace(theta=fits[best].theta)
 
 
-def _splits(rows: Rows, groups: NDArray | None) -> list[_Split]:
+def _splits(motions: Groups) -> list[_Split]:
     """Return folds of motions or rows; for a single motion, of parts of it."""
-    n = len(rows.q)
-    if groups is not None and len(np.unique(groups)) < 2:
-        groups = np.arange(n) * 10 // n
-    return [_Split(*split) for split in folds(rows.q, groups, _FOLDS, shuffle=True)]
+    splits = motions.in_parts().folds(_FOLDS, shuffle=True)
+    return [_Split(*split) for split in splits]
 
 
 def _mean_distance(
-    candidate: _Candidate,
-    start: Start | None,
+    start: Start,
     rows: Rows,
     splits: Sequence[_Split],
     loss: str,
@@ -419,10 +413,7 @@ def _mean_distance(
     total = 0.0
     total_weight = 0.0
     for split in splits:
-        chain = candidate.chain
-        if start is not None:
-            fitted = rows.take(split.fitted)
-            chain = solve(start.problem, fitted, start.theta, loss, COMPARED).chain()
+        chain = start.fitted(rows.take(split.fitted), loss, COMPARED)
         predicted = rows.take(split.predicted)
         weights = predicted.weights
         total += weights @ np.linalg.norm(predicted.residual(chain), axis=1)

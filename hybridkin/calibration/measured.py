@@ -1,16 +1,12 @@
-"""Checks of measured rows before a fit: missing values, scaled values; folds of motions."""
+"""Checks of measured rows before a fit: missing values, scaled values."""
 
 from __future__ import annotations
 
-from collections.abc import Sized
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from sklearn.model_selection import GroupKFold, KFold
 
 from hybridkin._core.arrays import countable
 from hybridkin._core.directions import moved_directions
-from hybridkin._core.turns import TURNS
 
 # fractions of rows by distance: end of the inner, start of the outer
 _INNER = 0.4
@@ -91,30 +87,6 @@ def check_unscaled(name: str, values: NDArray, meant: str) -> None:
             f"{scaler}; take it out of the pipeline. Error models scale their inputs themselves; "
             "one that does not can include it: error_model=make_pipeline(StandardScaler(), ...)."
         )
-
-
-def folds(
-    X: Sized, groups: NDArray | None, most: int = 5, shuffle: bool = False
-) -> list[tuple[NDArray, NDArray]]:
-    """Return training and held-out rows of at most `most` folds of whole groups, or of rows.
-
-    Rows are always shuffled, groups only if `shuffle`.
-    """
-    n_groups = len(X)
-    if groups is not None:
-        n_groups = len(np.unique(groups))
-    n_folds = min(most, n_groups)
-    if n_folds < 2:
-        raise ValueError(
-            "`groups` must hold at least two motions, so that one can be held out, got one; record "
-            "more motions, or leave `groups` out."
-        )
-    if groups is None:
-        return [*KFold(n_folds, shuffle=True, random_state=0).split(X)]
-    random_state = 0 if shuffle else None
-    splitter = GroupKFold(n_folds, shuffle=shuffle, random_state=random_state)
-    with TURNS.filters:
-        return [*splitter.split(X, groups=groups)]
 
 
 def evenly_spaced(n: int, most: int) -> NDArray[np.intp]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from hybridkin._core.actuators import ActuatorLayout
 from hybridkin._core.arrays import Numbers, as_path, shaped
+from hybridkin._core.reading import Reading
 from hybridkin._core.units import METRES, UNITS
 from hybridkin.chains._robot_files import chain_of, each, read_tables
 from hybridkin.chains.arc_chain import ArcChain
@@ -60,7 +61,7 @@ def bionic_handling_assistant() -> ConstantCurvatureChain:
 
 
 @dataclass(frozen=True)
-class LogFormat:
+class LogFormat(Reading):
     """Format of a robot's logs: columns, units and sign.
 
     Attributes
@@ -68,41 +69,21 @@ class LogFormat:
     q, x : tuple of str
         Columns of the actuator vector and of the tip position, in the chain's order; with several
         markers three for each, in the order of ``chain.markers``.
-    q_unit, x_unit : {"m", "cm", "mm", "um", "in"}
-        Units of these columns. For a chain with `gains` the unit of q is any other name; for a
-        robot without segments it may also be "rad", "deg" or "1".
+    q_unit : str
+        Unit of q. For a chain with `gains` it is any name; for a robot without segments it may also
+        be "rad", "deg" or "1".
     q_sign : int or tuple of int
         -1 if the log counts a pulled (shortened) tendon as positive.
     group_suffix : str
         A motion whose name ends in this suffix belongs to the motion named without it.
-    unwrap : bool, float or mapping of str to float
-        Periods of encoders to correct, see `datasets.load_log`.
-    groups, runs, time : str or None
-        Columns of the motion of each row, of its run (see `Commands`), and of its time stamp.
-    time_unit : {"s", "ms", "us", "ns", "frames"}
-        Unit of the time stamps.
-    rate : float or None
-        Frames per second, if `time_unit` is "frames" [1/s].
-    header_line, decimal, missing
-        Form of text files, and numbers that stand for missing values; as for
-        `datasets.load_log`.
+    groups, runs, time, time_unit, rate, x_unit, missing, unwrap
+        As for `datasets.load_log`.
+    delimiter, header_line, decimal, drop_invalid
+        As for `datasets.load_log`.
     """
 
-    q: tuple[str, ...]
-    x: tuple[str, ...]
-    q_unit: str = "m"
-    x_unit: str = "m"
-    q_sign: int | tuple[int, ...] = 1
+    _: KW_ONLY
     group_suffix: str = ""
-    groups: str | None = None
-    time: str | None = None
-    runs: str | None = None
-    header_line: int | None = None
-    decimal: str = "."
-    missing: tuple[float, ...] = ()
-    unwrap: bool | float | Mapping[str, float] = False
-    time_unit: str = "s"
-    rate: float | None = None
 
     @property
     def q_factor(self) -> NDArray:
@@ -122,26 +103,23 @@ class LogFormat:
 
     def of_tracks(self, target: tuple[str, ...]) -> LogFormat:
         """Return the format of a track.csv, which has the columns of q and targets as tips."""
-        return replace(
-            self,
-            x=target,
-            groups="status",
-            time_unit="s",
-            rate=None,
-            header_line=None,
-            decimal=".",
-            missing=(),
-            unwrap=False,
+        return LogFormat(
+            self.q,
+            target,
+            "status",
+            runs=self.runs,
+            time=self.time,
+            q_unit=self.q_unit,
+            x_unit=self.x_unit,
+            q_sign=self.q_sign,
+            group_suffix=self.group_suffix,
         )
 
     @property
     def reading(self) -> dict[str, Any]:
         """The arguments of `datasets.load_log` for this format."""
-        arguments = dict(vars(self))
-        del arguments["group_suffix"]
-        if self.q_unit not in UNITS:
-            arguments["q_unit"] = "1"
-        return arguments
+        unit = self.q_unit if self.q_unit in UNITS else "1"
+        return replace(self, q_unit=unit).keywords
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,6 +22,7 @@ from hybridkin._core.arrays import (
 )
 from hybridkin._core.commands import Commands
 from hybridkin._core.named_rows import named_places
+from hybridkin._core.reading import Reading, with_fields_of
 from hybridkin._core.text_rows import TextForm
 from hybridkin._core.units import METRES, UNITS, duration_in_words
 from hybridkin.datasets._frames import frame_table
@@ -127,40 +128,13 @@ class Log:
             )
         return "\n  ".join(lines)
 
-    @classmethod
-    def from_frame(
-        cls,
-        df: Any,
-        q: Sequence[str],
-        x: Sequence[str],
-        groups: str | None = None,
-        *,
-        runs: str | None = None,
-        time: str | None = None,
-        time_unit: str = "s",
-        rate: float | None = None,
-        q_unit: str = "m",
-        x_unit: str = "m",
-        q_sign: ArrayLike = 1,
-        missing: ArrayLike = (),
-        unwrap: bool | float | Mapping[str, float] = False,
-        drop_invalid: bool = False,
-    ) -> Log:
-        """Return the log in a data frame, as `load_log` from a file.
+    @staticmethod
+    @with_fields_of(Reading)
+    def from_frame(df: Any, reading: Reading) -> Log:
+        """Return the log in a data frame as from a file; see `load_log`.
 
-        Parameters
-        ----------
-        df : data frame
-            A frame of pandas, polars, modin or narwhals, or a table of pyarrow. Null is missing.
-        q, x, groups, runs, time, time_unit, rate
-            As for `load_log`.
-        q_unit, x_unit, q_sign, missing, unwrap, drop_invalid
-            As for `load_log`.
-
-        Returns
-        -------
-        Log
-            In SI units; its lines are the numbers of rows, from 0.
+        The frame is one of pandas, polars, modin or narwhals, or a table of pyarrow. Null is
+        missing, and lines are the numbers of rows, from 0.
 
         Raises
         ------
@@ -178,12 +152,7 @@ class Log:
         array([[0.01, 0.  , 0.05],
                [0.02, 0.  , 0.06]])
         """
-        table = frame_table(df, "data frame")
-        columns = _Columns.of(table, q, x, time, {"groups": groups, "runs": runs})
-        conversion = _Conversion(
-            q_unit, x_unit, q_sign, missing, unwrap, time_unit, rate
-        )
-        return _converted(table, columns, conversion, drop_invalid)
+        return _converted(frame_table(df, "data frame"), reading)
 
     @property
     def commands(self) -> Commands:
@@ -218,26 +187,8 @@ class Log:
         return encoder_faults(readings, self.x, runs[1:] == runs[:-1], periods)
 
 
-def load_log(
-    path: str | os.PathLike[str],
-    q: Sequence[str],
-    x: Sequence[str],
-    groups: str | None = None,
-    *,
-    runs: str | None = None,
-    time: str | None = None,
-    time_unit: str = "s",
-    rate: float | None = None,
-    q_unit: str = "m",
-    x_unit: str = "m",
-    q_sign: ArrayLike = 1,
-    delimiter: str | None = None,
-    header_line: int | None = None,
-    decimal: str = ".",
-    missing: ArrayLike = (),
-    unwrap: bool | float | Mapping[str, float] = False,
-    drop_invalid: bool = False,
-) -> Log:
+@with_fields_of(Reading)
+def load_log(path: str | os.PathLike[str], reading: Reading) -> Log:
     r"""Return actuator vectors and tip positions from a log: a CSV, npz or parquet file.
 
     Parameters
@@ -334,10 +285,7 @@ def load_log(
     >>> log.x, log.q_names
     (array([[0.01, 0.02, 0.03]]), ['a', 'b', 'c'])
     """
-    table = read_table(as_path(path), TextForm(delimiter, header_line, decimal))
-    columns = _Columns.of(table, q, x, time, {"groups": groups, "runs": runs})
-    conversion = _Conversion(q_unit, x_unit, q_sign, missing, unwrap, time_unit, rate)
-    return _converted(table, columns, conversion, drop_invalid)
+    return _converted(read_table(as_path(path), reading.text_form), reading)
 
 
 def log_columns(
@@ -373,60 +321,37 @@ class _Columns(NamedTuple):
     labels: dict[str, str]
 
     @classmethod
-    def of(
-        cls,
-        table: Table,
-        q: Sequence[str],
-        x: Sequence[str],
-        time: str | None,
-        labels: Mapping[str, str | None],
-    ) -> Self:
+    def of(cls, table: Table, reading: Reading) -> Self:
         """Return the names as the table has them."""
         of_q = []
-        if not isinstance(q, (list, tuple)) or q:
-            of_q = table.names("q", q)
-        of_x = table.names("x", x)
+        if not isinstance(reading.q, (list, tuple)) or reading.q:
+            of_q = table.names("q", reading.q)
+        of_x = table.names("x", reading.x)
         if len(of_x) % 3:
             raise ValueError(
                 "`x` must name 3 columns, or 3 for each of several markers, got "
                 f"{len(of_x)}: {of_x}."
             )
-        given = {
-            argument: name for argument, name in labels.items() if name is not None
-        }
-        times = [] if time is None else [time]
-        return cls(of_q, of_x, times, given)
+        labels = {"groups": reading.groups, "runs": reading.runs}
+        named = {}
+        for argument, name in labels.items():
+            if name is not None:
+                named[argument] = name
+        times = [] if reading.time is None else [reading.time]
+        return cls(of_q, of_x, times, named)
 
 
-class _Conversion(NamedTuple):
-    """The units and signs of columns, their missing values, and the periods of encoders."""
-
-    q_unit: str
-    x_unit: str
-    q_sign: ArrayLike
-    missing: ArrayLike
-    unwrap: bool | float | Mapping[str, float]
-    time_unit: str
-    rate: float | None
-
-    @property
-    def unit_of_q(self) -> str:
-        """The unit of the actuator columns."""
-        return "1" if self.q_unit == "counts" else self.q_unit
-
-
-def _converted(
-    table: Table, columns: _Columns, conversion: _Conversion, drop_invalid: bool
-) -> Log:
+def _converted(table: Table, reading: Reading) -> Log:
     """Return a log in SI units, without its invalid rows."""
-    q_unit = conversion.unit_of_q
-    x_unit = conversion.x_unit
+    columns = _Columns.of(table, reading)
+    q_unit = "1" if reading.q_unit == "counts" else reading.q_unit
+    x_unit = reading.x_unit
     n = len(columns.q)
-    factor = _checked_factor(n, q_unit, x_unit, conversion.q_sign)
+    factor = _checked_factor(n, q_unit, x_unit, reading.q_sign)
     table.check_unit("q_unit", columns.q, q_unit)
     table.check_unit("x_unit", columns.x, x_unit)
     stamps = table.column(columns.times[0]) if columns.times else ()
-    seconds = seconds_per_unit(stamps, conversion.time_unit, conversion.rate)
+    seconds = seconds_per_unit(stamps, reading.time_unit, reading.rate)
     values = table.values([*columns.q, *columns.x, *columns.times], columns.times)
     labelled = {
         argument: table.labels(argument, name, len(values))
@@ -435,8 +360,8 @@ def _converted(
     commands = values[:, :n]
     tips = values[:, n : n + len(columns.x)]
     times = values[:, n + len(columns.x) :]
-    without_missing(commands, conversion.missing, zeros=False)
-    without_missing(tips, conversion.missing)
+    without_missing(commands, reading.missing, zeros=False)
+    without_missing(tips, reading.missing)
     complete = countable(tips).reshape(len(tips), -1, 3).all(axis=2)
     tips = np.where(complete.repeat(3, axis=1), tips, np.nan)
     valid = countable(commands).all(axis=1) & complete.any(axis=1)
@@ -448,7 +373,7 @@ def _converted(
     if places is None:
         kind = "row"
         places = np.arange(len(values))
-    if not valid.any() or not (drop_invalid or valid.all()):
+    if not valid.any() or not (reading.drop_invalid or valid.all()):
         raise ValueError(
             f"{(~valid).sum()} of {len(values)} rows of {str(table.source)!r} have a missing, "
             f"NaN or infinite value, or no motion ({named_places(places[~valid], kind)}); correct "
@@ -457,7 +382,7 @@ def _converted(
     commands = commands[valid]
     tips = tips[valid]
     labelled = {argument: names[valid] for argument, names in labelled.items()}
-    periods = given_periods(conversion.unwrap, columns.q, q_unit)
+    periods = given_periods(reading.unwrap, columns.q, q_unit)
     if any(periods):
         same_run = _same_run(labelled, len(tips))
         commands = unwrapped(commands, tips[:, -3:], same_run, periods)
@@ -474,7 +399,7 @@ def _converted(
         invalid_lines=places[~valid],
         q_names=columns.q,
         x_names=columns.x,
-        q_sign=conversion.q_sign,
+        q_sign=reading.q_sign,
         units={"q": si_unit, "x": "m"},
         file_units={"q": q_unit, "x": x_unit},
         source=str(table.source),
@@ -500,7 +425,7 @@ def _warn_of_millimetres(name: str, column: NDArray, unit: str) -> None:
         warnings.warn(
             f"The `{name}` columns span {span:.4g} m around {middle:.4g} m; if the file has "
             f"millimetres, give {name}_unit='mm' (centimetres: 'cm').",
-            stacklevel=4,
+            stacklevel=5,
         )
 
 

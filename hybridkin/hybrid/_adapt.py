@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from typing_extensions import Self
 
 from hybridkin._core.arrays import identity
+from hybridkin._core.groups import Groups
 from hybridkin._core.model import ForwardModel, moved_points
 from hybridkin._core.rotations import (
     cross_matrix,
@@ -123,7 +124,7 @@ def likeliest_change(
 
 
 def _least_cost(
-    problem: _Problem, groups: NDArray | None, noise: float, parameters: Sequence[str]
+    problem: _Problem, groups: Groups, noise: float, parameters: Sequence[str]
 ) -> tuple[NDArray, NDArray]:
     """Return the most probable change theta, and the residual after it, relative to the noise."""
     theta = std = np.zeros(6 + len(problem.scale))
@@ -243,19 +244,19 @@ class _Problem:
         return residual.numpy(), A.numpy()
 
 
-def _whitened(values: NDArray, groups: NDArray | None) -> NDArray:
+def _whitened(values: NDArray, groups: Groups) -> NDArray:
     """Return rows (k, ...) whitened for errors with a part that is common to their group.
 
     The common part makes the mean of a group less certain, and differences from it more certain.
     """
-    if groups is None:
+    if not groups.whole:
         return values
     whitened = np.empty_like(values)
     individual = 1.0 - _COMMON
-    for group in np.unique(groups):
-        rows = groups == group
+    for members in groups.members:
+        rows = members.numpy()
         mean = values[rows].mean(axis=0)
-        common = mean / (individual + _COMMON * rows.sum()) ** 0.5
+        common = mean / (individual + _COMMON * len(rows)) ** 0.5
         whitened[rows] = (values[rows] - mean) / individual**0.5 + common
     return whitened
 

@@ -317,7 +317,7 @@ class HiddenLayer(FeatureModel):
 
     def features(self, q: Tensor, mechanical: ForwardModel) -> Features:
         """Return the features for training rows q (N, n)."""
-        layer = draw_layer(self.layer, q.numpy(), None)
+        layer = draw_layer(self.layer, q.numpy(), np.ones(len(q)))
         return HiddenFeatures.of_range(
             q, layer.input_weights, layer.input_bias, layer.activation
         )
@@ -368,7 +368,7 @@ class RegressorModel(TipModel, Generic[_Regressor]):
 
     def knows_held_out_error(self, rows: Rows) -> bool:
         """Return whether the `noise` of its fit is that of held-out rows, or groups if given."""
-        return self.holds_out and rows.groups is None
+        return self.holds_out and not rows.groups.whole
 
     def _settled(self, regressor: _Regressor) -> ErrorModel:
         return self
@@ -466,7 +466,6 @@ class KernelModel(RegressorModel[KernelRidge]):
         super().__init__(KernelRidge())
 
     def _learned(self, rows: Rows) -> KernelRidge:
-        assert rows.residual is not None
         tuned = tuned_kernel(rows.X, rows.residual, rows.counts, rows.groups)
         with TURNS.filters:  # scikit-learn's solver changes them
             return _fit_to_residuals(tuned, rows)
@@ -550,10 +549,10 @@ def _fit_to_residuals(regressor: _Regressor, rows: Rows) -> _Regressor:
     if not has_fit_parameter(within, "sample_weight"):
         rows = rows.repeated()
     options = {}
-    if rows.weights is not None:
-        options["sample_weight"] = rows.weights
-    if rows.groups is not None and has_fit_parameter(within, "groups"):
-        options["groups"] = rows.groups
+    if not rows.count_once:  # scikit-learn's numbers change with weights of one
+        options["sample_weight"] = rows.counts
+    if rows.groups.whole and has_fit_parameter(within, "groups"):
+        options["groups"] = rows.groups.labels
     try:
         copied.fit(rows.X, rows.residual, **options)
     except ValueError as error:
@@ -587,7 +586,6 @@ def _on_moved_directions(module: ForwardModel, directions: Directions) -> Forwar
 
 def _residual(rows: Rows) -> NDArray:
     """Return the residuals as a matrix (N, m) [m]."""
-    assert rows.residual is not None
     return rows.residual.reshape(len(rows), -1)
 
 

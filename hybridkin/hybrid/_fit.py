@@ -79,10 +79,8 @@ def _module(rows: Rows, spec: Spec, weighted: Weighted) -> HybridModule | WithPo
     if spec.error_model.learns or not directions.moved.size:
         # Backlash moves actuators off the plane of their commands, but only by its width.
         plane = Plane.of_log(spec.mechanical, rows.q, rows.commanded or directions)
-        groups = None
-        if guarded:
-            groups = rows.groups
-        tested = GroupDistance.of_log(rows.q, groups, directions, plane)
+        held_out = guarded and rows.groups.whole
+        tested = GroupDistance.of_log(rows, held_out, plane)
     if spec.output == "pose":
         assert spec.mechanical is not None  # checked with the settings
         return WithPose.of(spec.mechanical, corrections, weights, tested, plane)

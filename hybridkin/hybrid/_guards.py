@@ -22,6 +22,7 @@ from hybridkin._core.portable import PortableModule
 from hybridkin._core.stored import Layout, Stored
 from hybridkin.calibration.choice import split_by_effect
 from hybridkin.hybrid._features import center_and_scale
+from hybridkin.hybrid._rows import Rows
 from hybridkin.learning.network import (
     ELM,
     LeverageModule,
@@ -401,19 +402,22 @@ class GroupDistance(PortableModule):
     @classmethod
     def of_log(
         cls,
-        q: Tensor,
-        groups: NDArray | None,
-        directions: Directions,
+        rows: Rows,
+        held_out: bool,
         plane: Plane | None,
     ) -> GroupDistance | None:
         """Return the distance from the groups, and across the directions that no row moves.
 
+        With `held_out`, errors of held-out groups have tested the model.
+
         Where mechanics predict what happens there, steps of a tenth of the range stay in the
         domain; off the plane, only steps of a hundredth. None if there is nothing to measure.
         """
+        q = rows.q
+        directions = rows.directions
         tested = None
-        if groups is not None:
-            tested = cls.fit(q, groups)
+        if held_out:
+            tested = cls.fit(q, rows.groups.labels)
         if not directions.still.size and plane is None:
             return tested
         if tested is None:

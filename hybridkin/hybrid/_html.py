@@ -2,11 +2,32 @@
 
 from __future__ import annotations
 
+from typing import Any, Protocol
+
 from hybridkin._core.html import numbers
-from hybridkin.hybrid._predictor import HybridPredictor
+from hybridkin._core.model import ForwardModel
+from hybridkin.hybrid._range import TrainingRange
+from hybridkin.hybrid.log_fit import HybridFit
 
 
-def fitted_rows(model: HybridPredictor) -> dict[str, object]:
+class _Fitted(Protocol):
+    """What is read of a fitted `HybridForwardModel`, beside the record of its fit."""
+
+    error_model: Any
+    coupling: str
+    calibrate: Any
+    guard: str | None
+    n_features_in_: int
+    module_: ForwardModel
+    mechanical_model_: ForwardModel | None
+
+    @property
+    def training_range_(self) -> TrainingRange: ...
+
+    def structure_in_words(self) -> list[str]: ...
+
+
+def fitted_rows(model: _Fitted, fit: HybridFit) -> dict[str, object]:
     """Return names and values of what the fit of a hybrid found, for `html_table`."""
     mechanical = model.mechanical_model_
     kind = "none"
@@ -15,81 +36,79 @@ def fitted_rows(model: HybridPredictor) -> dict[str, object]:
     rows: dict[str, object] = {
         "actuators": model.n_features_in_,
         "mechanical model": kind,
-        "calibrated": _calibrated(model),
-        "error model": _error_model(model),
-        **_error(model),
-        "training rows": f"{len(model._fit.fitted_rows)} different rows",
-        "domain": _domain(model),
+        "calibrated": _calibrated(model, fit),
+        "error model": _error_model(model, fit),
+        **_error(fit),
+        "training rows": f"{len(fit.fitted_rows)} different rows",
+        "domain": _domain(model, fit),
     }
     words = model.structure_in_words()
     if words:
         rows["structure"] = " ".join(words)
-    if model.radius_ is not None:
-        rows["estimated error radius"] = str(model.radius_)
-    if model.hysteresis_:
-        rows[model.hysteresis_.kind] = (
-            f"width {numbers(model.hysteresis_.width)} (unit of q)"
-        )
-    if model.module_ is not model.fitted_module_:
+    if fit.radius is not None:
+        rows["estimated error radius"] = str(fit.radius)
+    if fit.hysteresis:
+        rows[fit.hysteresis.kind] = f"width {numbers(fit.hysteresis.width)} (unit of q)"
+    if model.module_ is not fit.module:
         rows["adapted"] = "after the fit; the errors are those of the fit"
-    if model.calibration_ is not None:
-        rows["calibration"] = {"": repr(model.calibration_)}
+    if fit.calibration is not None:
+        rows["calibration"] = {"": repr(fit.calibration)}
     if mechanical is not None:
         rows["geometry"] = mechanical.html_rows()
     rows["training range of q"] = _range(model)
     return rows
 
 
-def _calibrated(model: HybridPredictor) -> str:
-    if model.calibration_ is not None:
-        return ", ".join(model.calibration_.values)
-    if model.cv_results_ is not None:  # of a model from a file
-        return model.cv_results_["parameters"]
+def _calibrated(model: _Fitted, fit: HybridFit) -> str:
+    if fit.calibration is not None:
+        return ", ".join(fit.calibration.values)
+    if fit.error.comparison is not None:  # of a model from a file
+        return fit.error.comparison["parameters"]
     if isinstance(model.calibrate, str):
         return model.calibrate
     return ", ".join(model.calibrate or ()) or "nothing"
 
 
-def _domain(model: HybridPredictor) -> str:
+def _domain(model: _Fitted, fit: HybridFit) -> str:
     domain = "close to the training rows (guard by leverage)"
     if model.guard is None:
         domain = "everywhere (no guard)"
-    if model.fitted_module_.tested is None:
+    if fit.module.tested is None:
         return domain
     return f"{domain}, as far as held-out groups tested it"
 
 
-def _error_model(model: HybridPredictor) -> str:
-    if model.cv_results_ is not None:
+def _error_model(model: _Fitted, fit: HybridFit) -> str:
+    if fit.error.comparison is not None:
         parts = []
-        for name, weight in model.cv_results_["weights"].items():
+        for name, weight in fit.error.comparison["weights"].items():
             if weight > 0.0:
                 parts.append(f"{weight:.2f} {name}")
         return f'{" + ".join(parts)} (chosen by "auto")'
-    name = model._fit.kind
+    name = fit.kind
     if isinstance(model.error_model, str):
         name = f'"{model.error_model}"'
-    if model._fit.error.rejected:
+    if fit.error.rejected:
         return f"{name}, {model.coupling}, rejected by the held-out error"
     return f"{name}, {model.coupling}"
 
 
-def _error(model: HybridPredictor) -> dict[str, str]:
+def _error(fit: HybridFit) -> dict[str, str]:
     """Return the error on held-out rows or, where it is not known, on training rows."""
-    results = model.cv_results_
+    results = fit.error.comparison
     if results is not None:
         mean = _mm(results["expected_distance"])
         first = results["candidate"][0]
         error_of_first = _mm(results["mean_distance"][0])
         words = f"mean {mean}, {first} model alone {error_of_first}"
         return {"held-out error": words}
-    words = f"standard deviation of a coordinate {_mm(model._fit.error.noise)}"
-    if model._fit.error.held_out:
+    words = f"standard deviation of a coordinate {_mm(fit.error.noise)}"
+    if fit.error.held_out:
         return {"held-out error": words}
     return {"training error": words}
 
 
-def _range(model: HybridPredictor) -> dict[str, object]:
+def _range(model: _Fitted) -> dict[str, object]:
     low, high = model.training_range_
     names = vars(model).get("feature_names_in_", [f"q[{k}]" for k in range(len(low))])
     ranges: dict[str, object] = {"": ("least", "largest")}

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hybridkin._core.groups import Groups
 from hybridkin._core.model import as_forward_model
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._spec import HysteresisChoice, Spec
@@ -83,7 +83,7 @@ class FoundHysteresis(HysteresisChoice):
 
     def of(self, spec: Spec, rows: Rows) -> tuple[Hysteresis, list[str]]:
         """Return the hysteresis, and warnings about what the log does not show."""
-        measured = replace(rows, groups=None).take(rows.counted)
+        measured = rows.ungrouped().take(rows.counted)
         found = choose_hysteresis(spec.calibrated(measured), rows)
         if not found:
             return found, []
@@ -108,7 +108,7 @@ def coarse_in_words(hysteresis: Hysteresis, rows: Rows) -> list[str]:
     rows : Rows
         The log, with the rows of each run in order of time.
     """
-    log = Coarseness.of(rows.X, rows.run_of_rows)
+    log = Coarseness.of(rows.X, rows.runs)
     hint = "Record rows closer in time, also those without a measured tip."
     if not log.shows_reversals:
         return [
@@ -139,11 +139,9 @@ def choose_hysteresis(spec: Spec, rows: Rows) -> Hysteresis:
     rows : Rows
         The log, with the rows of each run in order of time.
     """
-    groups = np.zeros(len(rows)) if rows.groups is None else rows.groups
+    groups = Groups(rows.groups.motions).in_parts().labels
     positions = spec.positions(rows).numpy().astype(np.float64)
     usable = which_count(positions, rows.counts)
-    if len(np.unique(groups)) == 1:  # a single motion is cut into ten
-        groups = np.arange(len(rows)) * 10 // len(rows)
     if len(np.unique(groups[usable])) < 2:
         return NO_HYSTERESIS
     model = spec.mechanical
@@ -163,7 +161,7 @@ def choose_hysteresis(spec: Spec, rows: Rows) -> Hysteresis:
             positions,
             rows.counts,
             groups,
-            rows.run_of_rows,
+            rows.runs,
             np.zeros(len(rows)) if rows.time is None else rows.time,
         )
     )
@@ -172,7 +170,7 @@ def choose_hysteresis(spec: Spec, rows: Rows) -> Hysteresis:
 def continued(hysteresis: Hysteresis, rows: Rows, past: Past) -> tuple[NDArray, Past]:
     """Return the motion of the actuators (N, n), which go on from the past, and the new past."""
     moved = np.empty_like(rows.X)
-    runs = rows.run_of_rows
+    runs = rows.runs
     times = np.zeros(len(rows)) if rows.time is None else rows.time
     for run in dict.fromkeys(runs.tolist()):
         rows_of_run = np.flatnonzero(runs == run)

@@ -14,8 +14,9 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from sklearn.kernel_ridge import KernelRidge
 from sklearn.metrics.pairwise import euclidean_distances
 
+from hybridkin._core.groups import Groups
 from hybridkin._core.turns import TURNS
-from hybridkin.calibration.measured import distance, evenly_spaced, folds
+from hybridkin.calibration.measured import distance, evenly_spaced
 
 _MOST = 10_000  # rows; the matrices then take 3 GB
 _FOLDS = 5
@@ -33,13 +34,14 @@ _AROUND = ((-1, -1), (-1, 1), (1, -1), (1, 1), *_BESIDE)
 Place = tuple[int, int]
 
 
-def folds_of(X: NDArray, groups: NDArray | None) -> list[tuple[NDArray, NDArray]]:
-    """Return training and held-out rows of 5 folds of groups, or rows; 10 folds for small logs."""
-    return folds(X, groups, _FOLDS if len(X) >= _FEW else _FOLDS_OF_FEW, shuffle=True)
+def folds_of(groups: Groups) -> list[tuple[NDArray, NDArray]]:
+    """Return training and held-out rows of 5 folds of groups; 10 folds for small logs."""
+    most = _FOLDS if len(groups) >= _FEW else _FOLDS_OF_FEW
+    return groups.folds(most, shuffle=True)
 
 
 def tuned_kernel(
-    X: NDArray, error: NDArray, weights: NDArray, groups: NDArray | None
+    X: NDArray, error: NDArray, weights: NDArray, groups: Groups
 ) -> KernelRidge:
     """Return Gaussian kernel ridge with the width and the penalty of least held-out error.
 
@@ -57,13 +59,10 @@ def tuned_kernel(
 
     def held_out(most: int) -> _HeldOut:
         rows = evenly_spaced(len(X), most)
-        of_rows = None
-        if groups is not None:
-            # Without a whole motion the folds would not be those of the log.
-            if len(np.unique(groups[rows])) < len(np.unique(groups)):
-                rows = np.arange(len(X))
-            of_rows = groups[rows]
-        return _HeldOut(X[rows], error[rows], weights[rows], of_rows, spread)
+        # Without a whole motion the folds would not be those of the log.
+        if groups.whole and groups.take(rows).number < groups.number:
+            rows = np.arange(len(X))
+        return _HeldOut(X[rows], error[rows], weights[rows], groups.take(rows), spread)
 
     few = held_out(_FIRST)
     best = min(product(_WIDTHS[::2], _PENALTIES[1::2]), key=few.distance)
@@ -83,13 +82,13 @@ class _HeldOut:
         X: NDArray,
         error: NDArray,
         weights: NDArray,
-        groups: NDArray | None,
+        groups: Groups,
         spread: float,
     ) -> None:
         self._error = error
         self._weights = weights
         self._spread = spread
-        self._splits = folds_of(X, groups)
+        self._splits = folds_of(groups)
         self._root = np.sqrt(weights).reshape(-1, *[1] * (error.ndim - 1))
         with TURNS.filters:
             self._squares = euclidean_distances(X.astype(np.float64), squared=True)

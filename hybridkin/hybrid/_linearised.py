@@ -9,11 +9,12 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from sklearn.utils import gen_batches
 from torch import Tensor
 
 from hybridkin._core.arrays import identity
+from hybridkin._core.groups import Groups
 
 Pair = tuple[float, float]
 _GRID = (inf, 4.0, 0.0, -4.0)  # penalties to start with, in half decades
@@ -130,7 +131,7 @@ class Linearised:
         """Return y - J W phi, shape (N, m)."""
         return self.y - moved_by(self.J, self.phi, readout)
 
-    def left_out(self, penalty: Tensor, members: list[Tensor] | None = None) -> Tensor:
+    def left_out(self, penalty: Tensor, groups: Groups) -> Tensor:
         """Return the residual (N, m) of every row from a fit without that row, or its group.
 
         Exact: (1 - H_SS)^-1 r_S, with H the hat matrix and S the rows of a group. Groups with
@@ -140,16 +141,16 @@ class Linearised:
         ----------
         penalty : Tensor of shape (K,)
             Penalty of every feature.
-        members : list of Tensor, optional
-            Rows of every group, the same at every call. None: single rows.
+        groups : Groups
+            Group of every row, the same at every call.
         """
-        if members is None:
+        if not groups.whole:
             return self._single_rows_left_out(penalty)
         n_weights = len(self.gram) * int(torch.isfinite(penalty).sum())
-        few = n_weights if len(members) > _FOLDS else n_weights // 4
+        few = n_weights if groups.number > _FOLDS else n_weights // 4
         all_rows = None
         left_out = torch.empty_like(self.y)
-        for group, rows in enumerate(members):
+        for group, rows in enumerate(groups.members):
             if self.y[rows].numel() > few:
                 left_out[rows] = self._refitted_without(group, rows, penalty)
             else:
@@ -313,13 +314,6 @@ def solve_kept(right: Tensor, kept: Tensor, L: Tensor) -> Tensor:
 def design(J: Tensor, phi: Tensor) -> Tensor:
     """Return the matrix (..., m, C P) that maps the entries of W to J W phi."""
     return (J[..., None] * phi[..., None, None, :]).flatten(-2)
-
-
-def members_of(groups: ArrayLike) -> list[Tensor]:
-    """Return the rows of every group, from their labels (N,)."""
-    _, of_row = np.unique(np.asarray(groups), return_inverse=True)
-    order = torch.from_numpy(np.argsort(of_row, kind="stable"))
-    return [*order.split(np.bincount(of_row).tolist())]
 
 
 def basis(phi: Tensor, n_linear: int, most: int) -> Tensor:

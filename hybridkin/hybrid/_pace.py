@@ -113,7 +113,7 @@ def pace_range(paces: list[Pace], measured: Rows) -> PaceRange:
     measured : Rows
         The rows.
     """
-    names = measured.run_of_rows if measured.groups is None else measured.groups
+    names = measured.groups_or_runs
     shown = np.stack([pace.shown for pace in paces], axis=1)
     speeds = np.stack([pace.speeds for pace in paces], axis=1)
     fastest = np.where(shown[:, :, None], speeds, 0.0)

@@ -58,10 +58,7 @@ def state_range(states: NDArray, measured: Rows, size: NDArray) -> TrainingRange
     """
     size = np.where(size > 0.0, size, 1.0)
     margin = _MARGIN
-    names = measured.groups
-    if names is None:
-        names = measured.run_of_rows
-    others = ranges_of_others(states, names)
+    others = ranges_of_others(states, measured.groups_or_runs)
     if states.size and others.low.size:
         beyond = (others.beyond(states) / size).max(axis=(1, 2))
         margin = max(margin, np.quantile(beyond, TESTED))

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hybridkin._core.arrays import identity
+from hybridkin._core.groups import Groups
 from hybridkin._core.model import ForwardModel
 from hybridkin.calibration.measured import points
 from hybridkin.hybrid import _linearised
@@ -110,37 +111,30 @@ def fit_readout(
     """
     x = torch.from_numpy(rows.tips.astype(np.float64))
     weight = torch.from_numpy(rows.counts.astype(np.float64))
-    members: list[Tensor] | None = None
-    if alphas is not None and not (left_out or near):
-        members = []
-    elif rows.groups is not None:
-        members = _linearised.members_of(rows.groups)
     with torch.no_grad():
         problem = _Problem(
-            mechanical, features, rows.q, x, weight, coupling == "serial"
+            mechanical, features, rows.q, x, weight, rows.groups, coupling == "serial"
         )
         if alphas is None:
-            fit = _chosen_with_noise(problem, members)
+            fit = _chosen_with_noise(problem)
         else:
             weights = problem.weights_of(start)
             problem_in_noise = problem.in_noise(noise_ratio)
             if near:
-                fit = _chosen(problem_in_noise, members, alphas, weights, rounds=1)
+                fit = _chosen(problem_in_noise, alphas, weights, rounds=1)
             else:
-                fit = _fit_with_penalties(problem_in_noise, members, alphas, weights)
+                fit = _fit_with_penalties(problem_in_noise, alphas, weights, left_out)
     rmse = problem.mean_distance(fit.residual, 2) ** 0.5
     return fit._replace(residual=rows.as_given(fit.residual), rmse=rmse)
 
 
-def _chosen_with_noise(problem: _Problem, members: list[Tensor] | None) -> ReadoutFit:
+def _chosen_with_noise(problem: _Problem) -> ReadoutFit:
     """Return the fit with chosen penalties, in metres or in units of the actuators' noise."""
-    fit = _chosen(problem, members, None, problem.nothing)
+    fit = _chosen(problem, None, problem.nothing)
     noise_ratio = problem.likeliest_ratio(torch.from_numpy(fit.residual))
     if noise_ratio == inf:
         return fit
-    in_noise = _chosen(
-        problem.in_noise(noise_ratio), members, fit.alphas, problem.nothing
-    )
+    in_noise = _chosen(problem.in_noise(noise_ratio), fit.alphas, problem.nothing)
     if problem.mean_distance(in_noise.residual) < problem.mean_distance(fit.residual):
         return in_noise
     return fit
@@ -148,7 +142,6 @@ def _chosen_with_noise(problem: _Problem, members: list[Tensor] | None) -> Reado
 
 def _chosen(
     problem: _Problem,
-    members: list[Tensor] | None,
     alphas: Pair | None,
     weights: Tensor,
     rounds: int = 2,
@@ -157,33 +150,31 @@ def _chosen(
     scores = {}
     for _ in range(rounds):
         # Linearised first about the start, then about the correction found.
-        score = partial(problem.score, problem.linearised(weights), members)
+        score = partial(problem.score, problem.linearised(weights))
         alphas, scores = _linearised.choose(score, alphas)
         weights, _ = problem.minimum(weights, problem.penalty(alphas), _FACTORS)
     assert alphas is not None
-    fit = _fit_with_penalties(problem, members, alphas, weights)._replace(scores=scores)
+    fit = _fit_with_penalties(problem, alphas, weights)._replace(scores=scores)
     without = problem.mean_distance(problem.rest.numpy(force=True), 2)
     if problem.mean_distance(fit.residual, 2) > without:
         # The improvement of the linearised problem is not there in the exact one.
-        nothing = _fit_with_penalties(problem, members, (inf, inf), problem.nothing)
+        nothing = _fit_with_penalties(problem, (inf, inf), problem.nothing)
         return nothing._replace(scores=scores)
     return fit
 
 
 def _fit_with_penalties(
-    problem: _Problem,
-    members: list[Tensor] | None,
-    alphas: Pair,
-    weights: Tensor,
+    problem: _Problem, alphas: Pair, weights: Tensor, held_out: bool = True
 ) -> ReadoutFit:
-    """Return the fit with given penalties, from a start; its residuals hold out `members`."""
+    """Return the fit with given penalties, from a start; its residuals are those of held-out rows.
+
+    Without `held_out` they are NaN.
+    """
     penalty = problem.penalty(alphas)
     weights, gradient = problem.minimum(weights, penalty)
     left_out = problem.x * nan
-    if members != []:
-        left_out = problem.in_metres(
-            problem.linearised(weights).left_out(penalty, members)
-        )
+    if held_out:
+        left_out = problem.left_out(problem.linearised(weights), penalty)
     readout = problem.readout(weights)
     ratio = problem.noise_ratio
     return ReadoutFit(readout, alphas, left_out.numpy(force=True), {}, gradient, ratio)
@@ -199,12 +190,14 @@ class _Problem:
         q: Tensor,
         x: Tensor,
         weight: Tensor,
+        groups: Groups,
         serial: bool,
     ) -> None:
         self.mechanical = mechanical
         self.features = features
         self.q = q
         self.x = x
+        self.groups = groups
         self.root = weight.sqrt()[:, None]
         self.noise_ratio = inf
         self.whitening = None
@@ -294,11 +287,13 @@ class _Problem:
             self._last = readout, linear
         return self._last[1]
 
-    def score(
-        self, linear: Linearised, members: list[Tensor] | None, alphas: Pair
-    ) -> float:
+    def left_out(self, linear: Linearised, penalty: Tensor) -> Tensor:
+        """Return the residuals (N, m) of every row from a fit without its group [m]."""
+        return self.in_metres(linear.left_out(penalty, self.groups))
+
+    def score(self, linear: Linearised, alphas: Pair) -> float:
         """Return the mean squared held-out distance [m^2]."""
-        left = linear.left_out(self.penalty(alphas), members)
+        left = linear.left_out(self.penalty(alphas), self.groups)
         return float(left.square().sum() / self.root.square().sum())
 
     def minimum(

@@ -7,13 +7,14 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 from typing_extensions import Self
 
 from hybridkin._core.digests import row_digests
 from hybridkin._core.directions import Directions, moved_directions
 from hybridkin._core.distinct import at_place, distinct_rows
+from hybridkin._core.groups import Groups
 from hybridkin.hysteresis.value import Hysteresis
 
 
@@ -23,16 +24,48 @@ class Rows:
 
     X: NDArray  # (N, n) actuator vectors, float64 or float32
     y: NDArray  # (N, m) or (N,) tips [m]
-    weights: NDArray | None = None  # (N,), number of times each row counts
-    groups: NDArray | None = None  # (N,), motion of every row; held out together
-    # (N,), which rows follow each other in time without a break; None: those of a group
-    runs: NDArray | None = None
+    counts: NDArray  # (N,), number of times each row counts
+    groups: Groups  # motion of every row; held out together
+    runs: NDArray  # (N,), which rows follow each other in time without a break
+    place: NDArray  # (M,), the row here of each of the M given rows; -1: none
+    # Shaped like y: measured minus mechanical model [m], in a fit; y without such a model
+    residual: NDArray
     time: NDArray | None = None  # (N,) [s]
-    # (M,), the row here of each of the M given rows; -1: none
-    place: NDArray | None = None
-    # Shaped like y: measured minus mechanical model [m], in a fit
-    residual: NDArray | None = None
     commanded: Directions | None = None  # of the commands, with hysteresis before X
+
+    @classmethod
+    def of(
+        cls,
+        X: NDArray,
+        y: NDArray,
+        weights: ArrayLike | None = None,
+        groups: ArrayLike | Groups | None = None,
+        runs: NDArray | None = None,
+        time: NDArray | None = None,
+    ) -> Self:
+        """Return rows as they were measured.
+
+        Parameters
+        ----------
+        X, y : ndarray of shape (N, n), and of shape (N, m) or (N,)
+            Actuator vectors and tips [m].
+        weights : ndarray of shape (N,), optional
+            Number of times each row counts. Default: ones.
+        groups : Groups or array-like of shape (N,), optional
+            Motion of every row. Default: every row is a group.
+        runs : ndarray of shape (N,), optional
+            Run of every row. Default: the groups, or one run without groups.
+        time : ndarray of shape (N,), optional
+            Times [s].
+        """
+        n_rows = len(X)
+        if weights is None:
+            weights = np.ones(n_rows)
+        motions = Groups.of(groups, n_rows)
+        if runs is None:
+            runs = motions.motions
+        counts = np.asarray(weights)
+        return cls(X, y, counts, motions, runs, np.arange(n_rows), y, time)
 
     def __len__(self) -> int:
         return len(self.X)
@@ -48,16 +81,14 @@ class Rows:
         return self.y.reshape(len(self.y), -1)
 
     @property
-    def counts(self) -> NDArray:
-        """Number of times each row counts, (N,)."""
-        return np.ones(len(self.X)) if self.weights is None else self.weights
+    def groups_or_runs(self) -> NDArray:
+        """The group of every row (N,); without groups its run."""
+        return self.groups.labels if self.groups.whole else self.runs
 
     @property
-    def run_of_rows(self) -> NDArray:
-        """The run of every row, (N,)."""
-        if self.runs is not None:
-            return self.runs
-        return np.zeros(len(self)) if self.groups is None else self.groups
+    def count_once(self) -> bool:
+        """Whether every row counts once."""
+        return bool((self.counts == 1.0).all())
 
     @cached_property
     def directions(self) -> Directions:
@@ -70,16 +101,17 @@ class Rows:
 
     def take(self, rows: NDArray) -> Self:
         """Return some of the rows."""
+        X = self.X[rows]
         return replace(
             self,
-            X=self.X[rows],
+            X=X,
             y=self.y[rows],
-            weights=_some(self.weights, rows),
-            groups=_some(self.groups, rows),
-            runs=_some(self.runs, rows),
-            time=_some(self.time, rows),
-            place=None,
-            residual=_some(self.residual, rows),
+            counts=self.counts[rows],
+            groups=self.groups.take(rows),
+            runs=self.runs[rows],
+            time=None if self.time is None else self.time[rows],
+            place=np.arange(len(X)),
+            residual=self.residual[rows],
         )
 
     @property
@@ -89,18 +121,22 @@ class Rows:
 
     def counting(self, rows: NDArray) -> Self:
         """Return the log in which only some rows count; a single group is divided into rows."""
-        weights = np.zeros(len(self))
-        weights[rows] = self.counts[rows]
-        groups = self.groups
-        if groups is not None and len(np.unique(groups[rows])) == 1:
-            groups = None  # of a single motion, rows are held out
-        return replace(self, weights=weights, groups=groups, runs=self.run_of_rows)
+        counts = np.zeros(len(self))
+        counts[rows] = self.counts[rows]
+        counting = replace(self, counts=counts)
+        if self.groups.take(rows).several:
+            return counting
+        return counting.ungrouped()
+
+    def ungrouped(self) -> Self:
+        """Return the rows without groups."""
+        return replace(self, groups=Groups.rows(len(self)))
 
     def marker(self, k: int) -> Self:
         """Return the rows in which marker k was measured, with only its positions as tips."""
         columns = slice(3 * k, 3 * k + 3)
         tips = self.tips[:, columns]
-        residual = None if self.residual is None else self.residual[:, columns]
+        residual = self.residual[:, columns]
         measured = np.flatnonzero(~np.isnan(tips[:, 0]))
         if not len(measured):
             raise rare_marker(k)
@@ -108,29 +144,29 @@ class Rows:
 
     def distinct(self) -> Self:
         """Return the different rows with the number of times each counts, without an order."""
-        return replace(self, runs=None, time=None)._merged(self.y)
+        return self._merged(self.y)
 
     def in_runs(self) -> Self:
         """Return the rows in order of time, without those that repeat the row before.
 
         What the actuators do does not change: rows at other times, and of other runs, stay apart.
         """
-        columns = [self.y, _numbered(self.run_of_rows)]
+        columns = [self.y, _numbered(self.runs)]
         if self.time is not None:
             columns.append(self.time)
         return self._merged(np.column_stack(columns), follow=True)
 
     def effective(self, hysteresis: Hysteresis) -> Self:
         """Return the rows with what the actuators do in place of the commands."""
-        moved = hysteresis.apply_by_group(self.X, self.run_of_rows, self.time)
-        return replace(self, X=moved, runs=None, time=None)
+        moved = hysteresis.apply_by_group(self.X, self.runs, self.time)
+        return replace(self, X=moved)
 
     def _merged(self, columns: NDArray, follow: bool = False) -> Self:
         """Return the rows without those that equal another one, or `follow` it, in all columns."""
         first, counts, place = distinct_rows(
-            self.X, columns, self.weights, self.groups, follow
+            self.X, columns, self.counts, self.groups.apart, follow
         )
-        return replace(self.take(first), weights=counts, place=place)
+        return replace(self.take(first), counts=counts, place=place)
 
     def thinned(self, most: int) -> Self:
         """Return every k-th row, about `most` rows."""
@@ -139,22 +175,19 @@ class Rows:
     def repeated(self) -> Self:
         """Return every row as often as it counts, or these rows if they count in fractions."""
         times = self.counts.astype(int)
-        if self.weights is None or (times != self.weights).any():
+        if self.count_once or (times != self.counts).any():
             return self
-        return replace(self.take(np.repeat(np.arange(len(self)), times)), weights=None)
+        every = self.take(np.repeat(np.arange(len(self)), times))
+        return replace(every, counts=np.ones(len(every)))
 
     def as_given(self, values: NDArray) -> NDArray:
         """Return values (N, ...) of these rows for the given rows (M, ...); NaN for weight 0."""
-        return values if self.place is None else at_place(values, self.place)
+        return at_place(values, self.place)
 
 
 def _numbered(names: NDArray) -> NDArray:
     """Return names (N,) as numbers."""
     return np.unique(names, return_inverse=True)[1]
-
-
-def _some(values: NDArray | None, rows: NDArray) -> NDArray | None:
-    return None if values is None else values[rows]
 
 
 def rare_marker(k: int) -> ValueError:

@@ -173,7 +173,7 @@ def _side_by_side(
     models: Mapping[str, ErrorModel], rows: Rows, spec: Spec
 ) -> FittedError:
     """Return the fits of all candidates, with penalties chosen on folds of the rows."""
-    by_fold = _by_fold(rows, fold_of_rows(folds_of(rows.X, rows.groups)))
+    by_fold = _by_fold(rows, fold_of_rows(folds_of(rows.groups)))
     fits = {}
     near = {}
     for name, model in models.items():
@@ -218,7 +218,7 @@ class Settled(NamedTuple):
     def part(self, train: NDArray) -> tuple[Spec, Rows]:
         """Return the specification calibrated on training rows, and these rows."""
         # A single held-out motion has similar ones in training; folds are a harder test.
-        rows = replace(self.rows, groups=None).take(train).distinct()
+        rows = self.rows.ungrouped().take(train).distinct()
         return self.spec.recalibrated(rows), rows
 
     def held_out(self, train: NDArray, test: NDArray) -> Predictions:
@@ -243,7 +243,7 @@ class Settled(NamedTuple):
 
     def table(self, outer: Outer) -> CrossFit:
         """Return the held-out predictions of folds of groups or rows, with those of `outer`."""
-        splits = folds_of(self.rows.X, self.rows.groups)
+        splits = folds_of(self.rows.groups)
         held_out = starmap(self.held_out, splits)
         return CrossFit.of([*self.models], self.rows, splits, held_out, outer)
 
@@ -328,14 +328,13 @@ def _structure_of(model: ForwardModel | None, rows: Rows) -> StructureFit | None
 
 def _by_fold(rows: Rows, fold: NDArray) -> Rows:
     """Return rows whose groups, if there are any, are folds (N,): fewer take less time."""
-    return rows if rows.groups is None else replace(rows, groups=fold)
+    return replace(rows, groups=rows.groups.named(fold))
 
 
 def _is_small(rows: Rows) -> bool:
     """Return whether penalties chosen on all rows suit held-out ones, and folds can be refitted."""
-    if rows.groups is None:
-        return 2 < len(rows) < _FEW_ROWS
-    return 2 < len(np.unique(rows.groups)) < _FEW_MOTIONS
+    few = _FEW_MOTIONS if rows.groups.whole else _FEW_ROWS
+    return 2 < rows.groups.number < few
 
 
 def blend_of(models: Iterable[ErrorModel], weights: NDArray) -> ErrorModel:

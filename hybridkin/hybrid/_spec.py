@@ -16,9 +16,15 @@ from torch import Tensor
 from typing_extensions import Self
 
 from hybridkin._core.arrays import countable
+from hybridkin._core.groups import Groups
 from hybridkin._core.model import ForwardModel
 from hybridkin.calibration.calibrate import CalibrationResult, fit_geometry, refitted
-from hybridkin.calibration.choice import GeometryChoice, Starts, choose_geometry
+from hybridkin.calibration.choice import (
+    NOT_CHOSEN,
+    GeometryChoice,
+    Starts,
+    choose_geometry,
+)
 from hybridkin.chains.chain import Chain
 from hybridkin.chains.structural import StructuralChain
 from hybridkin.hybrid._drift import too_far
@@ -187,7 +193,7 @@ class Spec:
     hysteresis: HysteresisChoice = NO_CHOICE
     coverage: float | None = None
     starts: Starts = ()  # of the choice of what to calibrate
-    geometry: GeometryChoice | None = None  # how `calibrate` was chosen
+    geometry: GeometryChoice = NOT_CHOSEN  # how `calibrate` was chosen
     # Of the calibrated model, before its residual is learned.
     refinement: Refinement = UNREFINED
     calibration: CalibrationResult | None = None  # how `mechanical` was calibrated
@@ -204,7 +210,7 @@ class Spec:
         ----------
         settled : ErrorModel
             The error model with its choices for the whole log.
-        starts : tuple of Start or None
+        starts : tuple of Start
             Where the choice of what to calibrate starts.
         """
         error_model = self.error_model.starting_at(settled).without_errors()
@@ -216,7 +222,7 @@ class Spec:
         For a list and an error model that chooses, a plain chain is compared with elastic tendons.
         """
         geometry = self.geometry
-        if geometry is None:
+        if not geometry:
             automatic = self.calibrate == "auto"
             if not self.calibrate or not (automatic or self.error_model.chooses):
                 return self
@@ -225,7 +231,7 @@ class Spec:
                 rows.q,
                 self.positions(rows),
                 groups=rows.groups,
-                weights=rows.weights,
+                weights=rows.counts,
                 outside=self.error_model.learns,
                 parameters=None if automatic else self.calibrate,
                 starts=self.starts,
@@ -244,21 +250,23 @@ class Spec:
     def calibrated(self, rows: Rows) -> Spec:
         """Return the specification with the model calibrated; its `cv_rmse` holds out groups."""
         spec = self
-        if spec.geometry is None:
+        if not spec.geometry:
             spec = self.with_geometry_chosen(rows)
         if not spec.calibrate:
             return spec
-        if spec.geometry is not None and not spec.error_model.tells_errors:
+        if spec.geometry and not spec.error_model.tells_errors:
             return replace(spec.recalibrated(rows), calibrate=())
+        groups = rows.groups
+        if spec.error_model.chooses:  # it computes errors of held-out rows itself
+            groups = Groups.rows(len(rows))
         result = fit_geometry(
             cast(Chain, spec.mechanical),
             rows.q,
             spec.positions(rows),
             spec.calibrate,
-            # A comparison of models computes errors of held-out rows itself.
-            groups=None if spec.error_model.chooses else rows.groups,
-            sample_weight=rows.weights,
-            start=None if spec.geometry is None else spec.geometry.start,
+            groups=groups,
+            sample_weight=rows.counts,
+            start=spec.geometry.start,
         )
         return replace(
             spec,
@@ -271,9 +279,9 @@ class Spec:
     def recalibrated(self, rows: Rows) -> Spec:
         """Return the specification calibrated to other rows, without errors of held-out rows."""
         spec = self
-        if self.geometry is not None and self.geometry.start is not None:
+        start = self.geometry.start
+        if start.n_free:
             counts = torch.from_numpy(rows.counts)
-            start = self.geometry.start
             chain = refitted(start, rows.q, self.positions(rows), counts)
             spec = replace(spec, mechanical=chain)
         return spec.refined(rows)

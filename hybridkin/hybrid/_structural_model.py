@@ -10,7 +10,7 @@ import torch
 
 from hybridkin._core.model import ForwardModel
 from hybridkin.calibration.choice import GeometryChoice
-from hybridkin.calibration.measured import distance, folds
+from hybridkin.calibration.measured import distance
 from hybridkin.hybrid._error_models import named
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._spec import (
@@ -76,12 +76,9 @@ def best_refinement(spec: Spec, geometry: GeometryChoice, rows: Rows) -> Refinem
             candidates.append(RefinedGeometry(usual, Structure(usual.name)))
     candidates.append(RefinedGeometry(geometry, UNREFINED))
     rows = rows.thinned(_MOST)
-    groups = rows.groups
-    if groups is not None and len(np.unique(groups)) < 2:
-        groups = None
     totals = np.zeros(len(candidates))
-    for train, test in folds(rows.X, groups, _FOLDS, shuffle=True):
-        part = replace(rows.take(train), groups=None)
+    for train, test in rows.groups.divided().folds(_FOLDS, shuffle=True):
+        part = rows.take(train).ungrouped()
         held_out = rows.take(test)
         for k, candidate in enumerate(candidates):
             of_candidate = replace(

@@ -7,18 +7,17 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from hybridkin._core.arrays import identity
 from hybridkin._core.blocks import in_blocks
+from hybridkin._core.groups import Groups
 from hybridkin._core.model import ForwardModel
 from hybridkin._core.rotations import cross_matrix, rotation
 from hybridkin.calibration.measured import points
 from hybridkin.calibration.natural_scales import STRUCTURE
 from hybridkin.chains.structural import Loads, StructuralChain, Weights, change_of
 from hybridkin.hybrid._drift import too_far
-from hybridkin.hybrid._linearised import members_of
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid.structure_fit import StructureFit
 
@@ -360,17 +359,17 @@ def _left_out(
     theta: Tensor,
     covariance: Tensor,
     system: Tensor,
-    groups: NDArray | None,
+    groups: Groups,
 ) -> Tensor:
     """Return the residuals (N, m) of every row from a linearised fit without it, or its group."""
-    if groups is None:
+    if not groups.whole:
         leverage = A @ covariance @ A.mT
         unexplained = identity(leverage.shape[1], leverage) - leverage
         return torch.linalg.solve(unexplained, rest)
     targets = rest + A @ theta
     moment = A.flatten(0, 1).mT @ targets.flatten()
     left = torch.empty_like(rest)
-    for members in members_of(groups):
+    for members in groups.members:
         own = A[members].flatten(0, 1)
         without = torch.linalg.cholesky(system - own.mT @ own)
         right = moment - own.mT @ targets[members].flatten()

@@ -9,8 +9,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from hybridkin._core.groups import Groups
 from hybridkin._core.turns import TURNS
-from hybridkin.calibration.measured import folds, points
+from hybridkin.calibration.measured import points
 from hybridkin.hybrid._error_models import HiddenLayer, RegressorModel
 from hybridkin.hybrid._fit import FittedHybrid, fit_hybrid
 from hybridkin.hybrid._module import Hybrid
@@ -53,7 +54,7 @@ def worse_than_mechanical(fitted: FittedHybrid, rows: Rows) -> list[str]:
         after = max(after, _tip(fitted.error.noise, rows) ** 2)
         where = "on held-out rows"
     elif after <= before + chance and _can_hold_out(rows):
-        train, test = folds(rows.X, rows.groups)[0]
+        train, test = rows.groups.folds()[0]
         settled = replace(spec, error_model=fitted.error.settled).without_errors()
         with TURNS.filters, warnings.catch_warnings():  # the full fit has given them
             warnings.simplefilter("ignore")
@@ -77,7 +78,7 @@ def _can_hold_out(rows: Rows) -> bool:
     """Return whether a fifth of the rows, or of their groups, can be held out."""
     if np.isnan(rows.tips).any():
         return False
-    return rows.groups is None or len(np.unique(rows.groups)) > 1
+    return rows.groups.several
 
 
 def _squares(spec: Spec, module: Hybrid, rows: Rows) -> tuple[NDArray, NDArray]:
@@ -96,11 +97,10 @@ def _parts(residual: NDArray, counts: NDArray) -> NDArray:
     return (np.nan_to_num(squares) * weights / weights.sum(0)).mean(1)
 
 
-def _standard_error(parts: NDArray, groups: NDArray | None) -> float:
+def _standard_error(parts: NDArray, groups: Groups) -> float:
     """Return the standard error of a sum over independent groups; over rows if it is one group."""
-    if groups is not None and len(np.unique(groups)) > 1:
-        _, place = np.unique(groups, return_inverse=True)
-        parts = np.bincount(place, parts)
+    _, place = np.unique(groups.divided().labels, return_inverse=True)
+    parts = np.bincount(place, parts)
     return float(len(parts) ** 0.5 * parts.std(ddof=1))
 
 

@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike, NDArray
 from hybridkin._core.arrays import one_of, whole
 from hybridkin._core.turns import one_thread
 from hybridkin.calibration.choice import Starts
-from hybridkin.calibration.measured import folds as folds_of_rows
 from hybridkin.datasets.logs import Log
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._spec import ErrorModel, Spec
@@ -154,7 +153,7 @@ class _WeightedLog(NamedTuple):
     def measured(self) -> Rows:
         """The rows that count."""
         log = self.log.rows(self.counted)
-        return Rows(log.q, log.x, self.weights[self.counted], log.groups)
+        return Rows.of(log.q, log.x, self.weights[self.counted], log.groups)
 
     def prepared(self, model: HybridForwardModel) -> tuple[Spec, Rows]:
         """Return the checked settings of a model and the rows that it needs.
@@ -178,7 +177,7 @@ def _splits(folds: int | Sequence[Split], measured: Rows) -> list[Split]:
     """Return training and test rows of each fold; raise if a row is not tested once."""
     if isinstance(folds, int):
         most = whole(folds, "folds", 2, 1000)
-        return folds_of_rows(measured.X, measured.groups, most)
+        return measured.groups.folds(most)
     splits = [(np.asarray(train), np.asarray(test)) for train, test in folds]
     tested = np.sort(np.concatenate([test for _, test in splits]))
     if not np.array_equal(tested, np.arange(len(measured))):

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 from typing_extensions import Self
 
+from hybridkin._core.groups import Groups
 from hybridkin._core.simplest import simplest_within
-from hybridkin.calibration.choice import Errors, GeometryChoice
+from hybridkin.calibration.choice import NOT_CHOSEN, Errors, GeometryChoice
 from hybridkin.calibration.measured import distance, distances
 from hybridkin.hybrid._guards import GroupDistance
 from hybridkin.hybrid._radius import Radius, covering_distance
@@ -41,22 +42,22 @@ class FoldChoice(NamedTuple):
 
     Attributes
     ----------
-    geometry : GeometryChoice or None
-        The parameters to calibrate; None: not chosen.
+    geometry : GeometryChoice
+        The parameters to calibrate; falsy if they were not chosen.
     hysteresis : Hysteresis
         The hysteresis; empty without one.
     error_model : object
         The fitted error model, as `HybridForwardModel.error_model_`.
     """
 
-    geometry: GeometryChoice | None = None
+    geometry: GeometryChoice = NOT_CHOSEN
     hysteresis: Hysteresis = NO_HYSTERESIS
     error_model: object = None
 
     @property
     def parameters(self) -> str:
         """Name of the chosen parameters to calibrate; empty if there was no choice."""
-        if self.geometry is None or len(self.geometry.errors) < 2:
+        if len(self.geometry.errors) < 2:
             return ""
         return self.geometry.name
 
@@ -113,7 +114,7 @@ class CrossFit:
         Measured tips [m], NaN for missing markers.
     counts : ndarray of shape (N,)
         Number of times each row counts [1].
-    groups : ndarray of shape (N,) or None
+    groups : Groups
         Motion of every row.
     fold : ndarray of shape (N,)
         Fold in which a row was held out.
@@ -133,7 +134,7 @@ class CrossFit:
     q: NDArray
     y: NDArray
     counts: NDArray
-    groups: NDArray | None
+    groups: Groups
     fold: NDArray
     outer: Outer
     choices: tuple[FoldChoice, ...] = ()
@@ -211,7 +212,7 @@ class CrossFit:
     def distances_from_others(self) -> NDArray:
         """Distances (N,) of commands from those of the other folds; an actuator spans 2."""
         q = torch.from_numpy(self.q.astype(np.float64))
-        groups = self._groups
+        groups = self.groups.labels
         far = np.empty(len(q))
         for fold in np.unique(self.fold):
             test = self.fold == fold
@@ -219,18 +220,11 @@ class CrossFit:
         return far
 
     @property
-    def _groups(self) -> NDArray:
-        """Motion of every row (N,); without groups, the row."""
-        if self.groups is None:
-            return np.arange(len(self.y))
-        return self.groups
-
-    @property
     def errors(self) -> dict[str, HeldOutError]:
         """Mean errors on held-out rows by candidate [m]."""
         errors = {}
         for name, far in zip(self.names, self.distances, strict=True):
-            errors[name] = HeldOutError.of(far, self._groups, self.counts)
+            errors[name] = HeldOutError.of(far, self.groups.labels, self.counts)
         return errors
 
     @cached_property
@@ -280,7 +274,7 @@ class CrossFit:
         standard error, or twice that over structural errors, the first candidate is chosen.
         """
         of_held_out = self._distances_of_all[:, : len(self.y)]
-        labels = self.fold if self.groups is None else self.groups
+        labels = self.groups.labels if self.groups.whole else self.fold
         means = _means_by(labels, of_held_out, self.counts)
         gains = means[0] - means[-1]
         standard_error = gains.std(ddof=1) / np.sqrt(len(gains))
@@ -312,7 +306,7 @@ class CrossFit:
     @property
     def groups_inside(self) -> NDArray:
         """Motions (K,) of the rows in the domain of the chosen model; without groups these rows."""
-        return self._groups[self.chosen.inside]
+        return self.groups.labels[self.chosen.inside]
 
     def radius(self, coverage: float) -> Radius:
         """Return the radius about tips of the chosen model that covers a share of held-out tips.
@@ -337,7 +331,7 @@ class CrossFit:
         radius = covering_distance(errors[inside], group, self.counts[inside], coverage)
         return Radius(radius, coverage, len(self.y))
 
-    def results(self, geometry: GeometryChoice | None = None) -> CvResults:
+    def results(self, geometry: GeometryChoice = NOT_CHOSEN) -> CvResults:
         """Return the errors of all candidates and their blend, see `cv_results_`."""
         n = len(self.y)
         all_distances = self._distances_of_all
@@ -349,11 +343,8 @@ class CrossFit:
         chosen = "blend"
         if self.weights.max() == 1.0:
             chosen = self.names[int(self.weights.argmax())]
-        parameters = "nothing"
-        tried = {}
-        if geometry is not None:
-            parameters = geometry.name
-            tried = geometry.errors
+        parameters = geometry.name or "nothing"
+        tried = geometry.errors
         if not tried:
             errors = Errors(float(held_out_means[0]), float(outer_means[0]))
             tried = {parameters: errors}

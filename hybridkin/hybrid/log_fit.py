@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 from typing_extensions import Self
 
+from hybridkin._core.groups import Groups
 from hybridkin.calibration.calibrate import CalibrationResult
-from hybridkin.calibration.choice import GeometryChoice, Starts
-from hybridkin.calibration.measured import folds
+from hybridkin.calibration.choice import NOT_CHOSEN, GeometryChoice, Starts
 from hybridkin.hybrid._drift import Drift, too_far
 from hybridkin.hybrid._fit import few_rows, fit_hybrid, fit_messages
 from hybridkin.hybrid._module import Hybrid
@@ -68,7 +68,7 @@ class HybridFit:
         The drift before any measurement.
     calibration, hysteresis, radius
         The attributes of the model.
-    geometry : GeometryChoice or None
+    geometry : GeometryChoice
         How the parameters to calibrate were chosen.
     messages : tuple of str
         Warnings, which were not issued.
@@ -82,7 +82,7 @@ class HybridFit:
     training_range: TrainingRange
     no_drift: Drift
     calibration: CalibrationResult | None = None
-    geometry: GeometryChoice | None = None
+    geometry: GeometryChoice = NOT_CHOSEN
     hysteresis: Hysteresis = NO_HYSTERESIS
     state_range: TrainingRange | None = None
     pace: PaceRange | None = None
@@ -137,8 +137,6 @@ class FitOnce:
     @property
     def starts(self) -> Starts:
         """Where the choice of what to calibrate starts in parts of the log."""
-        if self.spec.geometry is None:
-            return ()
         return self.spec.geometry.starts
 
     def effective(self, log: Rows) -> Tensor:
@@ -160,7 +158,6 @@ class FitOnce:
         if not self.fitted.error.candidates:
             return None
         outer = self._outer_of_rows
-        assert self.rows.place is not None
         place = self.rows.place[self.log.counted]
         _, first = np.unique(place, return_index=True)
         return outer._replace(rows=first[outer.rows])
@@ -314,7 +311,7 @@ def _table_anew(spec: Spec, fit: FitOnce) -> CrossFit:
         spec = spec.starting_at(fit.fitted.error.settled, fit.starts)
     anew = Anew(spec.without_errors(), log)
     measured = log.take(log.counted)
-    splits = folds(measured.X, measured.groups)
+    splits = measured.groups.folds()
     held_out = starmap(anew.held_out, splits)
     return CrossFit.of(fit.names, measured, splits, held_out, fit.outer())
 
@@ -322,7 +319,7 @@ def _table_anew(spec: Spec, fit: FitOnce) -> CrossFit:
 def _states(hysteresis: Hysteresis, log: Rows) -> NDArray:
     """Return the inner states (K, R, n) of hysteresis after the rows that count."""
     states = [np.empty((len(log.counted), 0, log.X.shape[1]))]
-    for state in hysteresis.each_inner_state(log.X, log.run_of_rows, log.time):
+    for state in hysteresis.each_inner_state(log.X, log.runs, log.time):
         states.append(state[log.counted, None])
     return np.concatenate(states, axis=1)
 
@@ -333,14 +330,15 @@ def _pace(hysteresis: Hysteresis, log: Rows, measured: Rows) -> PaceRange | None
         return None
     paces = []
     times = hysteresis.time_constants
-    for pace in each_pace(log.X, log.run_of_rows, log.time, times):
+    for pace in each_pace(log.X, log.runs, log.time, times):
         paces.append(Pace(pace.speeds[log.counted], pace.shown[log.counted]))
     return pace_range(paces, measured)
 
 
 def _by_motion(log: Rows, rows: Rows, hysteresis: Hysteresis) -> Rows:
     """Return the rows of a fit with the groups to hold out: those of the log, else its runs."""
-    if log.groups is not None or log.runs is None:
+    runs = Groups(log.runs)
+    if log.groups.whole or not runs.several:
         return rows
-    by_run = replace(log, groups=log.runs)
+    by_run = replace(log, groups=runs)
     return by_run.effective(hysteresis).distinct()

@@ -60,7 +60,7 @@ class ModelDescription:
         """Format of the logs of the robot; plain names in SI units if nobody described it."""
         if self.robot.log is not None:
             return self.robot.log
-        return LogFormat(self.names, ("x", "y", "z"), self.unit)
+        return LogFormat(self.names, ("x", "y", "z"), q_unit=self.unit)
 
     @property
     def limits(self) -> Limits:

@@ -8,9 +8,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridkin._core.groups import Groups
 from hybridkin._core.model import ForwardModel
 from hybridkin._core.runs import RunOrder
-from hybridkin.calibration.measured import folds
 from hybridkin.hysteresis.reversals import behind, reversals
 
 _MOST_COUNTED = 10_000  # rows whose errors are computed
@@ -66,7 +66,7 @@ class HysteresisLog:
     @cached_property
     def folds(self) -> list[tuple[NDArray, NDArray]]:
         """Training and held-out rows, as places in `rows`."""
-        return folds(self.rows, self.groups[self.rows])
+        return Groups(self.groups[self.rows]).folds()
 
     @cached_property
     def order(self) -> RunOrder:

@@ -49,16 +49,11 @@ def gather(stats, elm, X, y, sample_weight, block_size):
         block = z[:-1]
         elm.write_features(q, block[:, :n_features])
         block[:, n_features:] = copied(y[rows], device)
-        if sample_weight is None:
-            n_block = float(len(block))
-            mean_block = block.mean(0)
-            block -= mean_block
-        else:
-            w = copied(sample_weight[rows], device)
-            n_block = w.sum().item()
-            mean_block = w @ block / n_block
-            block -= mean_block
-            block *= w.sqrt()[:, None]
+        w = copied(sample_weight[rows], device)
+        n_block = w.sum().item()
+        mean_block = w @ block / n_block
+        block -= mean_block
+        block *= w.sqrt()[:, None]
         step = mean_block - mean
         torch.mul(step, (n / (n + n_block) * n_block) ** 0.5, out=z[-1])
         n += n_block

@@ -352,8 +352,8 @@ class ELMRegressor(FittedNetwork):
 
     def _learn(self, X, y, sample_weight, first, decay=1.0):
         X, y, sample_weight = check_rows(self, X, y, sample_weight, reset=first)
-        if sample_weight is not None:
-            counted = sample_weight > 0
+        counted = sample_weight > 0.0
+        if not counted.all():
             X = X[counted]
             y = y[counted]
             sample_weight = sample_weight[counted]

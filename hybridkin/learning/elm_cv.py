@@ -17,8 +17,9 @@ from sklearn.utils import check_random_state, gen_batches
 from sklearn.utils._param_validation import Interval, StrOptions
 from sklearn.utils.validation import check_is_fitted
 
-from hybridkin._core.arrays import LARGEST, labels
+from hybridkin._core.arrays import LARGEST
 from hybridkin._core.distinct import at_place, distinct_rows
+from hybridkin._core.groups import Groups
 from hybridkin._core.stored import plain
 from hybridkin._core.turns import TURNS
 from hybridkin.learning._left_out import LeftOut, left_out
@@ -186,23 +187,21 @@ class ELMRegressorCV(FittedNetwork):
             The fitted estimator.
         """
         X, y, sample_weight = check_rows(self, X, y, sample_weight)
-        if groups is not None:
-            groups = labels(groups, len(X))
+        motions = Groups.of(groups, len(X))
+        apart = motions.apart
         # Listed splits are used as given, even if equal rows fall into different splits.
-        apart = groups
         if _is_listed(self.cv):
-            apart = np.arange(len(X))
+            apart = np.arange(len(X))[:, None]
         first, sample_weight, place = distinct_rows(X, y, sample_weight, apart)
         X = X[first]
         y = y[first]
-        if groups is not None:
-            groups = groups[first]
+        motions = motions.take(first)
         if len(y) < 2:
             raise ValueError(
                 f"`X` must have at least 2 different rows of positive weight, so that one can be "
                 f"held out, got n_samples={len(y)}; use ELMRegressor, which holds out no rows."
             )
-        splits = _splits(self.cv, groups, len(X), place)
+        splits = _splits(self.cv, motions, place)
         targets = y.reshape(len(y), -1)
         search = _Search(X, targets, sample_weight, splits, self.alphas)
         self._try_sizes_and_scales(search)
@@ -278,21 +277,18 @@ class _Search:
     ----------
     X, targets : ndarray of shape (n, d) and (n, m)
         The rows.
-    sample_weight : ndarray of shape (n,) or None
+    weights : ndarray of shape (n,)
         Their weights.
-    splits : list or None
-        Which rows are held out together, see `LeftOut.together`. None: each alone.
+    splits : list
+        Which rows are held out together, see `LeftOut.together`. Empty: each alone.
     alphas : "auto" or array-like
         Penalties.
     """
 
-    def __init__(self, X, targets, sample_weight, splits, alphas):
+    def __init__(self, X, targets, weights, splits, alphas):
         self.X = X
         self.targets = targets
-        self.sample_weight = sample_weight
-        self.weights = sample_weight
-        if sample_weight is None:
-            self.weights = np.ones(len(X))
+        self.weights = weights
         self.splits = splits
         self.alphas = alphas
         low = X.min(axis=0)
@@ -306,7 +302,7 @@ class _Search:
 
         Random weights would else give the network an arbitrary slope along these inputs.
         """
-        center, scale = scaling(self.X, self.sample_weight, input_scaling)
+        center, scale = scaling(self.X, self.weights, input_scaling)
         scale[self.still] = _NEVER
         return np.array([center - scale, center + scale])
 
@@ -319,13 +315,11 @@ class _Search:
     def add(self, params, relevance):
         """Try a hidden layer with all penalties."""
         candidate = ELMRegressor(**params)
-        elm = draw_layer(candidate, self.X, self.sample_weight)
+        elm = draw_layer(candidate, self.X, self.weights)
         elm = elm.to(device_named(candidate.device))
-        rows = self.X, self.targets, self.sample_weight
+        rows = self.X, self.targets, self.weights
         stats = gather(None, elm, *rows, candidate.block_size)
-        held_out = left_out(
-            elm, stats, self.X, self.targets, self.weights, candidate.fit_intercept
-        )
+        held_out = left_out(elm, stats, *rows, candidate.fit_intercept)
         if isinstance(self.alphas, str):
             alphas = _AUTO_ALPHAS * (held_out.eigenvalues[-1] or 1.0)
         else:
@@ -343,9 +337,9 @@ class _Search:
 
     def _errors(self, held_out, alphas):
         """Yield held-out rows and their errors (n_alphas, n_rows, n_outputs)."""
-        if self.splits is None:
-            return held_out.alone(alphas)
-        return held_out.together(self.splits, alphas)
+        if self.splits:
+            return held_out.together(self.splits, alphas)
+        return held_out.alone(alphas)
 
     def held_out_errors(self, candidate):
         """Return target minus prediction of every row, held out; a mean over splits, or NaN."""
@@ -402,7 +396,7 @@ def _relevance(best, search):
     The derivative refers to inputs in their initial scaling.
     """
     model = ELMRegressor(**best.params)
-    model.fit(search.X, search.targets, search.sample_weight)
+    model.fit(search.X, search.targets, search.weights)
     center = model.module_.input_center.numpy(force=True)
     scale = model.module_.input_scale.numpy(force=True) * best.relevance
     total = 0.0
@@ -426,17 +420,19 @@ def _is_listed(cv):
     return isinstance(cv, (Iterable, PredefinedSplit))
 
 
-def _splits(cv, groups, n_rows, place):
-    """Return (rows out, rows asked) of every split of the different rows.
+def _splits(cv, motions, place):
+    """Return (rows out, rows asked) of every split of the different rows; none: each row alone.
 
     Splits listed by the user refer to all rows; `place` maps them to the different rows. An
     integer or a splitter gets only the different rows.
     """
-    if groups is None and cv is None:
-        return None
+    if cv is None and not motions.whole:
+        return []
+    n_rows = len(motions)
+    groups = motions.labels if motions.whole else None
     if cv is None:
         cv = LeaveOneGroupOut()
-    elif groups is not None and isinstance(cv, Integral):
+    elif motions.whole and isinstance(cv, Integral):
         cv = GroupKFold(int(cv))
     if not _is_listed(cv):
         place = np.arange(n_rows)

@@ -59,7 +59,7 @@ def check_rows(estimator, X, y, sample_weight, reset=True):
     X, y = _validated(estimator, X, y, good=good, reset=reset, **checks)
     y = y.astype(np.float64, copy=False)
     if sample_weight is None:
-        return X, y, None
+        return X, y, np.ones(len(X))
     weights = np.asarray(sample_weight, dtype=np.float64)
     good = _is_finite(weights, 1) and len(weights) == len(X)
     if not good or weights.min() < 0.0 or (reset and not weights.any()):

@@ -11,9 +11,10 @@ from hybridkin import (
     RigidChain,
     calibrate,
 )
+from hybridkin._core.groups import Groups
 from hybridkin.calibration.calibrate import refitted
 from hybridkin.calibration.choice import choose_geometry
-from hybridkin.calibration.measured import folds, inner_and_outer
+from hybridkin.calibration.measured import inner_and_outer
 
 NOISE = 5e-4
 
@@ -153,7 +154,7 @@ def test_inner_and_outer_rows_do_not_depend_on_the_units_of_columns(unit):
 def test_folds_hold_out_whole_groups(names):
     groups = names[np.random.default_rng(0).permutation(np.arange(40) % 5)]
     for shuffle in (False, True):
-        splits = folds(groups, groups, most=3, shuffle=shuffle)
+        splits = Groups(groups).folds(3, shuffle)
         assert len(splits) == 3
         for train, test in splits:
             assert not set(groups[train]) & set(groups[test])

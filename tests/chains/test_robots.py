@@ -92,7 +92,9 @@ def test_description_is_the_chain_it_describes(write):
     assert_close(robot.chain(q), expected(q), rtol=1e-13, atol=1e-15)
     assert robot.name == "three by three"
     assert robot.calibrate == ("radii", "base")
-    log = robots.LogFormat(tuple("abcdefghij"), ("x", "y", "z"), "mm", "m", -1, "", "motion", "t")
+    log = robots.LogFormat(
+        tuple("abcdefghij"), ("x", "y", "z"), "motion", time="t", q_unit="mm", q_sign=-1
+    )
     assert robot.log == log
 
 

@@ -6,6 +6,7 @@ import torch
 from numpy.testing import assert_array_equal
 
 from hybridkin._core.distinct import at_place, distinct_rows
+from hybridkin._core.groups import Groups
 
 N = 60
 
@@ -54,9 +55,12 @@ def test_rows_are_merged_as_row_by_row(runs, weighted, grouped):
         groups = np.zeros(N, dtype=int)
     expected = merged(X, y, weights, groups, runs)
     labels = np.array(["b", "c", "a"])[groups]
-    for names in (groups, labels, 7.5 - groups) + (() if grouped else (None,)):
-        for given in (weights, torch.from_numpy(weights)) + (() if weighted else (None,)):
-            first, counts, place = distinct_rows(X, y, given, names, runs)
+    motions = [Groups(groups), Groups(labels), Groups(7.5 - groups)]
+    if not grouped:
+        motions.append(Groups.rows(N))
+    for of_rows in motions:
+        for given in (weights, torch.from_numpy(weights)):
+            first, counts, place = distinct_rows(X, y, given, of_rows.apart, runs)
             assert_array_equal(first, expected[0])
             assert_array_equal(counts, expected[1])
             assert_array_equal(place, expected[2])
@@ -65,21 +69,22 @@ def test_rows_are_merged_as_row_by_row(runs, weighted, grouped):
 
 def test_one_row_more_or_less_changes_a_count_and_no_other():
     X, y, weights, groups = rows()
-    first, counts, place = distinct_rows(X, y, weights, groups)
+    first, counts, place = distinct_rows(X, y, weights, groups[:, None])
     assert counts.sum() == weights.sum()
     values = np.arange(float(len(first)))
     at = at_place(values, place)
     assert_array_equal(np.isnan(at), weights == 0.0)
     assert_array_equal(at[first], values)
     repeated = np.repeat(np.arange(N), (2 * weights).astype(int))
-    again = distinct_rows(X[repeated], y[repeated], None, groups[repeated])
+    ones = np.ones(len(repeated))
+    again = distinct_rows(X[repeated], y[repeated], ones, groups[repeated, None])
     assert_array_equal(X[repeated][again[0]], X[first])
     assert_array_equal(again[1], 2.0 * counts)
 
 
 def test_without_equal_rows_nothing_is_merged():
     X = np.arange(10.0)[:, None]
-    first, counts, place = distinct_rows(X, X[:, :0])
+    first, counts, place = distinct_rows(X, X[:, :0], np.ones(10), X[:, :0])
     assert_array_equal(first, np.arange(10))
-    assert counts is None
+    assert_array_equal(counts, np.ones(10))
     assert_array_equal(place, first)

@@ -20,6 +20,7 @@ from hybridkin import (
     datasets,
     robots,
 )
+from hybridkin._core.groups import Groups
 from hybridkin._core.rotations import rotation, rotation_vector
 from hybridkin.hybrid._adapt import _SCALES, _likeliest_scales, _whitened
 from hybridkin.hybrid._drift import MISFITS, SWITCH
@@ -243,9 +244,9 @@ def test_groups_of_new_rows_are_correlated_errors(renamed):
     groups = np.array([0, 1, 0, 2, 1, 0, 0])
     covariance = 0.5 * np.eye(7) + 0.5 * (groups[:, None] == groups)
     names = np.array(["c", "a", "b"])[groups] if renamed else groups
-    whitening = _whitened(np.eye(7), names)
+    whitening = _whitened(np.eye(7), Groups(names))
     assert_allclose(whitening @ covariance @ whitening.T, np.eye(7), rtol=0, atol=1e-14)
-    assert _whitened(covariance, None) is covariance
+    assert _whitened(covariance, Groups.rows(7)) is covariance
 
 
 @pytest.mark.parametrize("parameters", [["base"], ["actuator_zeros"], ["base", "actuator_zeros"]])

@@ -51,9 +51,9 @@ def test_the_width_is_found_where_a_marker_is_missing(log):
         x = chain(torch.from_numpy(Hysteresis.backlash(WIDTH).apply_by_group(q, groups))).numpy()
     x += 2e-4 * np.random.default_rng(1).standard_normal(x.shape)
     x[::3, :3] = np.nan
-    rows = Rows(q, x, groups=groups)
+    rows = Rows.of(q, x, groups=groups)
     assert abs(choose_hysteresis(Spec(chain, NoCorrection()), rows).width - WIDTH) < 0.1 * WIDTH
-    nowhere = Rows(q, np.where(np.arange(6) < 3, np.nan, x), groups=groups)
+    nowhere = Rows.of(q, np.where(np.arange(6) < 3, np.nan, x), groups=groups)
     of_the_other = choose_hysteresis(Spec(chain, NoCorrection()), nowhere)
     assert abs(of_the_other.width - WIDTH) < 0.1 * WIDTH
     parts = np.arange(len(q)) // 20  # two of each run

@@ -11,6 +11,7 @@ from scipy.stats import multivariate_normal
 from sklearn.base import BaseEstimator, RegressorMixin
 
 from hybridkin import ConstantCurvatureChain, HybridForwardModel
+from hybridkin._core.groups import Groups
 from hybridkin.hybrid._adapt import _Problem
 from hybridkin.hybrid._drift import MISFITS, SWITCH, Drift
 from hybridkin.hybrid._error_models import NoCorrection
@@ -48,7 +49,8 @@ def table_of(tips, y, counts, groups, fold, outer_tips, outer):
     names = NAMES[: len(tips)]
     inside = np.ones(tips.shape[:2], dtype=bool)
     beyond = Outer(outer_tips, y[outer], counts[outer], outer)
-    return CrossFit(names, tips, inside, y, y, counts, groups, fold, beyond)
+    motions = Groups.of(groups, len(y))
+    return CrossFit(names, tips, inside, y, y, counts, motions, fold, beyond)
 
 
 def held_out(errors, counts=None, groups=None):
@@ -198,7 +200,7 @@ class Recorded(NoCorrection):
 
 def test_the_radius_chooses_the_error_model_without_the_held_out_rows():
     model = Recorded()
-    found = fit_to_log(Spec(CHAIN, model, coverage=0.5), Rows(*log(30)))
+    found = fit_to_log(Spec(CHAIN, model, coverage=0.5), Rows.of(*log(30)))
     assert model.lengths == [30] + [24] * 5
     assert found.messages == ()
     assert 0.0 < found.radius.inside < inf
@@ -210,7 +212,7 @@ def test_the_radius_chooses_the_error_model_without_the_held_out_rows():
 )
 def test_a_log_is_small_by_its_motions(n_rows, motions, small):
     groups = None if motions is None else np.arange(n_rows) % motions
-    assert _is_small(Rows(*log(n_rows), groups=groups)) == small
+    assert _is_small(Rows.of(*log(n_rows), groups=groups)) == small
 
 
 # Who gets what
@@ -266,7 +268,8 @@ def test_the_likeliest_noise_is_that_of_the_normal_density():
     generator = torch.Generator().manual_seed(0)
     counts = torch.randint(1, 4, (30,), generator=generator).double()
     J = CHAIN.forward_and_jacobian(q)[1]
-    problem = ReadoutProblem(CHAIN, Features.of_range(q), q, q[:, :3], counts, serial=True)
+    groups = Groups.rows(len(q))
+    problem = ReadoutProblem(CHAIN, Features.of_range(q), q, q[:, :3], counts, groups, True)
     spread = torch.linalg.eigvalsh(J @ J.mT)
     mean = float((counts[:, None] * spread).sum() / (3.0 * counts.sum()))
     ratios = mean * np.logspace(-2, 4, 25)
@@ -289,7 +292,7 @@ def test_the_derivative_of_a_pose_by_a_change_of_the_robot():
     """Against differences, where the residual is zero and so linear in the change."""
     q = torch.from_numpy(log(4)[0])
     fitted = WithPose.of(CHAIN, [], q.new_zeros(0))
-    rows = Rows(q.numpy(), np.zeros((4, 6)))
+    rows = Rows.of(q.numpy(), np.zeros((4, 6)))
     rng = np.random.default_rng(0)
     theta = rng.uniform(-0.2, 0.2, 9)
     scale = np.full(3, 0.01)
@@ -312,7 +315,7 @@ def test_noise_of_the_actuators_alone_is_found_and_allowed_for(seed):
     off, noise = 0.1 * (q - 0.22), 1e-3 * torch.from_numpy(rng.standard_normal((100, 3)))
     features, x = Features.of_range(q), chain(q + off + noise)
     moved = chain.coordinates(q + off)[0] - chain.coordinates(q)[0]
-    rows = Rows(q.numpy(), x.numpy())
+    rows = Rows.of(q.numpy(), x.numpy())
     found = fit_readout(chain, features, rows)
     ignored = fit_readout(chain, features, rows, alphas=found.alphas)
     assert found.noise_ratio < inf == ignored.noise_ratio
@@ -335,8 +338,8 @@ def test_weights_of_a_readout_are_repetitions(noisy, coupling):
     places = np.arange(60)
     many = np.repeat(places, counts)
     features = Features.of_range(q)
-    weighed = Rows(q.numpy(), x, counts.astype(float), places)
-    repeated = Rows(q.numpy()[many], x[many], None, places[many])
+    weighed = Rows.of(q.numpy(), x, counts.astype(float), places)
+    repeated = Rows.of(q.numpy()[many], x[many], None, places[many])
     one, two = (fit_readout(chain, features, rows, coupling) for rows in (weighed, repeated))
     assert (one.noise_ratio < inf) == (noisy == "actuators")
     assert two.noise_ratio == pytest.approx(one.noise_ratio)

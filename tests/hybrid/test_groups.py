@@ -75,8 +75,8 @@ def test_the_candidates_of_auto_hold_out_motions(part):
     """So do those of a fit to a part of a log, and the comparison itself."""
     q, x, motions = repeated_motions()
     spec = Spec(CHAIN, Few(0), guard=None)
-    fits = [fit_hybrid(spec, Rows(q, x, groups=groups)) for groups in (None, motions)]
-    rows = Rows(q, x, groups=motions)
+    fits = [fit_hybrid(spec, Rows.of(q, x, groups=groups)) for groups in (None, motions)]
+    rows = Rows.of(q, x, groups=motions)
     settled = Settled.of(fits[1], rows)
     assert settled.table(settled.outer()).results()["chosen"] == "mechanical"
     if part:  # with a start that suits the noise
@@ -94,10 +94,10 @@ def test_the_candidates_of_auto_hold_out_motions(part):
 def test_the_gain_of_a_blend_is_that_of_whole_motions():
     """Its score has every row in the fold of its motion, outer rows again, and the motion."""
     q, x, motions, _ = learnable()
-    rows = Rows(q, x, groups=motions)
+    rows = Rows.of(q, x, groups=motions)
     settled = Settled.of(fit_hybrid(Spec(CHAIN, FewAtTip(0), guard=None), rows), rows)
     table = settled.table(settled.outer())
-    assert_array_equal(table.groups, motions)
+    assert_array_equal(table.groups.labels, motions)
     scored = table._all_rows
     outer = inner_and_outer(q)[1]
     assert_array_equal(scored.y, np.concatenate([x, x[outer]]))

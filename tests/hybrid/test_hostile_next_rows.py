@@ -62,7 +62,7 @@ def test_chosen_rows_find_the_errors_of_a_structure_better_than_random_rows():
             x = truth(q).numpy() + 0.002 * rng.standard_normal((300, 3))
         orders = {"chosen": choose_rows(TRUNK, q, 15)[0], "random": rng.permutation(300)[:15]}
         for name, rows in orders.items():
-            fit = fit_structure(TRUNK, Rows(q.numpy()[rows], x[rows]), left_out=False)
+            fit = fit_structure(TRUNK, Rows.of(q.numpy()[rows], x[rows]), left_out=False)
             with torch.no_grad():
                 squares[name] += float((fit.model(q) - truth(q)).square().sum(1).mean())
     assert squares["chosen"] < 0.7 * squares["random"], squares

@@ -37,7 +37,7 @@ def fitted(n, seed=0, noise=0.002, scale=0.5, **options):
     with torch.no_grad():
         x = design.model(scale * drawn)(q).numpy()
     x += noise * np.random.default_rng(seed).standard_normal(x.shape)
-    return fit_structure(TRUNK, Rows(q.numpy(), x), **options), scale * drawn.numpy()
+    return fit_structure(TRUNK, Rows.of(q.numpy(), x), **options), scale * drawn.numpy()
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.002, 0.02])
@@ -57,9 +57,9 @@ def test_the_forecast_agrees_with_the_held_out_error_and_falls_to_the_noise(nois
 def test_rows_that_count_four_times_leave_the_error_of_the_forecast():
     q = motions(30)  # without errors both are linearised at zero
     with torch.no_grad():
-        rows = Rows(q.numpy(), TRUNK(q).numpy())
+        rows = Rows.of(q.numpy(), TRUNK(q).numpy())
     fit = fit_structure(TRUNK, rows)
-    four = fit_structure(TRUNK, replace(rows, weights=np.full(30, 4.0)))
+    four = fit_structure(TRUNK, replace(rows, counts=np.full(30, 4.0)))
     assert_allclose(fit.distance_by_few_rows(120), four.distance_by_few_rows(30), rtol=1e-9)
     assert_allclose(fit.spread, four.spread, rtol=1e-9, atol=1e-15)
 

@@ -6,6 +6,7 @@ from numpy.testing import assert_array_equal
 from sklearn.kernel_ridge import KernelRidge
 
 from hybridkin import HybridForwardModel
+from hybridkin._core.groups import Groups
 from hybridkin.hybrid import _kernel
 from hybridkin.hybrid._kernel import distance, folds_of, tuned_kernel
 
@@ -13,7 +14,7 @@ from hybridkin.hybrid._kernel import distance, folds_of, tuned_kernel
 def held_out(X, y, weights, groups, gamma, alpha):
     """Return the sum of held-out distances, by fits of scikit-learn."""
     total = 0.0
-    for train, test in folds_of(X, groups):
+    for train, test in folds_of(groups):
         ridge = KernelRidge(kernel="rbf", gamma=gamma).set_params(alpha=alpha)
         ridge.fit(X[train], y[train], sample_weight=weights[train])
         total += weights[test] @ distance(ridge.predict(X[test]), y[test])
@@ -31,7 +32,7 @@ def test_no_neighbour_of_the_tuned_kernel_is_better(enough, n_outputs, grouped, 
     y += 1e-3 * rng.standard_normal(y.shape)
     y = y if n_outputs else y[:, 0]
     weights = rng.integers(1, 4, 60).astype(float)
-    groups = np.arange(60) // 6 if grouped else None
+    groups = Groups.of(np.arange(60) // 6 if grouped else None, 60)
     found = tuned_kernel(X, y, weights, groups)
     spread = np.repeat(X, weights.astype(int), axis=0).var(axis=0).mean()
     best = held_out(X, y, weights, groups, found.gamma, found.alpha)
@@ -50,14 +51,14 @@ def rows_of_motions():
     rng = np.random.default_rng(4)
     X = rng.uniform(-0.1, 0.1, (60, 2))
     y = 0.01 * np.sin(20.0 * X) + 1e-3 * rng.standard_normal((60, 2))
-    return X, y, rng.integers(1, 9, 60).astype(float), np.arange(60) // 3
+    return X, y, rng.integers(1, 9, 60).astype(float), Groups(np.arange(60) // 3)
 
 
 @pytest.mark.parametrize("grouped", [False, True])
 @pytest.mark.parametrize("place", [(0, 1), (3, 4), (5, 6)])
 def test_the_score_of_a_kernel_is_that_of_weighted_fits_on_the_folds(place, grouped):
     X, y, weights, groups = rows_of_motions()
-    groups = groups if grouped else None
+    groups = groups if grouped else Groups.rows(60)
     score = _kernel._HeldOut(X, y, weights, groups, 0.01).distance(place)
     gamma = _kernel._GAMMAS[place[0]] / 0.01
     expected = held_out(X, y, weights, groups, gamma, _kernel._ALPHAS[place[1]])
@@ -81,9 +82,10 @@ def test_a_first_search_on_some_rows_keeps_their_weights_and_every_motion(first,
     few = searched[0]
     places = [int(np.flatnonzero((X == row).all(axis=1))[0]) for row in few[0]]
     assert len(places) == (60 if first == 7 else 40)  # 7 rows would leave motions out
-    for found, given in zip(few[1:4], (y, weights, groups), strict=True):
+    for found, given in zip(few[1:3], (y, weights), strict=True):
         assert_array_equal(found, given[places])
-    assert len(np.unique(few[3])) == 20
+    assert_array_equal(few[3].labels, groups.labels[places])
+    assert few[3].number == 20
 
 
 def test_more_rows_than_the_memory_holds_are_refused():

@@ -6,11 +6,11 @@ from saved_models import arm
 from torch.testing import assert_close
 
 from hybridkin import ConstantCurvatureChain, ElasticTendonChain, robots
+from hybridkin._core.groups import Groups
 from hybridkin.hybrid._features import Features, HiddenFeatures, QuadraticFeatures, Readout
 from hybridkin.hybrid._linearised import (
     Linearised,
     design,
-    members_of,
 )
 from hybridkin.hybrid._module import HybridModule, InnerCorrection, TipCorrection
 from hybridkin.hybrid._readout_fit import _Problem, fit_readout
@@ -21,7 +21,7 @@ def read_out(chain, features, q, x, sample_weight=None, groups=None, **options):
     """Return the readout that is fitted to the different ones of rows q and x."""
     weights = None if sample_weight is None else sample_weight.numpy()
     labels = None if groups is None else groups.numpy()
-    rows = Rows(q.detach().numpy(), x.detach().numpy(), weights, labels).distinct()
+    rows = Rows.of(q.detach().numpy(), x.detach().numpy(), weights, labels).distinct()
     return fit_readout(chain, features, rows, **options)
 
 
@@ -146,9 +146,9 @@ def test_rows_left_out_equal_fits_without_them(unused, sizes, n_linear, rng):
         else torch.arange(len(sizes)).repeat_interleave(torch.tensor(sizes))
     )
     groups = groups[torch.randperm(30, generator=rng)]
-    members = None if sizes is None else members_of(groups)
-    linear.left_out(2.0 * penalty, members)  # another penalty before changes nothing
-    found = linear.left_out(penalty, members)
+    motions = Groups(groups.numpy(), sizes is not None)
+    linear.left_out(2.0 * penalty, motions)  # another penalty before changes nothing
+    found = linear.left_out(penalty, motions)
     for label in groups.unique():
         out = groups == label
         expected = linear.residual(solved(linear, penalty, ~out))[out]

@@ -16,6 +16,7 @@ from hybridkin import (
     Hysteresis,
     calibrate,
 )
+from hybridkin._core.groups import Groups
 from hybridkin.hybrid import _hysteresis
 from hybridkin.hybrid._error_models import NoCorrection
 from hybridkin.hybrid._hysteresis import FoundHysteresis, choose_hysteresis
@@ -57,7 +58,7 @@ def test_rows_that_are_merged_do_not_change_what_the_actuators_do(operator):
     weights = np.random.default_rng(2).integers(0, 3, len(keep)).astype(float)
     groups = log.runs // 2  # two runs each
     clock = log.time if operator.needs_time else None
-    rows = Rows(log.q, x, weights, groups, log.runs, clock)
+    rows = Rows.of(log.q, x, weights, groups, log.runs, clock)
     merged = rows.in_runs()
     assert len(merged) == len(rows) - (1 if operator.needs_time else 4)
     assert_array_equal(merged.X[merged.place], rows.X)
@@ -139,9 +140,9 @@ def chosen(rows, calibrate=()):
 def test_the_chosen_hysteresis_knows_no_names_and_no_clock():
     q, runs, time = motions()
     x = tips(SLIDE.apply_by_group(q, runs, time))
-    found = chosen(Rows(q, x, None, runs, runs, time))
+    found = chosen(Rows.of(q, x, None, runs, runs, time))
     others, order = renamed(Commands(q, runs, time))
-    other = chosen(Rows(others.q, x[order], None, others.runs, others.runs, others.time))
+    other = chosen(Rows.of(others.q, x[order], None, others.runs, others.runs, others.time))
     assert found.kind == other.kind == "backlash and creep"
     same = other.apply_by_group(q, runs, time)
     assert_allclose(same, found.apply_by_group(q, runs, time), rtol=0, atol=1e-6)
@@ -157,9 +158,9 @@ def test_the_chosen_hysteresis_counts_rows_by_their_weights():
     weights = np.where(runs % 2, 1.0, 4.0)
     many = np.repeat(np.arange(len(q)), weights.astype(int))
     apart = x[many] + 1e-9 * np.random.default_rng(3).standard_normal((len(many), 3))
-    weighed = chosen(Rows(q, x, weights, runs), ("base",))
-    repeated = chosen(Rows(q[many], apart, None, runs[many]), ("base",))
-    plain = chosen(Rows(q, x, None, runs), ("base",))
+    weighed = chosen(Rows.of(q, x, weights, runs), ("base",))
+    repeated = chosen(Rows.of(q[many], apart, None, runs[many]), ("base",))
+    plain = chosen(Rows.of(q, x, None, runs), ("base",))
     moved = [operator.apply_by_group(q, runs) for operator in (weighed, repeated, plain)]
     assert np.abs(moved[0] - moved[1]).max() < 0.1 * np.abs(moved[0] - moved[2]).max()
 
@@ -168,7 +169,7 @@ def test_the_chosen_hysteresis_counts_rows_by_their_weights():
 def test_what_is_held_out_has_no_say_in_the_hysteresis():
     """Neither rows of weight zero nor held-out ones; the actuators follow them all the same."""
     q, runs, _ = motions(4)
-    log = Rows(q, tips(PLAY.apply_by_group(q, runs)), groups=runs)
+    log = Rows.of(q, tips(PLAY.apply_by_group(q, runs)), groups=runs)
     weights = np.where(np.arange(len(q)) % 5, 1.0, 0.0)
     measured = np.flatnonzero(weights)
     is_held_out = runs[measured] == 1
@@ -179,7 +180,7 @@ def test_what_is_held_out_has_no_say_in_the_hysteresis():
         y = log.y.copy()
         y[weights == 0.0] += wrong
         y[measured[test]] -= wrong
-        found.append(Anew(spec, replace(log, y=y, weights=weights)).held_out(train, test))
+        found.append(Anew(spec, replace(log, y=y, counts=weights)).held_out(train, test))
     assert_array_equal(found[1].tips, found[0].tips)
     moved = PLAY.apply_by_group(q, runs)[measured[test]]
     assert_allclose(found[0].tips[0], tips(moved), rtol=0, atol=1e-3)
@@ -195,7 +196,7 @@ def test_the_search_gets_the_rows_as_they_are(mechanical, monkeypatch):
     weights = np.random.default_rng(0).integers(0, 4, len(q)).astype(float)
     x = tips(q)
     log = choose_hysteresis(
-        Spec(mechanical, NoCorrection()), Rows(q, x, weights, groups, runs, time)
+        Spec(mechanical, NoCorrection()), Rows.of(q, x, weights, groups, runs, time)
     )
     for found, given in (
         (log.q, q),
@@ -221,7 +222,7 @@ def test_the_chain_of_the_search_is_calibrated_with_the_weights(monkeypatch):
     q, runs, _ = motions()
     weights = np.random.default_rng(0).integers(0, 4, len(q)).astype(float)
     x = tips(q) + 0.02 * np.sin(20 * q)
-    assert chosen(Rows(q, x, weights, runs), ("base",)) == found
+    assert chosen(Rows.of(q, x, weights, runs), ("base",)) == found
     found = logs[0].model
     expected, plain = (
         calibrate(CHAIN, q, x, parameters=("base",), sample_weight=counts).chain
@@ -235,7 +236,7 @@ def test_a_single_motion_that_counts_tells_nothing_of_hysteresis():
     """There is none to hold out beside those of weight zero."""
     q, runs, _ = motions()
     x = tips(PLAY.apply_by_group(q, runs))
-    assert chosen(Rows(q, x, (runs == 2).astype(float), runs)) == Hysteresis()
+    assert chosen(Rows.of(q, x, (runs == 2).astype(float), runs)) == Hysteresis()
 
 
 def test_the_range_of_states_is_tested_by_other_groups():
@@ -243,7 +244,7 @@ def test_the_range_of_states_is_tested_by_other_groups():
     q = np.linspace(0.0, 1.0, 40)[:, None]
     groups = np.repeat([0, 1, 2, 3], 10)
     states = np.repeat([0.0, 0.1, 0.6, 9.0], 10)[:, None, None]
-    log = Rows(q, q, np.where(groups == 3, 0.0, 1.0), groups)  # the last one is not measured
+    log = Rows.of(q, q, np.where(groups == 3, 0.0, 1.0), groups)  # the last one is not measured
 
     def ranges(log):
         return state_range(states[log.counted], log.take(log.counted), np.ptp(q, axis=0))
@@ -252,9 +253,9 @@ def test_the_range_of_states_is_tested_by_other_groups():
     assert_allclose([low.item(), high.item()], [0.0 - 0.5, 0.6 + 0.5])
     one_run = replace(log, runs=np.zeros(40))
     assert_allclose(ranges(one_run), (low, high))
-    by_run = replace(log, groups=None, runs=groups.astype(float))
+    by_run = replace(log.ungrouped(), runs=groups.astype(float))
     assert_allclose(ranges(by_run), (low, high))
-    alone = replace(log, groups=np.zeros(40))
+    alone = replace(log, groups=Groups(np.zeros(40)))
     assert_allclose(np.ravel(ranges(alone)), [0.0 - 0.1, 0.6 + 0.1])
 
 

@@ -15,6 +15,7 @@ from hybridkin import (
     datasets,
     robots,
 )
+from hybridkin._core.groups import Groups
 from hybridkin.calibration.natural_scales import STRUCTURE
 from hybridkin.chains.structural import StructuralChain
 from hybridkin.hybrid._rows import Rows
@@ -50,7 +51,7 @@ def with_errors(chain, q, seed=1, scale=1.0):
 def rows_of(model, q, noise=0.0, seed=2, groups=None):
     x = model(q).detach().numpy()
     rng = np.random.default_rng(seed)
-    return Rows(q.numpy(), x + noise * rng.standard_normal(x.shape), groups=groups)
+    return Rows.of(q.numpy(), x + noise * rng.standard_normal(x.shape), groups=groups)
 
 
 @pytest.mark.parametrize("chain", CHAINS)
@@ -91,8 +92,8 @@ def test_the_errors_are_relative_to_the_robot(size):
     x = robots.bionic_handling_assistant()(torch.cat([q, q[:, :3]], dim=1))
     first = ConstantCurvatureChain([0.1, 0.1])
     near = first(q) + 0.01 * x
-    fit = fit_structure(first, Rows(q.numpy(), near.numpy()))
-    scaled = fit_structure(small, Rows((size * q).numpy(), (size * near).numpy()))
+    fit = fit_structure(first, Rows.of(q.numpy(), near.numpy()))
+    scaled = fit_structure(small, Rows.of((size * q).numpy(), (size * near).numpy()))
     assert_close(fit.parameters, scaled.parameters, atol=1e-6, rtol=0.0)
 
 
@@ -117,7 +118,7 @@ def test_held_out_residuals_are_those_of_fits_without_the_rows():
     rows = rows_of(true, q, noise=0.001)
     fit = fit_structure(TRUNK, rows)
     groups = np.arange(40) // 8
-    by_group = fit_structure(TRUNK, replace(rows, groups=groups))
+    by_group = fit_structure(TRUNK, replace(rows, groups=Groups(groups)))
     without = fit_structure(TRUNK, rows.take(np.arange(1, 40)), left_out=False)
     alone = rows.tips[0] - without.model(q[:1])[0].numpy()
     # Units of the noise change by the row; the errors are small, and nearly linear.
@@ -131,7 +132,7 @@ def test_a_weight_of_two_is_the_row_twice():
     q = motions(TRUNK, 20)
     rows = rows_of(with_errors(TRUNK, q), q, noise=0.001)
     twice = np.append(np.arange(20), 3)
-    weighted = replace(rows, weights=np.where(np.arange(20) == 3, 2.0, 1.0))
+    weighted = replace(rows, counts=np.where(np.arange(20) == 3, 2.0, 1.0))
     repeated = rows.take(twice)
     fit = fit_structure(TRUNK, weighted).model(q)
     # The spread of the actuators, which sets their noise, counts every row once.
@@ -175,7 +176,7 @@ def test_inputs_are_not_changed():
 def test_numbers_too_large_are_named():
     q = 1e29 * motions(TRUNK, 20)
     with pytest.raises(ValueError, match="too large"):
-        fit_structure(TRUNK, Rows(q.numpy(), np.ones((20, 3))))
+        fit_structure(TRUNK, Rows.of(q.numpy(), np.ones((20, 3))))
 
 
 def test_structural_hybrid_of_the_shipped_trunk():

@@ -194,7 +194,7 @@ def test_the_selection_compares_weighted_fits_without_the_rows_that_it_predicts(
     q, x, weights, motions, _ = counted(log)
     groups = motions if grouped else None
     nominal = ConstantCurvatureChain([0.06])
-    rows = Rows(q, x, weights, groups)
+    rows = Rows.of(q, x, weights, groups)
     spec = Spec(nominal, Few(0), calibrate=("base",), guard=None)
     results = fit_to_log(spec, rows).error.comparison
 
@@ -306,4 +306,4 @@ def test_equal_commands_with_other_tips_are_other_rows(log):
     model = HybridForwardModel(chain, Ridge(0.1), guard=None).fit(q[twice], apart)
     expected = Ridge(0.1).fit(q[twice], error).predict(new)
     assert_allclose(model.predict_error(new), expected, rtol=0, atol=1e-12)
-    assert len(Rows(q[twice], apart).distinct()) == len(twice)
+    assert len(Rows.of(q[twice], apart).distinct()) == len(twice)

@@ -13,7 +13,7 @@ import threading
 import warnings
 import webbrowser
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -593,11 +593,6 @@ def _read(
     )
 
 
-_COLUMNS = ("q", "x", "q_unit", "x_unit", "q_sign", "groups", "runs", "time")
-_FORM = ("header_line", "decimal", "missing", "unwrap")
-_TIME = ("time_unit", "rate")
-
-
 def _log_format(
     arguments: argparse.Namespace, described: robots.LogFormat | None, source: Path
 ) -> robots.LogFormat:
@@ -605,10 +600,15 @@ def _log_format(
     entries = {}
     if arguments.time_unit not in (None, FRAMES):
         entries["rate"] = None  # that of the description is one of frames
-    for name in (*_COLUMNS, *_TIME, *_FORM):
-        value = vars(arguments)[name]
-        if value is not None:
-            entries[name] = None if value == "none" else value
+    options = vars(arguments)
+    names = [
+        field.name
+        for field in fields(hybridkin.robots.LogFormat)
+        if field.name in options
+    ]
+    for name in names:
+        if options[name] is not None:
+            entries[name] = None if options[name] == "none" else options[name]
     if described is not None:
         return replace(described, **entries)
     if "q" not in entries or "x" not in entries:

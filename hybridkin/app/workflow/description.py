@@ -135,7 +135,7 @@ def describe_robot(robot: robots.RobotDescription) -> Report[Description]:
     if log is None:
         unit = "m" if robot.chain.in_metres else "1"
         names = tuple(f"q{i + 1}" for i in range(n))
-        log = robots.LogFormat(names, ("x", "y", "z"), unit)
+        log = robots.LogFormat(names, ("x", "y", "z"), q_unit=unit)
     record = Description(
         name=robot.name,
         path=str(robot.path),

@@ -213,7 +213,8 @@ def read_log(
             f"`exclude` must be a list of patterns of names, got {exclude!r:.80}."
         )
     suffix = log_format.group_suffix
-    log = load_log(path, **log_format.reading, delimiter=delimiter, drop_invalid=True)
+    reading = replace(log_format, delimiter=delimiter, drop_invalid=True).reading
+    log = load_log(path, **reading)
     log = replace(log, file_units={**log.file_units, "q": log_format.q_unit})
     if log.groups is None and exclude:
         raise ValueError("`exclude` needs `groups`, the column that names the motions.")

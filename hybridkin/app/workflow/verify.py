@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -449,14 +449,16 @@ def read_tips(
     """
     columns = {*log_columns(path, delimiter)}
     time = log_format.time if log_format.time in columns else None
-    reading = {
-        **log_format.reading,
-        "q": (),
-        "q_unit": "m",
-        "q_sign": 1,
-        "groups": None,
-        "runs": None,
-        "time": time,
-    }
-    reading.pop("unwrap", None)
-    return load_log(path, **reading, delimiter=delimiter, drop_invalid=True)
+    of_tips = replace(
+        log_format,
+        q=(),
+        q_unit="m",
+        q_sign=1,
+        groups=None,
+        runs=None,
+        time=time,
+        unwrap=False,
+        delimiter=delimiter,
+        drop_invalid=True,
+    )
+    return load_log(path, **of_tips.reading)

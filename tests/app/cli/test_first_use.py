@@ -47,7 +47,12 @@ def test_init_from_options(tmp_path, capsys):
     assert robot.chain.radii.tolist() == [0.008, 0.008, 0.007]
     assert robot.chain.lengths.tolist() == [0.1] * 3
     assert robot.log == robots.LogFormat(
-        tuple(f"q{i}" for i in range(1, 10)), ("x", "y", "z"), "mm", "mm", -1, time="t"
+        tuple(f"q{i}" for i in range(1, 10)),
+        ("x", "y", "z"),
+        time="t",
+        q_unit="mm",
+        x_unit="mm",
+        q_sign=-1,
     )
 
 

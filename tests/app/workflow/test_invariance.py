@@ -125,7 +125,7 @@ def loaded(gains, tmp_path, *, learned=False, width=0.0):
     chain = ConstantCurvatureChain(**RADII, gains=gains)
     signs = tuple(np.sign(gains).astype(int).tolist())
     unit = "deg" if np.ptp(np.abs(gains)) > 0.0 else "ticks"
-    log = robots.LogFormat(COLUMNS, ("x", "y", "z"), unit, "cm", signs)
+    log = robots.LogFormat(COLUMNS, ("x", "y", "z"), q_unit=unit, x_unit="cm", q_sign=signs)
     description = robots.RobotDescription("r", chain, (), log, LIMITS.scaled(1.0 / gains))
     model = chain
     if learned:

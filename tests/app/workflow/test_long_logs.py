@@ -105,7 +105,7 @@ def test_a_log_that_is_too_coarse_for_its_reversals_says_so():
 
     def words(step, operator=PLAY):
         rows = log.rows(np.arange(0, len(log.q), step))
-        return coarse_in_words(operator, Rows(rows.q, rows.x, groups=rows.groups))
+        return coarse_in_words(operator, Rows.of(rows.q, rows.x, groups=rows.groups))
 
     assert not [f for f in check_log(log).findings if f.kind == "reversals"]
     assert words(1) == []
