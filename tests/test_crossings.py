@@ -206,7 +206,7 @@ OF_FORCES = ("robot", "forces"), ("error_model", "drop")
 EVERY_PAIR = "HYBRIDKIN_MUST_RUN" in os.environ
 CASES = pairwise(FACTORS)
 CASES += pairwise({**FACTORS, "robot": ("forces",)}, of=() if EVERY_PAIR else OF_FORCES)
-SLOW = {"auto"}  # values whose fits take more than 0.3 s
+SLOW = {"auto", "forces", "ELM-CV", "kernel"}  # values whose fits take more than 0.3 s
 
 
 class Log(NamedTuple):
