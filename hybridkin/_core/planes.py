@@ -25,7 +25,7 @@ class PlaneOfQ(NamedTuple):
     @classmethod
     def whole(cls) -> PlaneOfQ:
         """Return the whole space, whatever n is."""
-        return cls(torch.zeros(0), torch.zeros(0, 0))
+        return cls(torch.zeros(0, device="cpu"), torch.zeros(0, 0, device="cpu"))
 
     @property
     def n_normals(self) -> int:

@@ -207,6 +207,7 @@ def test_a_tracker_stays_within_the_limits_whatever_comes(case, memory, in_torch
         before = command
 
 
+@pytest.mark.slow
 @given(st.data(), solvers(), st.sampled_from([0, 1]), st.sampled_from([None, None, 2]))
 def test_a_solution_stays_within_the_limits_whatever_is_asked(data, case, restarts, places):
     name, ik = case

@@ -393,6 +393,7 @@ class TwoRegions(ForwardModel):
         return torch.where(near | (q[..., 3] > 0.4), 0.5, 2.0).to(q)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("as_numpy", [True, False])
 def test_a_track_without_a_start_stays_in_the_domain(as_numpy):
     path = torch.linspace(0.0, 0.3, 61)[:, None] * torch.tensor(
