@@ -7,6 +7,7 @@ compiled core, by 1e-12 in torch, where sums of a batch are taken in another ord
 import warnings
 
 import numpy as np
+import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
