@@ -60,9 +60,7 @@ class Reading:
 
 def with_fields_of(
     value: Callable[Fields, Reading],
-) -> Callable[
-    [Callable[[Source, Reading], Result]], Callable[Concatenate[Source, Fields], Result]
-]:
+) -> Callable[[Callable[[Source, Reading], Result]], Callable[Concatenate[Source, Fields], Result]]:
     """Return a decorator: a function of a source and a value gets its fields as arguments."""
     of_value = inspect.signature(value)
     made: Callable[..., Reading] = value

@@ -23,9 +23,7 @@ _SCALES = (0.6, 1.0, 1.6)
 _TURNS = tuple(0.5 * math.pi * k for k in range(4))
 _SWEEPS = 2
 _MOST = 2  # guesses per handedness
-_HOPELESS = (
-    3.0  # times the least error of a guess, before any fit; worse ones are dropped
-)
+_HOPELESS = 3.0  # times the least error of a guess, before any fit; worse ones are dropped
 
 _Rings = tuple[tuple[bool, float], ...]  # for every ring: mirrored or not, and its turn
 
@@ -113,9 +111,7 @@ def _best_rings(
     return [*likely[False], *likely[True]]
 
 
-def _error(
-    chain: Chain, rows: TipRows, align: bool, rings: _Rings, scale: float
-) -> float:
+def _error(chain: Chain, rows: TipRows, align: bool, rings: _Rings, scale: float) -> float:
     """Return the root mean square tip distance with these rings and scaled radii."""
     changed = _scaled(_with_rings(chain, rings), scale)
     return _alignment(changed, rows)[1] if align else rows.rmse(changed)

@@ -101,9 +101,7 @@ class CalibrationResult(Portable):
     messages: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
-        lines = [
-            f"CalibrationResult(rmse={self.rmse:.3e} m, converged={self.converged})"
-        ]
+        lines = [f"CalibrationResult(rmse={self.rmse:.3e} m, converged={self.converged})"]
         for name, value in self.values.items():
             lines.append(f"  {name}: {_shown(value)}")
             lines.append(f"    std. error {_shown(self.std_errors[name])}")
@@ -424,9 +422,7 @@ def _check_parameters(chain: Chain, parameters: Sequence[str]) -> tuple[str, ...
     return names
 
 
-def check_data(
-    chain: Chain, q: Numbers, x: Numbers
-) -> tuple[Tensor, Tensor, list[str]]:
+def check_data(chain: Chain, q: Numbers, x: Numbers) -> tuple[Tensor, Tensor, list[str]]:
     """Return the data as tensors in the dtype of the chain, and warnings about their units."""
     dtype = chain.geometry()["base"].dtype
     q = as_tensor(q, "q").to("cpu", dtype)

@@ -39,9 +39,7 @@ _FEW = 40  # with fewer rows `io` is not used
 # rows per parameter; with fewer rows a set must be clearly better
 _ROWS = 7
 _CLEARLY = 0.7
-_WORSE = (
-    1.1  # times the smallest held-out error: sets above are not taken, whatever `io`
-)
+_WORSE = 1.1  # times the smallest held-out error: sets above are not taken, whatever `io`
 # Also from few rows.
 _USUAL = (
     "nothing",
@@ -115,9 +113,7 @@ class GeometryChoice:
         """Return an iterator over the parameters to calibrate."""
         return iter(self.parameters)
 
-    def calibrate(
-        self, q: Numbers, x: Numbers, *, loss: str = "linear"
-    ) -> CalibrationResult:
+    def calibrate(self, q: Numbers, x: Numbers, *, loss: str = "linear") -> CalibrationResult:
         """Return the calibration of the chosen parameters, which must not be empty.
 
         Parameters
@@ -333,9 +329,7 @@ def _candidates(chain: Chain, q: Tensor, given: tuple[str, ...]) -> list[_Candid
     return candidates
 
 
-def _elastic_parameters(
-    chain: Chain, elastic: Chain, names: tuple[str, ...]
-) -> tuple[str, ...]:
+def _elastic_parameters(chain: Chain, elastic: Chain, names: tuple[str, ...]) -> tuple[str, ...]:
     """Return the parameters of elastic tendons in place of those of a plain chain.
 
     Lengths and radii of a plain chain compensate for slack; elastic tendons keep them.
@@ -444,9 +438,7 @@ def unmoved(model: ForwardModel | None, q: Tensor) -> tuple[str, ...]:
     )
 
 
-def split_by_effect(
-    model: ForwardModel, q: Tensor, directions: NDArray
-) -> tuple[NDArray, NDArray]:
+def split_by_effect(model: ForwardModel, q: Tensor, directions: NDArray) -> tuple[NDArray, NDArray]:
     """Return combinations (k, a) and (k, k - a) of directions of q (n, k).
 
     Along the first ones the tip of the model moves at some of the rows q (N, n), along the others

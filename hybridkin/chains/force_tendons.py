@@ -220,9 +220,7 @@ class ForceTendonChain(ElasticBody):
         S = self.n_segments
         weights = filled(weight, "weight", dtype, (S,))
         if not (weights >= 0.0).all():
-            raise ValueError(
-                f"`weight` must not be negative [N/m], got {weights.tolist()}."
-            )
+            raise ValueError(f"`weight` must not be negative [N/m], got {weights.tolist()}.")
         tapers = filled(taper, "taper", dtype, (S,))
         if not ((tapers >= 0.0) & (tapers < 1.0)).all():
             raise ValueError(f"`taper` must lie in [0, 1), got {tapers.tolist()}.")
@@ -482,9 +480,7 @@ class ForceTendonChain(ElasticBody):
         along = float(statics.down[2])
         pose = "stands on its base" if along < 0.0 else "hangs from its base"
         length = float(self.lengths.sum())
-        ratio = (
-            float(statics.weights.sum()) * length**2 / float(self.bending_stiffness[0])
-        )
+        ratio = float(statics.weights.sum()) * length**2 / float(self.bending_stiffness[0])
         axial = float(self.axial_stiffness.min())
         return (
             f"The body {pose} (gravity along its axis: {along:.3g}) with sum(W) L^2 / EI = "

@@ -132,9 +132,7 @@ class Log:
         ]
         if self.time is not None:
             duration = duration_in_words(float(np.ptp(self.time)))
-            lines.append(
-                f"time from {self.time[0]:.6g} to {self.time[-1]:.6g} s: {duration}"
-            )
+            lines.append(f"time from {self.time[0]:.6g} to {self.time[-1]:.6g} s: {duration}")
         return "\n  ".join(lines)
 
     @staticmethod
@@ -443,7 +441,5 @@ def _checked_factor(n: int, q_unit: str, x_unit: str, q_sign: ArrayLike) -> NDAr
     one_of(x_unit, "x_unit", METRES)
     sign = real_array(q_sign, "q_sign")
     if sign.shape not in ((), (n,)) or not np.isin(sign, (-1, 1)).all():
-        raise ValueError(
-            f"`q_sign` must be 1 or -1, or one per column of `q`, got {q_sign!r}."
-        )
+        raise ValueError(f"`q_sign` must be 1 or -1, or one per column of `q`, got {q_sign!r}.")
     return sign * UNITS[q_unit]

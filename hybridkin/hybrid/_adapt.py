@@ -159,11 +159,7 @@ def _misfit(rms: float, noise: float) -> list[str]:
 
 def check_parameters(parameters: Sequence[str], in_space: bool) -> None:
     """Raise if `parameters` are not allowed; `in_space`: outputs are tips in space or poses."""
-    if (
-        isinstance(parameters, str)
-        or not parameters
-        or not {*parameters} <= {*PARAMETERS}
-    ):
+    if isinstance(parameters, str) or not parameters or not {*parameters} <= {*PARAMETERS}:
         raise ValueError(
             f"`parameters` must be one or both of {PARAMETERS} in a list, got {parameters!r}."
         )

@@ -61,9 +61,7 @@ class Drift(NamedTuple):
         none = np.zeros((n_outputs, n, n)), np.zeros((n, n_outputs)), np.zeros(())
         return cls(center.numpy(), scale.numpy(), *none)
 
-    def learned(
-        self, q: NDArray, residual: NDArray, weights: NDArray, decay: float
-    ) -> Drift:
+    def learned(self, q: NDArray, residual: NDArray, weights: NDArray, decay: float) -> Drift:
         """Return the statistics after rows q (N, n) in order of time.
 
         Each row multiplies the weights of all earlier rows by `decay`, once per repetition. The
@@ -80,9 +78,7 @@ class Drift(NamedTuple):
             decayed = (1.0 - decay**weights) / (1.0 - decay)
         weighed = (decayed * decay**later)[:, None] * phi
         remaining = decay ** weights.sum()
-        gram = remaining * self.gram + np.einsum(
-            "nk,ni,nj->kij", measured, weighed, phi
-        )
+        gram = remaining * self.gram + np.einsum("nk,ni,nj->kij", measured, weighed, phi)
         moment = remaining * self.moment + weighed.T @ residual
         squares = remaining * self.squares + weighed[:, 0] @ (residual**2).sum(1)
         return self._replace(gram=gram, moment=moment, squares=squares)

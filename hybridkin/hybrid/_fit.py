@@ -73,9 +73,7 @@ def _module(rows: Rows, spec: Spec, weighted: Weighted) -> HybridModule | WithPo
             alone = HybridModule(spec.mechanical, [correction], weights.new_ones(1))
             with torch.no_grad():
                 values = alone.error_part(rows.q)
-            guard = fit_guard(
-                spec.guard, values, correction.module, rows.q, rows.counts
-            )
+            guard = fit_guard(spec.guard, values, correction.module, rows.q, rows.counts)
         corrections.append(type(correction)(correction.module, guard))
     directions = rows.directions
     tested = plane = None

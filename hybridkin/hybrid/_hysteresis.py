@@ -183,8 +183,6 @@ def continued(hysteresis: Hysteresis, rows: Rows, past: Past) -> tuple[NDArray, 
         steps = None
         if rows.timed:
             steps = np.diff(in_run, prepend=last.time)
-        moved[rows_of_run], state = hysteresis.apply(
-            rows.X[rows_of_run], last.state, steps
-        )
+        moved[rows_of_run], state = hysteresis.apply(rows.X[rows_of_run], last.state, steps)
         past = Past(run, float(in_run[-1]), state)
     return moved, past

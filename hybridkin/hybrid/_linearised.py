@@ -54,9 +54,7 @@ class Products:
             columns = self.phi[rows].T.copy()
             block = np.empty((_pairs(len(columns)), columns.shape[1]))
             for k, column in enumerate(columns):
-                np.multiply(
-                    columns[: k + 1], column, out=block[_pairs(k) : _pairs(k + 1)]
-                )
+                np.multiply(columns[: k + 1], column, out=block[_pairs(k) : _pairs(k + 1)])
             yield rows, block
 
 

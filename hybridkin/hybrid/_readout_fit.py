@@ -40,16 +40,10 @@ class ReadoutFit(NamedTuple):
 
     readout: Readout
     alphas: Pair  # of the linear and of the other features; infinity: features not used
-    residual: (
-        NDArray  # (N, m) [m], of every row from a fit without that row, or its group
-    )
+    residual: NDArray  # (N, m) [m], of every row from a fit without that row, or its group
     scores: dict[Pair, float]  # mean squared held-out distance [m^2], by alphas
-    gradient: (
-        float  # of the objective at the optimum, relative to that without a correction
-    )
-    noise_ratio: float = (
-        inf  # variance of tips over that of actuators; infinity: tips only
-    )
+    gradient: float  # of the objective at the optimum, relative to that without a correction
+    noise_ratio: float = inf  # variance of tips over that of actuators; infinity: tips only
     rmse: float = nan  # weighted root mean square length of `residual` [m]
 
 
@@ -236,11 +230,7 @@ class _ReadoutProblem:
         """Return the ratio with the largest likelihood of residuals (N, m) [m] as normal noise."""
         spread, axes = self._principal_noise
         squares = (axes.mT @ residual[..., None])[..., 0].square()
-        weights = (
-            self.root.square()
-            * self.seen.all(1, keepdim=True)
-            * torch.ones_like(squares)
-        )
+        weights = self.root.square() * self.seen.all(1, keepdim=True) * torch.ones_like(squares)
         total = weights.sum()
         mean = (weights * spread).sum() / weights.sum()
 
@@ -273,9 +263,7 @@ class _ReadoutProblem:
     def penalty(self, alphas: Pair) -> Tensor:
         """Return the penalty of every feature (K,)."""
         n = self.features.n_linear
-        return self.phi.new_tensor(
-            [alphas[0]] * n + [alphas[1]] * (self.phi.shape[1] - n)
-        )
+        return self.phi.new_tensor([alphas[0]] * n + [alphas[1]] * (self.phi.shape[1] - n))
 
     def linearised(self, readout: Tensor) -> Linearised:
         """Return the ridge problem linearised about a readout (C, K); the last one is cached."""
@@ -308,10 +296,7 @@ class _ReadoutProblem:
         readout = torch.where(taking_part, readout, 0.0)
         weight = torch.where(taking_part, penalty, 0.0)
         value, slope = self._value_and_slope(readout, weight, taking_part)
-        scale = (
-            float(self._value_and_slope(self.nothing, weight, taking_part)[1].norm())
-            or 1.0
-        )
+        scale = float(self._value_and_slope(self.nothing, weight, taking_part)[1].norm()) or 1.0
         pairs: list[tuple[Tensor, Tensor]] = []
         factor: tuple[Tensor, Tensor] | None = None
         step_size = 1.0
@@ -327,9 +312,7 @@ class _ReadoutProblem:
             step = -_linearised.quasi_newton(slope, pairs, factor)
             step_size = 1.0
             descent = float((slope * step).sum())
-            while (
-                step_size > 1e-6
-            ):  # a full step may overshoot, as the tip is nonlinear
+            while step_size > 1e-6:  # a full step may overshoot, as the tip is nonlinear
                 tried = readout + step_size * step
                 new, new_slope = self._value_and_slope(tried, weight, taking_part)
                 if new <= (1.0 + 1e-14) * value + 1e-4 * step_size * descent:
@@ -365,9 +348,7 @@ class _ReadoutProblem:
         """Return residuals (N, m) [m] and Jacobians (N, m, C) at z, zero for missing markers."""
         tip, J = self._tips(z)
         seen = self.seen
-        return torch.where(seen, self.x - tip, 0.0), torch.where(
-            seen[..., None], J, 0.0
-        )
+        return torch.where(seen, self.x - tip, 0.0), torch.where(seen[..., None], J, 0.0)
 
     def _whitened(self, values: Tensor) -> Tensor:
         """Return values (N, m) or (N, m, C) in units of noise, times the roots of the weights."""

@@ -201,6 +201,4 @@ def _numbered(names: NDArray) -> NDArray:
 
 def rare_marker(k: int) -> ValueError:
     """Return the error for a marker that too few rows hold."""
-    return ValueError(
-        f"`y` must hold marker {k} in at least 2 rows; remove that marker."
-    )
+    return ValueError(f"`y` must hold marker {k} in at least 2 rows; remove that marker.")

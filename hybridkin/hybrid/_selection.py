@@ -90,9 +90,7 @@ class Auto(ErrorModel):
         """Return this model for a fit that tells how many of its candidates are fitted."""
         return type(self)(self.random_state, progress)
 
-    def refinement(
-        self, spec: Spec, geometry: GeometryChoice, rows: Rows
-    ) -> Refinement:
+    def refinement(self, spec: Spec, geometry: GeometryChoice, rows: Rows) -> Refinement:
         """Return the errors of the structure, if they lower the errors on held-out rows."""
         if spec.output == "pose":
             return UNREFINED
@@ -105,9 +103,7 @@ class Auto(ErrorModel):
     def fit(self, rows: Rows, spec: Spec) -> FittedError:
         """Return the candidates fitted to all rows, which fixes their penalties."""
         spec, rows = _refined(spec, rows)
-        return _side_by_side(
-            self._candidates(spec, len(rows)), rows, spec, self._progress
-        )
+        return _side_by_side(self._candidates(spec, len(rows)), rows, spec, self._progress)
 
     def _candidates(self, spec: Spec, n_rows: int) -> dict[str, ErrorModel]:
         """Return the error models by name; of equal candidates the first, simplest one wins."""
@@ -153,9 +149,7 @@ class Candidates(ErrorModel):
         self.models = models
         self.refined = refined
 
-    def refinement(
-        self, spec: Spec, geometry: GeometryChoice, rows: Rows
-    ) -> Refinement:
+    def refinement(self, spec: Spec, geometry: GeometryChoice, rows: Rows) -> Refinement:
         """Return the refinement that was chosen with the candidates."""
         return self.refined
 
@@ -295,9 +289,7 @@ def decided(fitted: FittedHybrid, rows: Rows, table: CrossFit) -> FittedHybrid:
     return FittedHybrid(spec, blend, module_of(spec, rows, blend))
 
 
-def expected_with_new_choices(
-    fitted: FittedHybrid, rows: Rows, table: CrossFit
-) -> float:
+def expected_with_new_choices(fitted: FittedHybrid, rows: Rows, table: CrossFit) -> float:
     """Return the mean distance to expect if penalties are chosen without the held-out rows [m].
 
     Of few rows or motions, penalties that suit the held-out rows would make it too small. The ratio

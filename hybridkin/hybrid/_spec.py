@@ -70,9 +70,7 @@ class ErrorModel(ABC):
         """Return this model for a fit that tells how many of its candidates are fitted."""
         return self
 
-    def refinement(
-        self, spec: Spec, geometry: GeometryChoice, rows: Rows
-    ) -> Refinement:
+    def refinement(self, spec: Spec, geometry: GeometryChoice, rows: Rows) -> Refinement:
         """Return how the calibrated model is refined before this model learns its residual."""
         return UNREFINED
 
@@ -314,10 +312,7 @@ class Spec:
             tips = [None] * (rows.tips.shape[1] // 3)
         if len(tips) == 1:
             return [(rows, self)]
-        return [
-            (rows.marker(k), replace(self, mechanical=tip))
-            for k, tip in enumerate(tips)
-        ]
+        return [(rows.marker(k), replace(self, mechanical=tip)) for k, tip in enumerate(tips)]
 
 
 class FittedHybrid(NamedTuple):
@@ -339,9 +334,7 @@ class FittedHybrid(NamedTuple):
             return self.module(torch.from_numpy(X.astype(np.float64))).numpy()
 
 
-def residuals(
-    mechanical: ForwardModel | None, q: Tensor, y: NDArray, output: str
-) -> NDArray:
+def residuals(mechanical: ForwardModel | None, q: Tensor, y: NDArray, output: str) -> NDArray:
     """Return the residual, measured minus mechanical model, in the form that is learned [m]."""
     if mechanical is None:
         return y

@@ -189,9 +189,7 @@ def _numbers_of_rows(sample_weight: ArrayLike, n_rows: int) -> NDArray:
             f"{sample_weight!r:.80}."
         )
     if not (np.isfinite(weights).all() and (weights >= 0).all() and weights.any()):
-        raise ValueError(
-            "`sample_weight` must be finite, not negative, and positive for some row."
-        )
+        raise ValueError("`sample_weight` must be finite, not negative, and positive for some row.")
     return weights.astype(float)
 
 

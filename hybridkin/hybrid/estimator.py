@@ -563,9 +563,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """Return the learned part w(q) eps(q), shaped like `predict` [m], rotations [rad]."""
         return self._evaluated(self._tip_errors, X, warn=False)[0]
 
-    def score(
-        self, X: object, y: ArrayLike, sample_weight: ArrayLike | None = None
-    ) -> float:
+    def score(self, X: object, y: ArrayLike, sample_weight: ArrayLike | None = None) -> float:
         """Return R^2 of `predict`, averaged over the columns of y, without missing markers.
 
         Of rows of weight 0, y is ignored; with `hysteresis` they move the actuators.
@@ -672,16 +670,12 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         rows = check_inputs(self, commands.q)
         if not self.hysteresis_ or not len(rows):
             return rows
-        return self.hysteresis_.apply_by_group(
-            rows, commands.run_of_rows, commands.time
-        )
+        return self.hysteresis_.apply_by_group(rows, commands.run_of_rows, commands.time)
 
     def error_weight(self, X: object) -> NDArray:
         """Return the weight w(q) in [0, 1] of the error model at each row, shape (N,)."""
         weight = as_forward_model(self.fitted_module_.error_weight)
-        return self._evaluated(
-            lambda q: evaluate(weight, q + self.change_.shift), X, warn=False
-        )[0]
+        return self._evaluated(lambda q: evaluate(weight, q + self.change_.shift), X, warn=False)[0]
 
     @property
     def hysteresis_(self) -> Hysteresis:
@@ -717,9 +711,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
     @property
     def _robot(self) -> ForwardModel:
         """The mechanical model; without one the module, which knows no robot either."""
-        return (
-            self.module_ if self.mechanical_model_ is None else self.mechanical_model_
-        )
+        return self.module_ if self.mechanical_model_ is None else self.mechanical_model_
 
     def _check_commands(self, rows: Rows) -> None:
         """Raise if actuator vectors have another unit than those of the fit."""
@@ -764,9 +756,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         rows = check_inputs(self, commands.q)
         low, high = states_of_log.shifted(-self.change_.shift)
         seen = np.ones(len(commands), dtype=bool)
-        states = self.hysteresis_.each_inner_state(
-            rows, commands.run_of_rows, commands.time
-        )
+        states = self.hysteresis_.each_inner_state(rows, commands.run_of_rows, commands.time)
         for k, state in enumerate(states):
             seen &= ((low[k] <= state) & (state <= high[k])).all(axis=1)
         if self._fit.pace is not None and commands.time is not None:
@@ -808,9 +798,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if not self.hysteresis_ and "feature_names_in_" not in vars(self):
             self._plain_rows = self._plausible_rows
 
-    def _tips(
-        self, q: NDArray, enough: float = 0.0, **results: bool
-    ) -> tuple[NDArray, ...]:
+    def _tips(self, q: NDArray, enough: float = 0.0, **results: bool) -> tuple[NDArray, ...]:
         """Return the tips of rows q (N, n), or other `results` of `evaluate`."""
         model = in_columns(self.module_, self.output)
         return evaluate(model, q, enough=enough, **results)

@@ -60,9 +60,7 @@ def calmed(z: Tensor, task: Tensor, calm: Tensor) -> Tensor:
     return share.nan_to_num(1.0)[..., None] * z
 
 
-def box_limited_step(
-    problem: BoxProblem, mu: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
+def box_limited_step(problem: BoxProblem, mu: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """Return the exact minimiser of |dq - z|^2 + |J dq - v|^2 / lambda^2 in the box.
 
     The minimiser is dq(mu) = clip(z + J^T mu, lower, upper), where mu in R^m is the root of
@@ -188,9 +186,7 @@ def strict_box_step(problem: BoxProblem, calm: Tensor) -> Tensor:
     return _proximal_box_step(problem, floor, centre)[0]
 
 
-def _proximal_box_step(
-    problem: BoxProblem, floor: Tensor, centre: Tensor
-) -> tuple[Tensor, Tensor]:
+def _proximal_box_step(problem: BoxProblem, floor: Tensor, centre: Tensor) -> tuple[Tensor, Tensor]:
     """Return `box_limited_step` for any lambda^2 >= 0, without the effect of the floor.
 
     Every round solves J dq + used mu = v + (used - lambda^2) mu_last. At the fixed point

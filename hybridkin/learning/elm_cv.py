@@ -128,10 +128,7 @@ class ELMRegressorCV(FittedNetwork):
         "cv": ["cv_object"],
         "relevance_rounds": [Interval(Integral, 0, None, closed="left")],
         "max_hidden": [Interval(Integral, 0, None, closed="left")],
-        **{
-            name: ELMRegressor._parameter_constraints[name]
-            for name in (*_SHARED, "random_state")
-        },
+        **{name: ELMRegressor._parameter_constraints[name] for name in (*_SHARED, "random_state")},
     }
 
     def __init__(
@@ -242,9 +239,7 @@ class ELMRegressorCV(FittedNetwork):
         """Return the description of the chosen ELMRegressor."""
         check_is_fitted(self, "module_")
         chosen = self.best_estimator_.stored()
-        chosen.settings["feature_names_in"] = plain(
-            vars(self).get("feature_names_in_", [])
-        )
+        chosen.settings["feature_names_in"] = plain(vars(self).get("feature_names_in_", []))
         return chosen
 
 

@@ -73,9 +73,7 @@ def other_direction(counts: Sequence[int]) -> list[int]:
     return order
 
 
-def _reordered(
-    declared: NDArray, columns: Sequence[int], order: Sequence[int]
-) -> NDArray:
+def _reordered(declared: NDArray, columns: Sequence[int], order: Sequence[int]) -> NDArray:
     """Return the way with some columns in another order."""
     way = declared.copy()
     way[:, columns] = declared[:, order]
@@ -91,9 +89,7 @@ def _segments_listed(counts: Sequence[int], listed: Sequence[int]) -> list[int]:
     return order
 
 
-def misses(
-    chain: LengthDrivenChain, qs: NDArray, x: NDArray, base_is_free: bool
-) -> NDArray:
+def misses(chain: LengthDrivenChain, qs: NDArray, x: NDArray, base_is_free: bool) -> NDArray:
     """Return for each q (N, n) of qs (K, N, n) the relative error of the chain's tips.
 
     This is the rms distance of the tips x (N, 3) from those of the chain, after the best shift (for
@@ -122,9 +118,7 @@ def base_turn(chain: LengthDrivenChain, q: NDArray, x: NDArray) -> tuple[float, 
     return float(np.degrees(twist)), float(np.degrees(tilt))
 
 
-def _centred(
-    chain: LengthDrivenChain, qs: NDArray, x: NDArray
-) -> tuple[NDArray, NDArray]:
+def _centred(chain: LengthDrivenChain, qs: NDArray, x: NDArray) -> tuple[NDArray, NDArray]:
     """Return the tips (K, N, 3) of the chain and the measured ones, each minus their mean."""
     rows = torch.from_numpy(np.ascontiguousarray(qs, dtype=np.float64))
     with torch.no_grad():

@@ -155,9 +155,7 @@ def write(text: str, to: TextIO, *, end: str = "\n", indent: str = "") -> None:
 
     Further lines are indented, so that none looks like one of its own.
     """
-    print(
-        visible_lines(text).replace("\n", f"\n{indent}"), end=end, file=to, flush=True
-    )
+    print(visible_lines(text).replace("\n", f"\n{indent}"), end=end, file=to, flush=True)
 
 
 def _in_words(seconds: float) -> str:

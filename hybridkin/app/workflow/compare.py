@@ -356,9 +356,7 @@ def compare(
     CrossFit
         The models by kind, without the calibrated model with backlash if there is no hysteresis.
     """
-    with (
-        warnings.catch_warnings()
-    ):  # the report and the mechanical model say what matters
+    with warnings.catch_warnings():  # the report and the mechanical model say what matters
         warnings.simplefilter("ignore")
         compared = cross_fit(
             models_of(robot, mechanical, settings),
@@ -378,9 +376,7 @@ def compare(
     if not settings.follows_order:  # it is the calibrated model
         tips.pop(BACKLASH, None)
     names = sorted(tips, key=lambda name: _KINDS.index(name.partition(",")[0]))
-    return replace(
-        compared, names=tuple(names), tips=np.array([tips[name] for name in names])
-    )
+    return replace(compared, names=tuple(names), tips=np.array([tips[name] for name in names]))
 
 
 def _models_for(

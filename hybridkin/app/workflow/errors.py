@@ -137,9 +137,7 @@ class Promise:
         """Return the promise from errors (N,) of held-out rows and their distances (N,)."""
         columns = np.column_stack([np.ones_like(errors), distances])
         at_rows, per_distance = scipy.optimize.nnls(columns, errors)[0]
-        if (
-            at_rows == 0.0
-        ):  # a robot without error at the rows of its log is not credible
+        if at_rows == 0.0:  # a robot without error at the rows of its log is not credible
             at_rows = errors.mean()
             per_distance = 0.0
         if at_rows == 0.0:  # no errors at all

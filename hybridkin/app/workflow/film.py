@@ -76,9 +76,7 @@ def animate_track(
         n_frames=n_frames,
     )
     try:
-        film.save(
-            out, unit=unit, speed=speed, progress=partial(progress, "drawing frames")
-        )
+        film.save(out, unit=unit, speed=speed, progress=partial(progress, "drawing frames"))
     except RuntimeError as error:  # no program to write films with
         raise ValueError(str(error)) from error
     fps = speed * film.fps

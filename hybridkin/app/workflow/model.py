@@ -55,9 +55,7 @@ def domain_distance(model: HybridForwardModel, q: NDArray) -> NDArray:
     return native.evaluate(tip, q, value=False, distance=True)[0]
 
 
-def commands_for(
-    model: HybridForwardModel, q: NDArray, time: NDArray | None = None
-) -> NDArray:
+def commands_for(model: HybridForwardModel, q: NDArray, time: NDArray | None = None) -> NDArray:
     """Return the commands (N, n) that move the actuators along q (N, n), row after row.
 
     The times (N,) of the rows matter with creep [s]; without them the robot rests at each row.

@@ -176,9 +176,7 @@ def _outcome(record: TrackRecord, better: str) -> str:
         by = millimetres(record.missed_by, ".2g")
         words += f"; missed: {record.missed}, by up to {by}"
     if not record.expected:
-        unknown = (
-            "The error of the robot is not known: the model has no held-out errors"
-        )
+        unknown = "The error of the robot is not known: the model has no held-out errors"
         return f"{words}. {unknown}{better}."
     mean = millimetres(record.expected["mean"], ".2g")
     p95 = millimetres(record.expected["p95"], ".2g")
@@ -482,9 +480,7 @@ def best_track(
 def _in_steps(path: trajectories.Trajectory, n: int) -> trajectories.Trajectory:
     """Return the path with every segment between two points cut into n."""
     places = np.arange((len(path) - 1) * n + 1) / n
-    return trajectories.interpolated(
-        path, np.interp(places, np.arange(len(path)), path.t)
-    )
+    return trajectories.interpolated(path, np.interp(places, np.arange(len(path)), path.t))
 
 
 def _thinned(track: Track, every: int) -> Track:
@@ -532,9 +528,7 @@ def _steps(track: Track) -> NDArray:
     return np.diff(track.t, prepend=track.t[0])
 
 
-def _with_commands(
-    track: Track, q: NDArray, domain: Domain, tol: float, state: Any
-) -> Track:
+def _with_commands(track: Track, q: NDArray, domain: Domain, tol: float, state: Any) -> Track:
     """Return a track with commands q (N, n) that are sent alone, and what they do."""
     model = domain.model
     effective = q
@@ -569,9 +563,7 @@ def read_track(path: str | Path, log_format: robots.LogFormat) -> Log:
     if file.is_dir():
         file = file / "track.csv"
     if not file.is_file():
-        raise FileNotFoundError(
-            f"`track` must be a file of commands, there is none at {file}."
-        )
+        raise FileNotFoundError(f"`track` must be a file of commands, there is none at {file}.")
     columns = replace(log_format, groups=None)
     with open(file, encoding="utf-8", errors="replace") as text:
         first_line = text.readline().rstrip("\n")
@@ -613,9 +605,7 @@ def _text(values: NDArray, digits: int = 9) -> NDArray:
     return np.char.mod(f"%.{digits}g", values + 0.0).T  # no -0
 
 
-def _add_path(
-    report: Report[TrackRecord], model: HybridForwardModel, track: Track
-) -> None:
+def _add_path(report: Report[TrackRecord], model: HybridForwardModel, track: Track) -> None:
     plots = hybridkin.plots
     figure, axes = plots.new_figure(11.0, 4.6, 1, 3)
     display = plots.TrackingDisplay.from_tracks({f"solver on {kind_of(model)}": track})
@@ -645,17 +635,13 @@ def _add_commands(
     rings = model.module_.tip_model.robot.rings or (slice(0, model.n_features_in_),)
     counts = [ring.stop - ring.start for ring in rings]
     n = len(counts)
-    figure, axes = hybridkin.plots.new_figure(
-        7.0, 1.0 + 1.8 * n, n, 1, sharex=True, squeeze=False
-    )
+    figure, axes = hybridkin.plots.new_figure(7.0, 1.0 + 1.8 * n, n, 1, sharex=True, squeeze=False)
     low, high = domain.limits.commands
     display = hybridkin.plots.ActuatorDisplay(
         commands, counts, t, names=log_format.q, limits=np.stack([low, high])
     )
     display.plot(axes[:, 0], unit=log_format.q_unit, per_unit=log_format.q_factor)
-    caption = (
-        "Commands and their limits, with the names, unit and sign of the robot's logs."
-    )
+    caption = "Commands and their limits, with the names, unit and sign of the robot's logs."
     if n_lead:
         for ax in axes[:, 0]:
             ax.axvline(t[n_lead], color="0.6", linewidth=1.0)

@@ -121,9 +121,7 @@ class Verification:
         if self.kept:
             report.text("The promise is kept.")
         elif self.cause is None:
-            report.text(
-                "None of the known causes explains the error; check load and friction."
-            )
+            report.text("None of the known causes explains the error; check load and friction.")
         else:
             report.text(f"Likely cause: {self.cause}. To do: {self.remedy}.")
             if self.amount:
@@ -225,9 +223,7 @@ def verify_track(
     rows = rows[used]
     x = x[used]
     if len(rows) < 3:
-        raise ValueError(
-            f"`log` must have at least 3 measured tips of the path, got {len(rows)}."
-        )
+        raise ValueError(f"`log` must have at least 3 measured tips of the path, got {len(rows)}.")
     q = motion[rows]
     predicted = tips_at(model, q)
     later = None
@@ -272,9 +268,7 @@ def verify_track(
         delay=delay,
         later=later,
     )
-    title = (
-        f"{model.description_.name}: {Path(track).name} against {Path(log.source).name}"
-    )
+    title = f"{model.description_.name}: {Path(track).name} against {Path(log.source).name}"
     report = Report(title, record)
     record._write(report)
     if out is not None:
@@ -426,9 +420,7 @@ def _off_plane(model: HybridForwardModel, q: NDArray) -> NDArray:
     return np.where(np.abs(off).max() > _OFF * np.ptp(q, axis=0).max(), off, 0.0)
 
 
-def read_tips(
-    path: str | Path, log_format: robots.LogFormat, delimiter: str | None = None
-) -> Log:
+def read_tips(path: str | Path, log_format: robots.LogFormat, delimiter: str | None = None) -> Log:
     """Return the tips of a file of a camera, which holds none of the commands.
 
     Parameters

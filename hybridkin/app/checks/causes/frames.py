@@ -114,9 +114,7 @@ class MovedBase(Cause):
         """Return no motion: the matrix (3, 4), row by row."""
         return [np.eye(3, 4).ravel()]
 
-    def fit(
-        self, evidence: Evidence, used: NDArray, start: NDArray, rounds: int
-    ) -> NDArray:
+    def fit(self, evidence: Evidence, used: NDArray, start: NDArray, rounds: int) -> NDArray:
         """Return the rigid motion (12,) that brings some rows nearest to the measured tips."""
         rows = used & self.moved_rows(evidence)
         if rows.sum() < 3:
