@@ -1,4 +1,4 @@
-"""The rotations that bring points nearest to others, also for mirror images and points in a plane."""
+"""Rotations that bring points nearest to others, also for mirror images and points in a plane."""
 
 import numpy as np
 from numpy.testing import assert_allclose
