@@ -37,8 +37,7 @@ AVX2 = "-mavx2 -mfma"
 X86 = {
     "v2": "-msse4.2 -O2",  # for old processors: compiled in half the time
     "v3": AVX2,
-    "v4": AVX2
-    + " -mavx512f -mavx512cd -mavx512bw -mavx512dq -mavx512vl -mprefer-vector-width=512",
+    "v4": AVX2 + " -mavx512f -mavx512cd -mavx512bw -mavx512dq -mavx512vl -mprefer-vector-width=512",
 }
 
 
@@ -149,18 +148,14 @@ class KernelsHook(BuildHookInterface):  # pyright: ignore[reportGeneralTypeIssue
         try:
             made = compile_into(folder, target, [])
         except OSError as error:
-            sys.stderr.write(
-                f"hybridkin: installed without compiled kernels; {error}\n"
-            )
+            sys.stderr.write(f"hybridkin: installed without compiled kernels; {error}\n")
             return
         if version != "editable":
             build_data.update(pure_python=False, tag=f"py3-none-{target}")
             places = {str(path): f"hybridkin/native/lib/{path.name}" for path in made}
             build_data["force_include"].update(places)
 
-    def finalize(
-        self, version: str, build_data: dict[str, Any], artifact_path: str
-    ) -> None:
+    def finalize(self, version: str, build_data: dict[str, Any], artifact_path: str) -> None:
         """Remove what was compiled for the wheel alone."""
         shutil.rmtree(self.work)
 

@@ -31,9 +31,7 @@ train, test = datasets.paper_split(data, random_state=0)
 # `fit` first calibrates the radii of the rings and the pose of the base. The network then learns
 # the residual. The errors are those of held-out rows.
 
-model = HybridForwardModel(
-    robots.bionic_handling_assistant(), calibrate="default", random_state=0
-)
+model = HybridForwardModel(robots.bionic_handling_assistant(), calibrate="default", random_state=0)
 model.fit(data.q[train], data.x[train])
 predictions = {
     "mechanical, calibrated": model.predict_mechanical(data.q[test]),
@@ -69,8 +67,6 @@ plt.show()
 
 figure = plt.figure(figsize=(6, 4.6), layout="constrained")
 chain = model.mechanical_model_
-film = plots.TrackAnimation.from_estimator(
-    chain, track.q, target=path.x, t=path.t, tips=track.x
-)
+film = plots.TrackAnimation.from_estimator(chain, track.q, target=path.x, t=path.t, tips=track.x)
 film.plot(figure.add_subplot(projection="3d"), frame=60)
 plt.show()

@@ -90,9 +90,7 @@ def tip_error(model):
 
 def bounds_by_dask(client, blocks, n_rows):
     """Return the least and the largest inputs (2, 9) of all blocks [m]."""
-    ends = np.array(
-        client.gather(client.map(bounds_of, blocks, n_rows=n_rows, pure=False))
-    )
+    ends = np.array(client.gather(client.map(bounds_of, blocks, n_rows=n_rows, pure=False)))
     return np.array([ends[:, 0].min(axis=0), ends[:, 1].max(axis=0)])
 
 
@@ -107,9 +105,7 @@ def fit_by_dask(client, blocks, n_rows, bounds):
         left, right, odd = slice(0, -1, 2), slice(1, None, 2), len(models) // 2 * 2
         pairs = client.map(merged, models[left], models[right], pure=False)
         models = pairs + models[odd:]
-        sizes = [a + b for a, b in zip(sizes[left], sizes[right], strict=True)] + sizes[
-            odd:
-        ]
+        sizes = [a + b for a, b in zip(sizes[left], sizes[right], strict=True)] + sizes[odd:]
 
 
 # %%
@@ -165,9 +161,7 @@ def draw(tree, curve, seconds):
     rows, n_features = curve[:, 0], NETWORK["n_hidden"] + 9 + 1
     law = NOISE * np.sqrt(3 * n_features / rows)
     axes[0].plot(rows, 1e3 * law, "--", color="0.6", label="noise alone, no penalty")
-    axes[0].plot(
-        rows, 1e3 * curve[:, 1], color="#0072B2", label="one machine, chunk after chunk"
-    )
+    axes[0].plot(rows, 1e3 * curve[:, 1], color="#0072B2", label="one machine, chunk after chunk")
     axes[0].plot(
         *(tree * [1, 1e3]).T,
         "o",
@@ -181,9 +175,7 @@ def draw(tree, curve, seconds):
     axes[0].minorticks_off()
     axes[0].set_yticks(ticks, [f"{tick:g}" for tick in ticks])
     axes[0].legend(fontsize="small")
-    parts = zip(
-        seconds.T, ("bounds", "fit and merge"), ("#56B4E9", "#D55E00"), strict=True
-    )
+    parts = zip(seconds.T, ("bounds", "fit and merge"), ("#56B4E9", "#D55E00"), strict=True)
     bottom, workers = np.zeros(2), ("1 worker", "2 workers")
     for time_taken, label, color in parts:
         axes[1].bar(workers, time_taken, 0.6, bottom, color=color, label=label)
@@ -201,16 +193,12 @@ if __name__ == "__main__":  # each worker imports this file
         print('Skipped: this example needs dask; pip install "hybridkin[dask]".')
     else:
         with (
-            LocalCluster(
-                n_workers=1, threads_per_worker=1, dashboard_address=None
-            ) as cluster,
+            LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster,
             Client(cluster) as client,
         ):
             model, looped, tree, curve, seconds = compare(cluster, client)
         n_rows, n_features = curve[-1, 0], len(model.output_weights_)
-        print(
-            f"{n_rows:.0f} rows; all their features: {8e-9 * n_features * n_rows:.1f} GB"
-        )
+        print(f"{n_rows:.0f} rows; all their features: {8e-9 * n_features * n_rows:.1f} GB")
         (q, _), start = chunk(10**9, 4000), time.perf_counter()
         merged(model, looped)
         merge_time = time.perf_counter() - start
@@ -221,11 +209,7 @@ if __name__ == "__main__":  # each worker imports this file
         ):
             print(f"  {what}: {relative_difference(a, b):.0e}")
         for n_workers, (first, second) in enumerate(seconds, 1):
-            print(
-                f"workers: {n_workers}; bounds {first:.1f} s, fit and merge {second:.1f} s"
-            )
-        print(
-            f"one merge: {1e3 * merge_time:.0f} ms, most of it to solve for the readout"
-        )
+            print(f"workers: {n_workers}; bounds {first:.1f} s, fit and merge {second:.1f} s")
+        print(f"one merge: {1e3 * merge_time:.0f} ms, most of it to solve for the readout")
         figure = draw(tree, curve, seconds)
         plt.show()

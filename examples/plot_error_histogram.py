@@ -35,9 +35,7 @@ found = {
 
 display = plots.ErrorHistogramDisplay.from_predictions(data.x[test], found)
 for name, errors in display.errors.items():
-    print(
-        f"{name}: mean {100 * errors.mean():.2f} cm, largest {100 * errors.max():.1f} cm"
-    )
+    print(f"{name}: mean {100 * errors.mean():.2f} cm, largest {100 * errors.max():.1f} cm")
 figure, ax = plt.subplots(figsize=(8, 4), layout="constrained")
 display.plot(ax)
 plt.show()

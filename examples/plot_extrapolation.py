@@ -36,16 +36,12 @@ models = {name: hybrid(guard) for name, guard in guards.items()}
 # combinations of lengths are in the training data.
 
 predictions = {
-    "mechanical, calibrated": models["hybrid, no guard"].predict_mechanical(
-        data.q[test]
-    )
+    "mechanical, calibrated": models["hybrid, no guard"].predict_mechanical(data.q[test])
 }
 predictions |= {name: model.predict(data.q[test]) for name, model in models.items()}
 errors = plots.ErrorBoxDisplay.from_predictions(data.x[test], predictions)
 for name, values in errors.errors.items():
-    print(
-        f"{name}: mean {1e3 * values.mean():.1f} mm, largest {1e3 * values.max():.0f} mm"
-    )
+    print(f"{name}: mean {1e3 * values.mean():.1f} mm, largest {1e3 * values.max():.0f} mm")
 
 # %%
 # Length of the learned correction on straight lines from training rows to test rows: median and
@@ -56,12 +52,8 @@ start, end = data.q[rng.choice(train, 60)], data.q[rng.choice(test, 60)]
 share = np.linspace(0.0, 1.0, 41)
 ways = (start + share[:, None, None] * (end - start)).reshape(-1, 9)
 
-figure, axes = plt.subplots(
-    1, 2, figsize=(11, 4.2), width_ratios=(1, 1.1), layout="constrained"
-)
-for (name, model), color in zip(
-    models.items(), ("0.6", plots.model_color("hybrid")), strict=True
-):
+figure, axes = plt.subplots(1, 2, figsize=(11, 4.2), width_ratios=(1, 1.1), layout="constrained")
+for (name, model), color in zip(models.items(), ("0.6", plots.model_color("hybrid")), strict=True):
     length = 1e3 * np.linalg.norm(model.predict_error(ways), axis=1).reshape(41, 60)
     low, median, high = np.quantile(length, [0.1, 0.5, 0.9], axis=1)
     axes[0].plot(100 * share, median, color=color, label=name, linewidth=2)

@@ -44,9 +44,7 @@ candidates = {
 }
 for name, model in candidates.items():
     errors = -cross_val_score(model, q, x, groups=groups, cv=folds, scoring=score)
-    print(
-        f"{name}: {errors.mean():.1f} mm, folds {errors.min():.1f} to {errors.max():.1f}"
-    )
+    print(f"{name}: {errors.mean():.1f} mm, folds {errors.min():.1f} to {errors.max():.1f}")
 
 # %%
 # A grid over the coupling and over parameters of the network. With small penalties, networks make
@@ -78,9 +76,7 @@ for where in ("parallel", "serial"):
             -results["mean_test_score"][some],
             results["std_test_score"][some],
         )
-        ax.plot(
-            alpha[some], mean, style, color=color, label=f"{where}, {n_hidden} neurons"
-        )
+        ax.plot(alpha[some], mean, style, color=color, label=f"{where}, {n_hidden} neurons")
         if n_hidden == 100:
             ax.fill_between(
                 alpha[some],

@@ -43,9 +43,7 @@ def simulated_log(n_motions=60, n_rows=25, seed=0):
         bending_stiffness=0.15 * RADII**2,
         rest_bends=0.05,
     )
-    bends = rng.normal(0.0, 0.5, (n_motions, 1, 3, 2)) * (
-        rng.random((n_motions, 1, 3, 1)) < 0.6
-    )
+    bends = rng.normal(0.0, 0.5, (n_motions, 1, 3, 2)) * (rng.random((n_motions, 1, 3, 1)) < 0.6)
     way = np.sin(np.linspace(0.0, np.pi, n_rows))[None, :, None, None]
     # Out and back.
     bends = way * bends + rng.normal(0.0, 0.01, (n_motions, n_rows, 3, 2))
@@ -81,9 +79,7 @@ parameters = ("base", "tool", "radii", "lengths")
 models = {
     "mechanical, calibrated": HybridForwardModel(chain, "drop", calibrate=parameters),
     "data-driven, kernel ridge": HybridForwardModel(None, kernel_ridge, guard=None),
-    "hybrid, kernel ridge": HybridForwardModel(
-        chain, kernel_ridge, calibrate=parameters
-    ),
+    "hybrid, kernel ridge": HybridForwardModel(chain, kernel_ridge, calibrate=parameters),
 }
 
 
@@ -105,15 +101,11 @@ ways = {
     "held-out random rows": list(KFold(5, shuffle=True, random_state=0).split(q)),
     "held-out motions": list(GroupKFold(5).split(q, groups=groups)),
 }
-figure, axes = plt.subplots(
-    1, 2, figsize=(11, 3.4), sharex=True, sharey=True, layout="constrained"
-)
+figure, axes = plt.subplots(1, 2, figsize=(11, 3.4), sharex=True, sharey=True, layout="constrained")
 for ax, (way, folds) in zip(axes, ways.items(), strict=True):
     errors = {name: held_out(model, folds) for name, model in models.items()}
     for name, values in errors.items():
-        print(
-            f"{way}, {name}: mean {1e3 * values.mean():.1f} mm, max {1e3 * values.max():.0f}"
-        )
+        print(f"{way}, {name}: mean {1e3 * values.mean():.1f} mm, max {1e3 * values.max():.0f}")
     plots.ErrorBoxDisplay(errors).plot(ax, unit="mm", log=True)
     ax.set_title(way)
 axes[0].set_xlim(0.3, 300)

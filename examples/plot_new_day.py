@@ -73,12 +73,8 @@ def errors(what, seed):
         "adapt": copy.deepcopy(fitted).adapt(*today),
         "fitted anew": again,
     }
-    misses = {
-        name: m.predict(read(q_test)) - move(x_test) for name, m in models.items()
-    }
-    return {
-        name: 1e3 * np.linalg.norm(miss, axis=1).mean() for name, miss in misses.items()
-    }
+    misses = {name: m.predict(read(q_test)) - move(x_test) for name, m in models.items()}
+    return {name: 1e3 * np.linalg.norm(miss, axis=1).mean() for name, miss in misses.items()}
 
 
 CHANGES = ("nothing", "zeros", "base", "both")
@@ -96,12 +92,8 @@ colors = {
 }
 for k, (name, color) in enumerate(colors.items()):
     means = {what: np.mean([draw[name] for draw in table[what]]) for what in CHANGES}
-    print(
-        f"{name:12}", "  ".join(f"{what} {mean:.1f} mm" for what, mean in means.items())
-    )
-    axes.bar(
-        np.arange(4) + 0.2 * (k - 1.5), means.values(), 0.18, color=color, label=name
-    )
+    print(f"{name:12}", "  ".join(f"{what} {mean:.1f} mm" for what, mean in means.items()))
+    axes.bar(np.arange(4) + 0.2 * (k - 1.5), means.values(), 0.18, color=color, label=name)
 axes.set_xticks(range(4), CHANGES)
 axes.set(xlabel="what has changed", ylabel="mean tip error [mm]", ylim=(0, 80))
 axes.legend(frameon=False, ncols=4, loc="upper left")

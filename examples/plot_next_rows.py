@@ -29,9 +29,7 @@ chosen, expected = choose_rows(chain, data.q_target[pool], max(sizes))
 
 def errors(measured):
     """Return the mean and the largest tip error [mm] of a model fitted to these rows."""
-    model = HybridForwardModel(
-        chain, "structural", coupling="serial", calibrate="default"
-    )
+    model = HybridForwardModel(chain, "structural", coupling="serial", calibrate="default")
     model.fit(data.q[measured], data.x[measured])
     distance = np.linalg.norm(model.predict(data.q_target[test]) - data.x[test], axis=1)
     return 1e3 * distance.mean(), 1e3 * distance.max()
@@ -40,9 +38,7 @@ def errors(measured):
 draws = [np.random.default_rng(seed).permutation(pool) for seed in range(5)]
 by_choice = np.array([errors(pool[chosen[:n]]) for n in sizes])
 by_chance = np.array([[errors(draw[:n]) for n in sizes] for draw in draws])
-for n, (mean, largest), several in zip(
-    sizes, by_choice, by_chance.swapaxes(0, 1), strict=True
-):
+for n, (mean, largest), several in zip(sizes, by_choice, by_chance.swapaxes(0, 1), strict=True):
     average, spread = several.mean(0), several.std(0)
     print(
         f"{n} rows, mean (largest) error in mm: chosen {mean:.1f} ({largest:.0f}), "
@@ -60,9 +56,7 @@ for k, (ax, what) in enumerate(zip(axes, ("mean", "largest"), strict=True)):
     average, spread = by_chance[..., k].mean(0), by_chance[..., k].std(0)
     ax.plot(sizes, by_choice[:, k], "o-", color="#0072B2", label="chosen rows")
     ax.plot(sizes, average, "s--", color="0.4", label="random rows, five draws")
-    ax.fill_between(
-        sizes, average - spread, average + spread, color="0.4", alpha=0.2, linewidth=0
-    )
+    ax.fill_between(sizes, average - spread, average + spread, color="0.4", alpha=0.2, linewidth=0)
     ax.set(
         xscale="log",
         xticks=sizes,

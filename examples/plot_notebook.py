@@ -31,9 +31,7 @@ chain
 # estimates an error radius. Every fourth row of the log is enough here.
 
 data = datasets.load_trunk()
-model = HybridForwardModel(
-    chain, "pose", coupling="serial", calibrate="default", coverage=0.9
-)
+model = HybridForwardModel(chain, "pose", coupling="serial", calibrate="default", coverage=0.9)
 model.fit(data.q[::4], data.x[::4])
 
 # %%

@@ -34,9 +34,7 @@ payload_from = len(path.x)
 def fitted():
     """Return the serial hybrid model: the error acts inside the robot."""
     chain = robots.bionic_handling_assistant()
-    model = HybridForwardModel(
-        chain, "quadratic", coupling="serial", calibrate="default"
-    )
+    model = HybridForwardModel(chain, "quadratic", coupling="serial", calibrate="default")
     return model.fit(data.q, data.x)
 
 
@@ -79,9 +77,7 @@ def run(learn):
 if importlib.util.find_spec("mujoco") is None:
     print('Skipped: this example needs MuJoCo; pip install "hybridkin[sim]".')
 else:
-    figure, axes = plt.subplots(
-        1, 2, figsize=(9, 3.6), width_ratios=[1, 1.5], layout="constrained"
-    )
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.6), width_ratios=[1, 1.5], layout="constrained")
     axes[0].plot(100 * targets[:, 0], 100 * targets[:, 1], "k:", label="path")
     time = 0.1 * np.arange(len(targets))
     for learn, color, name in (
@@ -99,9 +95,7 @@ else:
         smooth = np.convolve(error, np.ones(5) / 5, "same")
         axes[1].plot(time, error, ".", color=color, alpha=0.3, markersize=3)
         style = "-" if learn else "--"
-        axes[1].plot(
-            time[2:-2], smooth[2:-2], style, color=color, label=name, zorder=3 - learn
-        )
+        axes[1].plot(time[2:-2], smooth[2:-2], style, color=color, label=name, zorder=3 - learn)
     axes[0].set(
         xlabel="x [cm]",
         ylabel="y [cm]",

@@ -62,9 +62,7 @@ real = RigidChain.from_urdf(URDF, "flange", base=base, tool=[0.015, 0.0, 0.11])
 
 def settled(q):
     """Return the joint angles (N, 6) at which the arm comes to rest [rad]."""
-    height = torch.func.vmap(
-        torch.func.jacrev(lambda one: nominal.backbone(one)[1:7, 2])
-    )
+    height = torch.func.vmap(torch.func.jacrev(lambda one: nominal.backbone(one)[1:7, 2]))
     torque = -9.81 * (height(q) * MASSES[:, None]).sum(1)
     return q + COMPLIANCE * torque
 
@@ -87,9 +85,7 @@ with torch.no_grad():
 
 models = {
     "mechanical, nominal: URDF": HybridForwardModel(nominal, "drop"),
-    "mechanical, calibrated": HybridForwardModel(
-        nominal, "drop", calibrate=("base", "tool")
-    ),
+    "mechanical, calibrated": HybridForwardModel(nominal, "drop", calibrate=("base", "tool")),
     "hybrid, error at the tip": HybridForwardModel(
         nominal, "quadratic", calibrate=("base", "tool")
     ),
@@ -101,9 +97,7 @@ errors = plots.ErrorBoxDisplay.from_predictions(
     x, {name: cross_val_predict(model, q, x, cv=10) for name, model in models.items()}
 )
 for name, values in errors.errors.items():
-    print(
-        f"{name}: mean {1e3 * values.mean():.1f} mm, largest {1e3 * values.max():.1f} mm"
-    )
+    print(f"{name}: mean {1e3 * values.mean():.1f} mm, largest {1e3 * values.max():.1f} mm")
 
 # %%
 # The last model leads the tip along a circle, by default within the limits of the URDF.
@@ -116,9 +110,7 @@ with torch.no_grad():
     reached = real(settled(torch.from_numpy(track.q))).numpy()
     arm = model.mechanical_model_.backbone(torch.from_numpy(track.q[::12]))
 error = 1e3 * np.linalg.norm(reached - circle.x, axis=1)
-print(
-    f"circle on the simulated arm: mean {error.mean():.1f} mm, largest {error.max():.1f} mm"
-)
+print(f"circle on the simulated arm: mean {error.mean():.1f} mm, largest {error.max():.1f} mm")
 
 figure = plt.figure(figsize=(11, 4.6), layout="constrained")
 left, right = figure.subfigures(1, 2, width_ratios=(1.3, 1))

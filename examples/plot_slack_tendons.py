@@ -131,9 +131,7 @@ def splits_of(data, seeds=5):
         "pairs from single segments and tendons": [(rows[~pair], rows[pair])],
     }
     for n in (20, 10):
-        drawn = [
-            np.random.default_rng(k).permutation(motions)[:n] for k in range(seeds)
-        ]
+        drawn = [np.random.default_rng(k).permutation(motions)[:n] for k in range(seeds)]
         known = [np.isin(data.groups, some) for some in drawn]
         ways[f"{n} motions"] = [(rows[k], rows[~k]) for k in known]
     return ways
@@ -153,14 +151,9 @@ def compare_tendon_models(
     data, found = datasets.load_ftdcr(data_home), {}
     for way in ways:
         splits = splits_of(data, seeds)[way]
-        jobs = (
-            delayed(without_warnings)(data, *split, models, angles, thin)
-            for split in splits
-        )
+        jobs = (delayed(without_warnings)(data, *split, models, angles, thin) for split in splits)
         results = Parallel(n_jobs=n_jobs)(jobs)
-        found[way] = [
-            (test, one) for (_, test), one in zip(splits, results, strict=True)
-        ]
+        found[way] = [(test, one) for (_, test), one in zip(splits, results, strict=True)]
     return data, found
 
 
@@ -192,30 +185,22 @@ def draw(data, results):
         ):
             rows = np.flatnonzero(many)
             ax.plot(rows, error[rows], ".", markersize=3.5, color=color, label=label)
-        ax.axhline(
-            error.mean(), color="black", linewidth=1.0, linestyle="--", label="mean"
-        )
+        ax.axhline(error.mean(), color="black", linewidth=1.0, linestyle="--", label="mean")
         title = f"{title}: mean {error.mean():.1f} mm, largest {error.max():.0f} mm"
         ax.set_title(title, loc="left", fontsize="medium")
-        ax.set(
-            ylabel="tip error, motion held out [mm]", yscale="log", xlim=(0, len(kinds))
-        )
+        ax.set(ylabel="tip error, motion held out [mm]", yscale="log", xlim=(0, len(kinds)))
         ax.set(ylim=(0.08, 130))
         ax.set_yticks([0.3, 1, 3, 10, 30, 100], ["0.3", "1", "3", "10", "30", "100"])
         ax.minorticks_off()
     for part in parts:
-        axes[1].text(
-            part.mean(), 0.095, NAMES[kinds[part[0]]], ha="center", fontsize="small"
-        )
+        axes[1].text(part.mean(), 0.095, NAMES[kinds[part[0]]], ha="center", fontsize="small")
     axes[0].legend(ncols=4, fontsize="small", loc="upper right", markerscale=2.5)
     axes[1].set(xlabel="row, in the order of time")
     return figure
 
 
 try:
-    data, found = compare_tendon_models(
-        models=("plain", "elastic"), angles=False, thin=2
-    )
+    data, found = compare_tendon_models(models=("plain", "elastic"), angles=False, thin=2)
 except FileNotFoundError as missing:
     print(f"Skipped: {missing}")
 else:

@@ -42,9 +42,7 @@ for name, row in zip(names, table, strict=True):
 
 figure, ax = plt.subplots(figsize=(8.5, 4.6), layout="constrained")
 places = np.arange(len(names))[::-1]
-train, test = (
-    100 * np.array([row[part]["mean"] for row in table]) for part in ("train", "test")
-)
+train, test = (100 * np.array([row[part]["mean"] for row in table]) for part in ("train", "test"))
 tints = [plots.model_color(name) for name in names]
 ax.hlines(places, train, test, color=tints, linewidth=2.5, alpha=0.5)
 ax.scatter(

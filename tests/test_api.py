@@ -19,7 +19,7 @@ FLOORS = [
     {"app.workflow"},
     {"app.checks"},
     {"app"},
-    {"arguments", "formats"},
+    {"arguments", "formats", "rotations"},
     {"saving"},
     {"hybrid"},
     {"hysteresis"},

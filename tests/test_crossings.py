@@ -206,7 +206,7 @@ OF_FORCES = ("robot", "forces"), ("error_model", "drop")
 EVERY_PAIR = "HYBRIDKIN_MUST_RUN" in os.environ
 CASES = pairwise(FACTORS)
 CASES += pairwise({**FACTORS, "robot": ("forces",)}, of=() if EVERY_PAIR else OF_FORCES)
-SLOW = {"auto"}  # values whose fits take more than 0.3 s
+SLOW = {"auto", "forces", "ELM-CV", "kernel"}  # values whose fits take more than 0.3 s
 
 
 class Log(NamedTuple):
@@ -329,9 +329,7 @@ def test_parts_add_up(crossing):
     columns = slice(None, 3 if case["output"] == "pose" else None)
     np.testing.assert_allclose((mechanical + error)[:, columns], whole[:, columns], atol=1e-9)
     if case["error_model"] == "drop" and case["change"] in ("none", "adapted"):
-        # Gravity stays where it is when a base turns; what the model learned of it turns.
-        sag = 1e-4 if case["robot"] == "forces" and case["change"] == "adapted" else 0.0
-        np.testing.assert_allclose(error, 0.0, atol=1e-12 + sag)
+        np.testing.assert_allclose(error, 0.0, atol=1e-12)
 
 
 def test_the_core_agrees_with_torch(crossing):
@@ -395,8 +393,10 @@ def test_limits_of_a_track_leave_room(crossing, tmp_path):
 
 def test_a_clone_fits_the_same(crossing):
     case, (_, model, log, _) = crossing
-    if case["error_model"] == "auto" and case["hysteresis"] != "none":
-        return  # takes as long as the fit itself; those without backlash are enough
+    if case["error_model"] == "auto" and (
+        case["hysteresis"] != "none" or case["robot"] == "forces"
+    ):
+        return  # takes as long as the fit itself; quick robots without backlash are enough
     again = clone(model).fit(log.commands, log.x, groups=log.groups)
     np.testing.assert_allclose(
         again.predict(log.commands),

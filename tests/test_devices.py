@@ -151,6 +151,7 @@ def test_nothing_follows_the_default_device_or_precision(work, tmp_path):
             assert_allclose(found, wanted, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_tensors_of_the_package_name_their_device():
     for path in Path(hybridkin.__file__).parent.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

@@ -46,6 +46,7 @@ from hybridkin import (
     as_forward_model,
     calibrate,
     choose_rows,
+    cross_fit,
     datasets,
     jacobian,
     load_model,
@@ -380,6 +381,16 @@ ENTRIES = {
         },
     ),
     "open_model": (open_model, {"model": SAVED, "robot": ROBOT}),
+    "cross_fit": (
+        cross_fit,
+        {
+            "models": {"nominal": HybridForwardModel(trunk(), "drop")},
+            "log": LOG,
+            "folds": 2,
+            "choices": "anew",
+            "sample_weight": np.ones(24),
+        },
+    ),
     "workflow.scaled_path": (workflow.scaled_path, {"path": PATH, "scale": 0.5}),
     "workflow.path_limits": (
         workflow.path_limits,

@@ -11,7 +11,7 @@ FILES = (
     "tests/app/checks/test_check_log.py::test_clean_logs_pass",
     "tests/hybrid/test_guards.py",
     "tests/ik/test_hysteresis.py::test_the_core_commands_what_torch_does[speed-plays, creep]",
-    "tests/ik/test_hysteresis.py::test_the_core_commands_what_torch_does[acceleration-play]",
+    "tests/ik/test_hysteresis.py::test_the_core_commands_what_torch_does[speed-play]",
 )
 RUNS = (0, 1)  # without the core and with two threads; other instructions of everything
 

@@ -53,9 +53,7 @@ BESIDE = ("datasets", "plots")
 def box(ax, x, y, width, color, text, height=0.95):
     """Draw a box with its lower left corner at (x, y)."""
     style = "round,pad=0,rounding_size=0.12"
-    ax.add_patch(
-        FancyBboxPatch((x, y), width, height, style, fc=color, ec="0.35", lw=1.0)
-    )
+    ax.add_patch(FancyBboxPatch((x, y), width, height, style, fc=color, ec="0.35", lw=1.0))
     ax.text(x + width / 2, y + height / 2, text, ha="center", va="center", fontsize=9.5)
 
 

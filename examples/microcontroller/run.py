@@ -41,20 +41,14 @@ def models():
     limits = {"q_min": 0.1, "q_max": 0.4, "q_pref": 0.25, "dt": 0.01}
     elm = HybridForwardModel(trunk, ELMRegressor(50, random_state=0), random_state=0)
     serial = HybridForwardModel(trunk, "quadratic", coupling="serial", random_state=0)
-    tendons = ConstantCurvatureChain(
-        [0.005, 0.005], lengths=[0.06, 0.06], routing="base"
-    )
+    tendons = ConstantCurvatureChain([0.005, 0.005], lengths=[0.06, 0.06], routing="base")
     elastic = ElasticTendonChain([0.005, 0.005], [0.06, 0.06], bending_stiffness=3e-7)
     return {
         "trunk of chambers": InverseKinematics(trunk, **limits),
         "the same, model alone": trunk,
         "tendons": InverseKinematics(tendons, q_min=-0.004, q_max=0.004, dt=0.01),
-        "elastic tendons": InverseKinematics(
-            elastic, q_min=-0.004, q_max=0.004, dt=0.01
-        ),
-        "hybrid, network of 50": InverseKinematics(
-            elm.fit(data.q[rows], data.x[rows]), **limits
-        ),
+        "elastic tendons": InverseKinematics(elastic, q_min=-0.004, q_max=0.004, dt=0.01),
+        "hybrid, network of 50": InverseKinematics(elm.fit(data.q[rows], data.x[rows]), **limits),
         "hybrid, serial quadratic": InverseKinematics(
             serial.fit(data.q[rows], data.x[rows]), **limits
         ),
@@ -122,9 +116,7 @@ def run(program, core):
         "-kernel",
         str(program),
     ]
-    done = subprocess.run(
-        command, capture_output=True, text=True, timeout=120, check=False
-    )
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     return numbers(done.stdout + done.stderr)
 
@@ -132,9 +124,7 @@ def run(program, core):
 def on_desktop(folder):
     """Return the numbers of the same source on this machine."""
     say = folder / "say.c"
-    say.write_text(
-        "#include <stdio.h>\nvoid say(const char *text) { fputs(text, stdout); }\n"
-    )
+    say.write_text("#include <stdio.h>\nvoid say(const char *text) { fputs(text, stdout); }\n")
     program = folder / "desktop"
     sources = map(str, [folder / "model.c", HERE / "main.c", say])
     options = [
@@ -156,9 +146,9 @@ def numbers(text):
 
 def sizes(program):
     """Return bytes of flash and of RAM."""
-    text, data, bss = subprocess.check_output(
-        ["arm-none-eabi-size", program], text=True
-    ).split()[6:9]
+    text, data, bss = subprocess.check_output(["arm-none-eabi-size", program], text=True).split()[
+        6:9
+    ]
     return int(text) + int(data), int(data) + int(bss)
 
 
@@ -177,9 +167,7 @@ def measured(model):
             native.export_c(model, folder, dtype="float32")
             desktop = on_desktop(folder)
             program = built(folder, core)
-            difference = (
-                np.abs(run(program, core) - desktop).max() / np.abs(desktop).max()
-            )
+            difference = np.abs(run(program, core) - desktop).max() / np.abs(desktop).max()
             rows[core] = (difference, *sizes(program), stack(folder))
     return rows
 
@@ -192,14 +180,10 @@ def missing():
 
 if __name__ == "__main__":
     if missing():
-        raise SystemExit(
-            f"not installed: {', '.join(missing())}; see microcontroller.md"
-        )
+        raise SystemExit(f"not installed: {', '.join(missing())}; see microcontroller.md")
     print("| model | core | difference | flash [kB] | RAM [B] | stack [kB] |")
     print("| --- | --- | --- | --- | --- | --- |")
     for name, model in models().items():
         for core, (difference, flash, ram, used) in measured(model).items():
-            numbers_of_row = (
-                f"{difference:.1e} | {flash / 1e3:.1f} | {ram} | {used / 1e3:.1f}"
-            )
+            numbers_of_row = f"{difference:.1e} | {flash / 1e3:.1f} | {ram} | {used / 1e3:.1f}"
             print(f"| {name} | {core} | {numbers_of_row} |")

@@ -70,9 +70,7 @@ def identifiability(data: Bunch, split: int = 0) -> dict[str, Any]:
 def write_identifiability(report: Report, data: Bunch, found: dict[str, Any]) -> None:
     """Add the results of `identifiability` to a report."""
     report.record["identifiability"] = found
-    asked, fewer, default = (
-        found[label] for label in ("asked", "identifiable", "default")
-    )
+    asked, fewer, default = (found[label] for label in ("asked", "identifiable", "default"))
     n = sum(entry.identified for entry in asked["entries"])
     report.text(
         "## Geometry that the data identify",
@@ -84,14 +82,10 @@ def write_identifiability(report: Report, data: Bunch, found: dict[str, Any]) ->
         "base is given by its rotation from the start and its position.",
     )
     write_parameters(report, asked["entries"])
-    report.text(
-        "Not identified by the data, and the measurement that would identify it:"
-    )
+    report.text("Not identified by the data, and the measurement that would identify it:")
     report.text("\n".join(f"- {sentence}" for sentence in asked["unidentified"]))
     n = sum(entry.identified for entry in fewer["entries"])
-    report.text(
-        f"Without turns and actuator zeros {n} of {len(fewer['entries'])} are identified:"
-    )
+    report.text(f"Without turns and actuator zeros {n} of {len(fewer['entries'])} are identified:")
     write_parameters(report, fewer["entries"])
     base = {entry.name: entry for entry in fewer["entries"]}
     true = dict(

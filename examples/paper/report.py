@@ -54,9 +54,7 @@ def run_paper(
     modules = {name: model.module_ for name, model in models.items()}
     paths, plant = tracks.paper_paths(n_points), data.parameters["plant"]
     feed_forward, closed = (
-        tracks.tracking(
-            modules, paths, plant, feedback, n_jobs=n_jobs, progress=progress
-        )
+        tracks.tracking(modules, paths, plant, feedback, n_jobs=n_jobs, progress=progress)
         for feedback in ("model", "measured")
     )
     report = Report("The paper's result on a simulated trunk", {})
@@ -76,16 +74,13 @@ def run_paper(
     return report, report.write(out)
 
 
-def _write_errors(
-    report: Report, data: Bunch, models: dict[str, HybridForwardModel]
-) -> None:
+def _write_errors(report: Report, data: Bunch, models: dict[str, HybridForwardModel]) -> None:
     """Add Fig. 2 to a report."""
     predictions = {name: model.predict(data.q) for name, model in models.items()}
     errors = {name: distance(x, data.x) for name, x in predictions.items()}
     mechanical = "mechanical, nominal"
     report.record["errors_all_rows"] = {
-        name: {"mean": e.mean(), "std": e.std(), "max": e.max()}
-        for name, e in errors.items()
+        name: {"mean": e.mean(), "std": e.std(), "max": e.max()} for name, e in errors.items()
     }
     report.text(
         "## Fig. 2: errors of the mechanical model",
@@ -97,14 +92,10 @@ def _write_errors(
     figure, ax = new_figure(5.5, 3.4)
     shown = {name: errors[name] for name in (mechanical, "hybrid on nominal")}
     ErrorHistogramDisplay(shown).plot(ax)
-    report.figure(
-        "error_histogram", figure, "Tip errors over all rows (Fig. 2, right)."
-    )
+    report.figure("error_histogram", figure, "Tip errors over all rows (Fig. 2, right).")
     row = int(np.argsort(errors[mechanical])[int(0.95 * len(data.q))])
     chain = robots.bionic_handling_assistant()
     backbone = chain.backbone(torch.from_numpy(data.q[row])).numpy()
     figure, ax = new_figure(6.0, 5.0, subplot_kw={"projection": "3d"})
     WorkspaceDisplay(data.x, predictions[mechanical], backbone, row).plot(ax)
-    report.figure(
-        "workspace", figure, "Measured tips; error of the nominal model (Fig. 2, left)."
-    )
+    report.figure("workspace", figure, "Measured tips; error of the nominal model (Fig. 2, left).")

@@ -20,9 +20,7 @@ from hybridkin.chains.chain import Chain
 from hybridkin.datasets import paper_split
 from hybridkin.plots import model_color, new_figure
 
-QUADRATIC = make_pipeline(
-    MinMaxScaler((-1, 1)), PolynomialFeatures(2), LinearRegression()
-)
+QUADRATIC = make_pipeline(MinMaxScaler((-1, 1)), PolynomialFeatures(2), LinearRegression())
 """A quadratic polynomial by least squares."""
 
 PAPER_TABLE_1 = {
@@ -71,25 +69,18 @@ def table1(
     ----------
     Reinhart & Steil (2016), section 3.3, Table 1.
     """
-    jobs = [
-        delayed(_one_split)(data.q, data.x, data.part, s, n_seeds)
-        for s in range(n_splits)
-    ]
+    jobs = [delayed(_one_split)(data.q, data.x, data.part, s, n_seeds) for s in range(n_splits)]
     splits = run_all(jobs, n_jobs, progress, "Table 1, test splits")
     table = []
     for model, learner in splits[0]:
         entry: dict[str, Any] = {"model": model, "learner": learner}
         for i, part in enumerate(("train", "test")):
-            entry[part] = summary(
-                [[run[i] for run in split[model, learner]] for split in splits]
-            )
+            entry[part] = summary([[run[i] for run in split[model, learner]] for split in splits])
         table.append(entry)
     return table
 
 
-def run_all(
-    jobs: list[Any], n_jobs: int | None, progress: Progress, what: str
-) -> list[Any]:
+def run_all(jobs: list[Any], n_jobs: int | None, progress: Progress, what: str) -> list[Any]:
     """Return the results of delayed jobs, and report progress."""
     results = []
     for result in Parallel(n_jobs=n_jobs, return_as="generator")(jobs):
@@ -138,9 +129,7 @@ def _one_split(
 
     def record(model: str, learner: str, estimator: HybridForwardModel) -> None:
         estimator.fit(q[train], x[train])
-        seen, unseen = (
-            distance(estimator.predict(q[rows]), x[rows]) for rows in (train, test)
-        )
+        seen, unseen = (distance(estimator.predict(q[rows]), x[rows]) for rows in (train, test))
         errors.setdefault((model, learner), []).append((seen, unseen))
 
     chains = chains_of(q[train], x[train])
@@ -152,9 +141,7 @@ def _one_split(
     }
     for role, chain in roles.items():
         # The paper uses the error model everywhere, without a guard.
-        record(
-            role, "linear", HybridForwardModel(chain, LinearRegression(), guard=None)
-        )
+        record(role, "linear", HybridForwardModel(chain, LinearRegression(), guard=None))
         record(role, "quadratic", HybridForwardModel(chain, QUADRATIC, guard=None))
         for seed in range(n_seeds):
             elm = ELMRegressor(**PAPER_ELM, random_state=1000 * split + seed)
@@ -171,9 +158,7 @@ def chains_of(q: NDArray, x: NDArray) -> dict[str, Chain]:
 def write_table1(report: Report, table: list[dict[str, Any]]) -> None:
     """Add Table 1 to a report, with the numbers of the paper beside ours."""
     report.record["table1"] = table
-    means = {
-        e["model"]: e["test"]["mean"] for e in table if e["learner"] in ("-", "ELM")
-    }
+    means = {e["model"]: e["test"]["mean"] for e in table if e["learner"] in ("-", "ELM")}
     report.record["mechanical_over_hybrid"] = ratios = mechanical_over_hybrid(means)
     report.text(
         "## Table 1: error of the forward models",
@@ -192,17 +177,13 @@ def write_table1(report: Report, table: list[dict[str, Any]]) -> None:
     rows = []
     for entry in table:
         paper = PAPER_TABLE_1.get((entry["model"], entry["learner"]), ("", ""))
-        spread = [
-            f"{100 * entry['test'][key]:.2f}" for key in ("std_splits", "std_seeds")
-        ]
+        spread = [f"{100 * entry['test'][key]:.2f}" for key in ("std_splits", "std_seeds")]
         cells = [cell(entry["train"]), paper[0], cell(entry["test"]), paper[1], *spread]
         rows.append([entry["model"], entry["learner"], *cells])
     report.table([*header, "± test sets", "± hidden layers"], rows)
     figure, ax = new_figure(7.0, 3.6)
     names = [f"{e['model']}, {e['learner']}".removesuffix(", -") for e in table]
-    means, spreads = (
-        100 * np.array([e["test"][key] for e in table]) for key in ("mean", "std")
-    )
+    means, spreads = (100 * np.array([e["test"][key] for e in table]) for key in ("mean", "std"))
     places = np.arange(len(table))[::-1]
     for name, mean, spread, place in zip(names, means, spreads, places, strict=True):
         look = {"fmt": "o", "capsize": 3, "color": model_color(name)}
@@ -216,12 +197,9 @@ def write_table1(report: Report, table: list[dict[str, Any]]) -> None:
     ax.set(xlabel="test error [cm]", xlim=(0.0, None))
     ax.legend(frameon=False, loc="lower right")
     caption = (
-        "Mean test error ± standard deviation over configurations: "
-        "dots on the simulated trunk"
+        "Mean test error ± standard deviation over configurations: dots on the simulated trunk"
     )
-    report.figure(
-        "table1", figure, f"{caption}, crosses the paper's, on the real robot."
-    )
+    report.figure("table1", figure, f"{caption}, crosses the paper's, on the real robot.")
 
 
 def paper_test_error(entry: dict[str, Any]) -> tuple[float, float]:
@@ -234,10 +212,7 @@ def paper_test_error(entry: dict[str, Any]) -> tuple[float, float]:
 def mechanical_over_hybrid(means: dict[str, float]) -> dict[str, float]:
     """Return the mean error of each mechanical model divided by that of the hybrid on it."""
     names = ("nominal", "calibrated")
-    return {
-        name: means[f"mechanical, {name}"] / means[f"hybrid on {name}"]
-        for name in names
-    }
+    return {name: means[f"mechanical, {name}"] / means[f"hybrid on {name}"] for name in names}
 
 
 def cell(stats: dict[str, Any]) -> str:

@@ -83,10 +83,7 @@ def tracking(
     Reinhart & Steil (2016), section 4, Figs. 3 and 4.
     """
     pairs = [(path, model) for path in paths for model in models]
-    jobs = [
-        delayed(_one_track)(models[m], paths[p], plant_parameters, feedback)
-        for p, m in pairs
-    ]
+    jobs = [delayed(_one_track)(models[m], paths[p], plant_parameters, feedback) for p, m in pairs]
     runs = iter(run_all(jobs, n_jobs, progress, "tracking on the simulated trunk"))
     return {path: {model: next(runs) for model in models} for path in paths}
 
@@ -101,9 +98,7 @@ def paper_paths(n_points: int = 151) -> dict[str, Trajectory]:
     }
     return {
         "figure eight": trajectories.figure_eight(center, (0.50, 0.25), **timing),
-        "spiral": trajectories.spiral(
-            center, (0.05, 0.25), rise=0.08, turns=3.0, **timing
-        ),
+        "spiral": trajectories.spiral(center, (0.05, 0.25), rise=0.08, turns=3.0, **timing),
     }
 
 
@@ -135,18 +130,11 @@ def _one_track(
     return ik.track(path, plant=plant, feedback=feedback)
 
 
-def write_tracking(
-    report: Report, paths: Mapping[str, Trajectory], tracks: Tracks
-) -> None:
+def write_tracking(report: Report, paths: Mapping[str, Trajectory], tracks: Tracks) -> None:
     """Add the feed-forward tracks to a report."""
     paper = {name: f"{value:.2f}" for name, value in PAPER_TRACKING.items()}
-    errors = {
-        path: {n: track.error for n, track in runs.items()}
-        for path, runs in tracks.items()
-    }
-    errors["both"] = {
-        n: np.concatenate([e[n] for e in errors.values()]) for n in MODELS
-    }
+    errors = {path: {n: track.error for n, track in runs.items()} for path, runs in tracks.items()}
+    errors["both"] = {n: np.concatenate([e[n] for e in errors.values()]) for n in MODELS}
     rows, record = [], {}
     for label, by_model in errors.items():
         record[label] = {}
@@ -154,9 +142,7 @@ def write_tracking(
             lost = int(np.isnan(error).sum())
             record[label][name] = stats = {**_statistics(error), "lost_steps": lost}
             cells = [cell(stats), f"{100 * stats['p95']:.2f}", str(lost)]
-            rows.append(
-                [label, name, *cells, paper.get(name, "") if label == "both" else ""]
-            )
+            rows.append([label, name, *cells, paper.get(name, "") if label == "both" else ""])
     means = {name: stats["mean"] for name, stats in record["both"].items()}
     ratios = mechanical_over_hybrid(means)
     report.record |= {"tracking": record, "tracking_mechanical_over_hybrid": ratios}
@@ -182,9 +168,7 @@ def write_tracking(
     _draw_tracking(report, paths, tracks)
 
 
-def _draw_tracking(
-    report: Report, paths: Mapping[str, Trajectory], tracks: Tracks
-) -> None:
+def _draw_tracking(report: Report, paths: Mapping[str, Trajectory], tracks: Tracks) -> None:
     shown = ("mechanical, nominal", "hybrid on nominal")
     figure, axes = new_figure(8.0, 6.4, 2, 2)
     for column, (label, path) in zip(axes.T, paths.items(), strict=True):
@@ -193,9 +177,7 @@ def _draw_tracking(
         column[0].set_title(label)
     report.figure("tracking", figure, "Targets (black) and reached tips (Fig. 3).")
     figure, ax = new_figure(6.0, 3.0)
-    ErrorBoxDisplay(
-        {f"{p}, {n}": tracks[p][n].error for p in tracks for n in shown}
-    ).plot(ax)
+    ErrorBoxDisplay({f"{p}, {n}": tracks[p][n].error for p in tracks for n in shown}).plot(ax)
     report.figure(
         "tracking_error",
         figure,
@@ -204,9 +186,7 @@ def _draw_tracking(
     figure, axes = new_figure(6.0, 5.0, 3, 1, sharex=True)
     commanded = {name: tracks["figure eight"][name].q for name in shown}
     ActuatorDisplay(commanded, (3, 3, 3)).plot(axes)
-    report.figure(
-        "configurations", figure, "Chamber lengths on the figure eight (Fig. 4, right)."
-    )
+    report.figure("configurations", figure, "Chamber lengths on the figure eight (Fig. 4, right).")
 
 
 def write_closed_loop(report: Report, feed_forward: Tracks, closed: Tracks) -> None:
@@ -229,9 +209,7 @@ def write_closed_loop(report: Report, feed_forward: Tracks, closed: Tracks) -> N
         "step uses the tip measured after the previous one, with its noise. The correction of the "
         "serial hybrid acts inside the robot; it is not in the paper.",
     )
-    report.table(
-        ["model", "feed-forward", "95 %", "step", "closed loop", "95 %", "step"], rows
-    )
+    report.table(["model", "feed-forward", "95 %", "step", "closed loop", "95 %", "step"], rows)
 
 
 def _statistics(error: NDArray) -> dict[str, Any]:

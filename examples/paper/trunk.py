@@ -166,9 +166,7 @@ class TrunkPlant:
 
         down = (gravity * np.sin(tilt), gravity * np.cos(tilt))
         self._mujoco = mujoco
-        self._model = mujoco.MjModel.from_xml_string(
-            trunk_mjcf(down, mass, tip_mass, stiffness)
-        )
+        self._model = mujoco.MjModel.from_xml_string(trunk_mjcf(down, mass, tip_mass, stiffness))
         self._data = mujoco.MjData(self._model)
         self._tip = self._model.site("tip").id
         rings = [[f"s{s}_{i}_{LINKS}" for i in range(3)] for s in range(3)]
@@ -176,9 +174,7 @@ class TrunkPlant:
         # A state holds the joint positions and the forces of the nine chambers.
         self._n_dof = self._model.nv
         straight, lengths = np.zeros(self._n_dof + 9), np.full(9, REST_LENGTH)
-        self._rest, _ = self._equilibrium(
-            straight, lengths, iter(range(self._max_iter))
-        )
+        self._rest, _ = self._equilibrium(straight, lengths, iter(range(self._max_iter)))
         self.reset()
 
     def reset(self) -> None:
@@ -396,13 +392,7 @@ class TrunkPlant:
 
 def _check_number(name: str, value: Any) -> None:
     low = -np.inf if name == "tilt" else 0.0
-    enough = (
-        isinstance(value, (int, float, np.number))
-        and np.isfinite(value)
-        and value >= low
-    )
+    enough = isinstance(value, (int, float, np.number)) and np.isfinite(value) and value >= low
     if not enough or (value == 0 and name not in _MAY_BE_ZERO):
         sign = ">=" if name in _MAY_BE_ZERO else ">"
-        raise ValueError(
-            f"`{name}` must be a finite number {sign} {low:g}, got {value!r}."
-        )
+        raise ValueError(f"`{name}` must be a finite number {sign} {low:g}, got {value!r}.")

@@ -114,9 +114,7 @@ def make_trunk(
     if random_state is None:
         random_state = int(np.random.default_rng().integers(2**31))
     if not isinstance(random_state, (int, np.integer)) or random_state < 0:
-        raise ValueError(
-            f"`random_state` must be an integer >= 0 or None, got {random_state!r}."
-        )
+        raise ValueError(f"`random_state` must be an integer >= 0 or None, got {random_state!r}.")
     noise = {"cable_noise": cable_noise, "mocap_noise": mocap_noise}
     plant = _plant_parameters({**plant_parameters, **noise})
     made = {
@@ -126,10 +124,7 @@ def make_trunk(
     }
     targets, part, drawn = _targets(q_target, made["random_state"], n_segment, n_random)
     chunks = np.array_split(np.arange(len(targets)), max(1, -(-len(targets) // CHUNK)))
-    jobs = (
-        delayed(_kept)(checkpoint, rows, targets[rows], part[rows], made)
-        for rows in chunks
-    )
+    jobs = (delayed(_kept)(checkpoint, rows, targets[rows], part[rows], made) for rows in chunks)
     q, x, targets, failed = zip(*Parallel(n_jobs=n_jobs)(jobs), strict=True)  # type: ignore
     q, x, targets = map(np.concatenate, (q, x, targets))
     failed = [one for chunk in failed for one in chunk]
@@ -176,12 +171,8 @@ def _kept(checkpoint, rows, targets, part, made):
     """Return the result of `_measure`, from a file of the checkpoint if it has a valid one."""
     if checkpoint is None:
         return _measure(rows, targets, part, made)
-    text = json.dumps(
-        [rows.tolist(), targets.tolist(), part.tolist(), made], sort_keys=True
-    )
-    file = (
-        Path(checkpoint) / f"rows-{hashlib.sha256(text.encode()).hexdigest()[:32]}.npz"
-    )
+    text = json.dumps([rows.tolist(), targets.tolist(), part.tolist(), made], sort_keys=True)
+    file = Path(checkpoint) / f"rows-{hashlib.sha256(text.encode()).hexdigest()[:32]}.npz"
     names = ("q", "x", "targets", "failed", "failed_targets", "key")
     try:
         q, x, reached, failed, tried, key = map(arrays_of(file).__getitem__, names)
@@ -233,9 +224,7 @@ def _measure(rows, targets, part, made):
 
 def _plant_parameters(given):
     """Return all arguments of the plant, as plain numbers and lists."""
-    merged = {
-        k: v.default for k, v in inspect.signature(TrunkPlant).parameters.items()
-    } | given
+    merged = {k: v.default for k, v in inspect.signature(TrunkPlant).parameters.items()} | given
     del merged["random_state"]  # every row has its own seed
     TrunkPlant(**merged)  # raises errors here, not in a process
     return {name: np.asarray(value).tolist() for name, value in merged.items()}
@@ -246,9 +235,7 @@ def _bunch(columns, parameters, failed, return_X_y):
     if return_X_y:
         return columns["q"], columns["x"]
     data = load_trunk()  # the same units, source and citation
-    data.update(
-        columns, failed=failed, parameters=parameters, DESCR=inspect.getdoc(make_trunk)
-    )
+    data.update(columns, failed=failed, parameters=parameters, DESCR=inspect.getdoc(make_trunk))
     if (data.part == OWN).any():
         data.part = None
     return data

@@ -104,9 +104,7 @@ class Recording:
             model.fit(self.q[fitted], self.x[fitted], groups=self.days[fitted])
             return model.predict(q_new)
         commands = Commands(self.q, self.runs, self.time)
-        model.fit(
-            commands[other], self.x[other], counted[other], groups=self.days[other]
-        )
+        model.fit(commands[other], self.x[other], counted[other], groups=self.days[other])
         return model.predict(commands[~other])
 
     def error(self, name: str, day: str) -> tuple[float, float, float]:

@@ -56,9 +56,7 @@ def table1_figures():
 
 def hybrid_figures():
     """Return the errors of quick models on recorded robots: few rows, and held-out motions."""
-    folds = [
-        case for case in hybrid_cases.motion_cases(None, 2) if "5 folds" in case.tests
-    ]
+    folds = [case for case in hybrid_cases.motion_cases(None, 2) if "5 folds" in case.tests]
     studies = {"held-out motions": folds}
     robot = hybrid_cases.armlab(None)
     if robot is not None:
@@ -66,9 +64,7 @@ def hybrid_figures():
         studies["few rows"] = few
     figures = {}
     for study, cases in studies.items():
-        for _, case, test, rows, model, mean, *_ in csv_lines(
-            study, examine(cases, MODELS)
-        ):
+        for _, case, test, rows, model, mean, *_ in csv_lines(study, examine(cases, MODELS)):
             figures[study, case, test, str(rows), model] = mean
     return figures
 

@@ -69,9 +69,7 @@ def rows_of(case: Case, n: int, rng: np.random.Generator) -> tuple[NDArray, NDAr
     return q, far
 
 
-def agreement(
-    case: Case, n: int, rng: np.random.Generator, n_single: int = 2000
-) -> dict[str, Any]:
+def agreement(case: Case, n: int, rng: np.random.Generator, n_single: int = 2000) -> dict[str, Any]:
     """Return how far the core is from torch at random rows.
 
     Returns
@@ -90,9 +88,7 @@ def agreement(
     parts = [_in_torch(case.model, some) for some in torch.from_numpy(q).split(_BLOCK)]
     right = [np.concatenate(part) for part in zip(*parts, strict=True)]
     found: dict[str, Any] = {"n": n, "single": 0.0, "nan": 0}
-    some = np.concatenate(
-        [np.arange(min(n, n_single)), np.flatnonzero(np.isnan(q).any(1))]
-    )
+    some = np.concatenate([np.arange(min(n, n_single)), np.flatnonzero(np.isnan(q).any(1))])
     single: Any = [program.evaluate(row, True, True) for row in q[some]]
     for k, name in enumerate(("x", "J", "distance")):
         sizes = _sizes(right[k], far, name == "distance")
@@ -136,9 +132,7 @@ def _sizes(right: NDArray, far: NDArray, own: bool) -> NDArray:
     return np.where(far, size[far].max(initial=0.0), size[~far].max())
 
 
-def random_settings(
-    low: NDArray, high: NDArray, rng: np.random.Generator
-) -> dict[str, Any]:
+def random_settings(low: NDArray, high: NDArray, rng: np.random.Generator) -> dict[str, Any]:
     """Return settings of inverse kinematics."""
     n, span, narrower = len(low), high - low, 0.3 * rng.integers(0, 2, 2)
     chosen: dict[str, Any] = {
@@ -169,9 +163,7 @@ def _starts_of_steps(
     ends = np.where(rng.random(at_limit.shape) < 0.5, low, high)
     q[1::4] = np.where(at_limit, ends, q[1::4])
     q[2::8] = low + span * rng.random((len(q[2::8]), 1))
-    q[2::8] += (
-        10.0 ** rng.uniform(-8, -3) * span * rng.standard_normal((len(q[2::8]), size))
-    )
+    q[2::8] += 10.0 ** rng.uniform(-8, -3) * span * rng.standard_normal((len(q[2::8]), size))
     return q, np.where(rng.random((n, 1)) < 0.5, q, rng.uniform(low, high, (n, size)))
 
 
@@ -198,23 +190,17 @@ def steps(robot: Robot, n: int, rng: np.random.Generator) -> dict[str, Any]:
     for _ in range(_SETTINGS):
         given = random_settings(low, high, rng)
         ik = InverseKinematics(robot.model, **given)
-        q, goal = _starts_of_steps(
-            given["q_min"], given["q_max"], -(-n // _SETTINGS), rng
-        )
+        q, goal = _starts_of_steps(given["q_min"], given["q_max"], -(-n // _SETTINGS), rng)
         with torch.no_grad():
             x, J = (
                 forward(torch.from_numpy(goal)),
                 forward.jacobian(torch.from_numpy(q)).numpy(),
             )
-        x = x.numpy() + 10.0 ** rng.uniform(
-            -4.0, -1.0, (len(q), 1)
-        ) * rng.standard_normal(x.shape)
+        x = x.numpy() + 10.0 ** rng.uniform(-4.0, -1.0, (len(q), 1)) * rng.standard_normal(x.shape)
         dx = rng.choice([0.0, 0.1]) * rng.standard_normal(x.shape)
         near = np.nextafter(q, 0.5 * (low + high))
         ours = ik.step(q, x, dx)
-        theirs, control = (
-            ik.step(*map(torch.from_numpy, (at, x, dx))) for at in (q, near)
-        )
+        theirs, control = (ik.step(*map(torch.from_numpy, (at, x, dx))) for at in (q, near))
         apart = ours.dq - theirs.dq.numpy()
         ending = "_off" if "limits" in given else ""
         seen = {
@@ -280,9 +266,7 @@ def solve(robot: Robot, n: int, n_beyond: int, random_state: int = 0) -> dict[st
         found["differ"] += int(other.sum())
         found["moved"] += int((other & (apart < 1e-9)).sum())
         found["error"] = max(found["error"], apart[~other & ~reached].max(initial=0.0))
-        found["error_reached"] = max(
-            found["error_reached"], apart[reached].max(initial=0.0)
-        )
+        found["error_reached"] = max(found["error_reached"], apart[reached].max(initial=0.0))
         control = ik.solve(torch.nextafter(x, torch.zeros_like(x)), q0)
         for key, q in (("other_q", ours.q), ("control", control.q.numpy())):
             far = (np.abs(q - theirs.q.numpy()) / span).max(axis=1) > 1e-6
@@ -320,19 +304,13 @@ def ticks(case: Case, n: int, rng: np.random.Generator) -> Ticks:
         once.append(times[:, 0])
         least.append(times.min(axis=1))
         worst = np.argsort(least[-1])[-_SLOWEST:]
-        again, _ = _timed(
-            ik, at[worst].repeat(MORE_RUNS, 0), x[worst].repeat(MORE_RUNS, 0), 1
-        )
+        again, _ = _timed(ik, at[worst].repeat(MORE_RUNS, 0), x[worst].repeat(MORE_RUNS, 0), 1)
         slowest = max(slowest, int(again.reshape(len(worst), -1).min(axis=1).max()))
     gc.enable()
-    return Ticks(
-        1e-3 * np.concatenate(once), 1e-3 * np.concatenate(least), 1e-3 * slowest
-    )
+    return Ticks(1e-3 * np.concatenate(once), 1e-3 * np.concatenate(least), 1e-3 * slowest)
 
 
-def _timed(
-    ik: InverseKinematics, q: NDArray, x: NDArray, stay: int = _STAY
-) -> tuple[NDArray, ...]:
+def _timed(ik: InverseKinematics, q: NDArray, x: NDArray, stay: int = _STAY) -> tuple[NDArray, ...]:
     """Return times [ns] of a few runs of every tick, and the configurations they started at."""
     robot: Any = ik.tracker(q[0])._robot
     robot.tick(x[0], None, None)  # sets what is given
@@ -366,32 +344,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
         metavar="CASE",
         help="of agreement and ticks",
     )
-    parser.add_argument(
-        "--robots", nargs="+", choices=ROBOTS, metavar="ROBOT", default=[*ROBOTS]
-    )
-    parser.add_argument(
-        "--rows", type=int, default=100_000, help="of each model (100000)"
-    )
-    parser.add_argument(
-        "--steps", type=int, default=10_000, help="of each robot (10000)"
-    )
-    parser.add_argument(
-        "--targets", type=int, default=10_000, help="in reach, each robot (10000)"
-    )
-    parser.add_argument(
-        "--ticks", type=int, default=1_000_000, help="of each model (1000000)"
-    )
+    parser.add_argument("--robots", nargs="+", choices=ROBOTS, metavar="ROBOT", default=[*ROBOTS])
+    parser.add_argument("--rows", type=int, default=100_000, help="of each model (100000)")
+    parser.add_argument("--steps", type=int, default=10_000, help="of each robot (10000)")
+    parser.add_argument("--targets", type=int, default=10_000, help="in reach, each robot (10000)")
+    parser.add_argument("--ticks", type=int, default=1_000_000, help="of each model (1000000)")
     parser.add_argument("--seed", type=int, default=0, help="of the draws; default: 0")
-    parser.add_argument(
-        "--image", type=Path, help="file that the figure goes to as well"
-    )
+    parser.add_argument("--image", type=Path, help="file that the figure goes to as well")
     given = parser.parse_args(arguments)
     torch.set_num_threads(1)
     report = Report("The compiled core against torch", {})
 
-    def run(
-        part: str, names: Sequence[str], study: Callable[[str], Any]
-    ) -> dict[str, Any]:
+    def run(part: str, names: Sequence[str], study: Callable[[str], Any]) -> dict[str, Any]:
         found = {}
         for done, name in enumerate(names, 1):
             found[name] = study(name)

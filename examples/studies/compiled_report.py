@@ -72,9 +72,7 @@ def steps_report(report: Report, found: Found) -> None:
         ]
         for name, one in found.items()
     ]
-    _table(
-        report, ["robot", "steps", *heads, "other `saturated`", "beyond limits"], rows
-    )
+    _table(report, ["robot", "steps", *heads, "other `saturated`", "beyond limits"], rows)
 
 
 def solve_report(report: Report, found: Found) -> None:
@@ -89,9 +87,7 @@ def solve_report(report: Report, found: Found) -> None:
     rows = []
     for name, one in found.items():
         errors = [f"{one[key]:.1g}" for key in ("error_reached", "error")]
-        shares = [
-            f"{100.0 * one[key] / one['n']:.2g}" for key in ("other_q", "control")
-        ]
+        shares = [f"{100.0 * one[key] / one['n']:.2g}" for key in ("other_q", "control")]
         seconds = [f"{one[key]:.3g}" for key in ("seconds", "seconds_torch")]
         counts = [one[key] for key in ("n", "differ", "moved")]
         rows.append([name, *counts, *errors, *shares, *seconds])
@@ -118,9 +114,7 @@ def ticks_report(report: Report, found: dict[str, Ticks]) -> Any:
     heads += [f"{head} of {RUNS}" for head in heads]
     report.table(["model", "ticks", *heads, f"worst of {MORE_RUNS}"], rows)
     figure = _figure(found)
-    caption = (
-        "Times of ticks: the shortest of three runs of each, and every one by itself."
-    )
+    caption = "Times of ticks: the shortest of three runs of each, and every one by itself."
     report.figure("ticks", figure, caption)
     return figure
 
@@ -133,9 +127,7 @@ def _figure(found: dict[str, Ticks]) -> Any:
         for k, (name, one) in enumerate(found.items()):
             counts = np.histogram(getattr(one, what), edges)[0]
             axis.stairs(counts, edges, color=f"C{k}", linewidth=1.2, label=name)
-        axis.set(
-            xscale="log", yscale="log", xlim=(0.3, 3e3), ylim=(0.5, None), title=title
-        )
+        axis.set(xscale="log", yscale="log", xlim=(0.3, 3e3), ylim=(0.5, None), title=title)
         axis.set_xlabel("time of a tick [µs]")
     axes[0].set_ylabel("ticks")
     axes[0].legend(loc="upper right", fontsize="small")

@@ -57,9 +57,7 @@ class Recording(NamedTuple):
 
 def robot(radius: float = 0.008, length: float = 0.1) -> ConstantCurvatureChain:
     """Return two segments of three tendons."""
-    return ConstantCurvatureChain(
-        [radius] * 2, lengths=[length] * 2, routing="base", gains=GAIN
-    )
+    return ConstantCurvatureChain([radius] * 2, lengths=[length] * 2, routing="base", gains=GAIN)
 
 
 def recording(seed: int, n_motions: int) -> Recording:
@@ -132,9 +130,7 @@ def error(log: Log, test: Recording) -> float:
     """Return the mean error of a hybrid on new motions [mm]."""
     start = log.q - np.median(log.q[:20], axis=0)  # counts from the first posture
     shift = np.rint((log.q[0] - start[0]) / PERIOD) * PERIOD  # whole turns
-    model = HybridForwardModel(
-        robot(), "quadratic", coupling="serial", calibrate="default"
-    )
+    model = HybridForwardModel(robot(), "quadratic", coupling="serial", calibrate="default")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         model.fit(log.q - shift, log.x, groups=log.groups)
@@ -154,9 +150,7 @@ def tried(fault: str, seed: int, folder: Path) -> list[float]:
     off = mended.q - clean.q
     numbers = [
         "encoder" in kinds,
-        bool(
-            kinds & {"order", "sign", "numbering", "units", "offset", "drift", "size"}
-        ),
+        bool(kinds & {"order", "sign", "numbering", "units", "offset", "drift", "size"}),
         np.ptp(off, axis=0).max() == 0.0 and not np.mod(off, PERIOD).any(),
     ]
     if seed >= FITTED:

@@ -114,9 +114,7 @@ class _Sagging(FaultRobot):
         given = torch.zeros_like(bends)
         for _ in range(_ROUNDS):
             moved = (bends + given).requires_grad_()
-            (moment,) = torch.autograd.grad(
-                (self._tip(arcs, moved) @ force).sum(), moved
-            )
+            (moment,) = torch.autograd.grad((self._tip(arcs, moved) @ force).sum(), moved)
             given = 0.5 * given + 0.5 * self.softness * arcs[..., None] * moment
         tip = self._tip(arcs, bends + given).detach().numpy()
         return tip + np.cross(self.turned, tip) + self.shift
@@ -199,9 +197,7 @@ class Tendons(FaultRobot):
         rng = np.random.default_rng([seed, 30])
         robot = self.robot
         self.size = float(robot.lengths.sum())
-        gain = float(
-            (1.0 + 0.02 * rng.standard_normal()) / robot.counts_per_metre.mean()
-        )
+        gain = float((1.0 + 0.02 * rng.standard_normal()) / robot.counts_per_metre.mean())
         self.signs = -robot.signs  # a pull shortens
         self.chain = ConstantCurvatureChain(
             robot.radii * rng.uniform(0.97, 1.03, 2),
@@ -222,9 +218,7 @@ class Tendons(FaultRobot):
         """Return smooth balanced commands (N, 6) in counts that shorten where negative."""
         n = max(1, rows // 40)
         pulls = self.robot._motion_pulls(rng, n, rows // n, 0.9, True)
-        pulls = np.concatenate(
-            [pulls, np.repeat(pulls[-1:], rows - len(pulls), axis=0)]
-        )
+        pulls = np.concatenate([pulls, np.repeat(pulls[-1:], rows - len(pulls), axis=0)])
         return self.signs * np.round(self.robot.counts(pulls))
 
     def tips(self, q: NDArray, load: float = 0.0) -> NDArray:

@@ -135,9 +135,7 @@ def _zero(run: Run) -> NDArray:
 def _slip(run: Run) -> NDArray:
     way = run.rng.choice([-1.0, 1.0])
     after = np.arange(len(run.q)) >= run.middle
-    return _with_column(
-        run, lambda column: column + 0.15 * way * np.ptp(column) * after
-    )
+    return _with_column(run, lambda column: column + 0.15 * way * np.ptp(column) * after)
 
 
 def _gain(run: Run) -> NDArray:
@@ -286,9 +284,7 @@ def _reversed(q: NDArray, rng: np.random.Generator) -> NDArray:
     return signs * q
 
 
-def _two_columns(
-    q: NDArray, rng: np.random.Generator, places: Sequence[int]
-) -> NDArray:
+def _two_columns(q: NDArray, rng: np.random.Generator, places: Sequence[int]) -> NDArray:
     order = np.arange(q.shape[1])
     order[[*places]] = order[[*places][::-1]]
     return q[:, order]
@@ -392,9 +388,7 @@ def check_study(seeds: Sequence[int]) -> list[dict]:
             robot = kind(seed)
             for mistake in MISTAKES:
                 found = checked(robot, seed, mistake)
-                records.append(
-                    found | {"robot": robot.name, "seed": seed, "fault": mistake}
-                )
+                records.append(found | {"robot": robot.name, "seed": seed, "fault": mistake})
     return records
 
 
@@ -413,9 +407,7 @@ def main() -> None:
         truth = FAULTS[fault][1]
         first = sum(r["cause"] == truth for r in mine)
         named = sum(truth in (r["cause"], *r["also"]) for r in mine)
-        wrong = sum(
-            r["cause"] not in (None, truth) and truth not in r["also"] for r in mine
-        )
+        wrong = sum(r["cause"] not in (None, truth) and truth not in r["also"] for r in mine)
         none = sum(r["cause"] is None for r in mine)
         rows.append(["verify", fault, len(mine), first, named, wrong, none])
     checks = check_study(options.seeds)

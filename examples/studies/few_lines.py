@@ -74,9 +74,7 @@ def simulated_log(seed: int, n_test: int = 1000) -> Log:
     rng, kind = np.random.default_rng([seed, 18]), LINES[seed % len(LINES)]
     n_segments = 1 + seed % 3
     n, radii, offsets = 3 * n_segments, np.full(n_segments, 0.05), [0.02] * n_segments
-    robot = ConstantCurvatureChain(
-        radii * rng.uniform(0.9, 1.1, n_segments), offsets=offsets
-    )
+    robot = ConstantCurvatureChain(radii * rng.uniform(0.9, 1.1, n_segments), offsets=offsets)
     products, single = (
         np.triu(rng.standard_normal((n, n, n))) / n,
         rng.standard_normal((n, n)),
@@ -101,14 +99,10 @@ def simulated_log(seed: int, n_test: int = 1000) -> Log:
         "new lines": measured(_lines(kind, n, _NEW, max(2, n_test // _NEW), rng)),
     }
     groups = np.repeat(np.arange(n_motions), n_rows)
-    return Log(
-        kind, ConstantCurvatureChain(radii, offsets=offsets), q, x, groups, tests
-    )
+    return Log(kind, ConstantCurvatureChain(radii, offsets=offsets), q, x, groups, tests)
 
 
-def _lines(
-    kind: str, n: int, n_motions: int, n_rows: int, rng: np.random.Generator
-) -> NDArray:
+def _lines(kind: str, n: int, n_motions: int, n_rows: int, rng: np.random.Generator) -> NDArray:
     """Return rows (n_motions * n_rows, n) of motions in the box [-1, 1]."""
     start = np.full((n_motions, n), -1.0 if kind.endswith("shortest") else 0.0)
     if kind.startswith("between"):
@@ -120,9 +114,7 @@ def _lines(
         way = 2.0 * reach if kind.endswith("shortest") else sign * reach
         end = start + (own * way).T
     elif kind.endswith("shortest"):  # about half of the actuators move
-        moves = (rng.random((n_motions, n)) < 0.5) | np.eye(n, dtype=bool)[
-            np.arange(n_motions) % n
-        ]
+        moves = (rng.random((n_motions, n)) < 0.5) | np.eye(n, dtype=bool)[np.arange(n_motions) % n]
         end = start + 2.0 * rng.random((n_motions, n)) * moves
     else:
         way = rng.standard_normal((n_motions, n))
@@ -137,9 +129,7 @@ def examined(seed: int, models: Sequence[str] = (*MODELS,)) -> list[dict[str, An
     """Return, of every model of a log, its errors and shares by test and domain."""
     log, entries = simulated_log(seed), []
     for name in models:
-        model = HybridForwardModel(
-            log.chain, calibrate="default", random_state=0, **MODELS[name]
-        )
+        model = HybridForwardModel(log.chain, calibrate="default", random_state=0, **MODELS[name])
         with warnings.catch_warnings():  # of few rows
             warnings.simplefilter("ignore", UserWarning)
             model.fit(log.q, log.x, groups=log.groups)
@@ -158,9 +148,7 @@ def examined(seed: int, models: Sequence[str] = (*MODELS,)) -> list[dict[str, An
             inside = (alone.in_domain(torch.from_numpy(q)).numpy(), model.in_domain(q))
             entry[test] = {"hybrid": float(hybrid.mean()), "chain": float(chain.mean())}
             entry[test] |= {
-                domain: {
-                    what: float((rows & some).mean()) for what, some in harm.items()
-                }
+                domain: {what: float((rows & some).mean()) for what, some in harm.items()}
                 for domain, rows in zip(DOMAINS, inside, strict=True)
             }
         entries.append(entry)
@@ -186,9 +174,7 @@ def write(entries: list[dict[str, Any]], seconds: float) -> Report:
             some = [entry for entry in own if kind in (entry["lines"], "all")]
             cells = []
             for _, test, what in parts:
-                both = [
-                    100 * np.mean([e[test][d][what] for e in some]) for d in DOMAINS
-                ]
+                both = [100 * np.mean([e[test][d][what] for e in some]) for d in DOMAINS]
                 cells.append(" -> ".join(f"{share:.1f}" for share in both))
             rows.append([kind, str(len(some)), *cells])
         report.table([name, "logs", *(label for label, _, _ in parts)], rows)
@@ -203,9 +189,7 @@ def figure(entries: list[dict[str, Any]]) -> Figure:
     ax = drawn.subplots()
     for name, marker in zip(MODELS, "osD", strict=True):
         own = [entry["box"] for entry in entries if entry["model"] == name]
-        before, after = (
-            100 * np.array([box[d]["harmed"] for box in own]) for d in DOMAINS
-        )
+        before, after = (100 * np.array([box[d]["harmed"] for box in own]) for d in DOMAINS)
         ax.scatter(before, after, marker=marker, alpha=0.6, label=name)
     top = ax.get_xlim()[1]
     ax.plot([0, top], [0, top], color="0.7", zorder=0)

@@ -41,9 +41,7 @@ SIZES = (12, 25, 50, 100)
 COVERAGE = 0.9
 
 
-def promise_cases(
-    n_draws: int, *, data_home: Any = None, folder: Any = None
-) -> list[Case]:
+def promise_cases(n_draws: int, *, data_home: Any = None, folder: Any = None) -> list[Case]:
     """Return the cases of `promises`: both simulated trunks, armlab_3cable and ftdcr_v4."""
     n_test = 1000
     cases = trunk_cases(SIZES, n_draws, n_test, folder, 1)
@@ -80,9 +78,7 @@ def promises(
         in covered draws also "covered", the share of test rows within the radius, and its mean
         "radius" [m].
     """
-    return Parallel(n_jobs)(
-        delayed(promise)(case, name, case.draw < n_covered) for case in cases
-    )
+    return Parallel(n_jobs)(delayed(promise)(case, name, case.draw < n_covered) for case in cases)
 
 
 @threadpool_limits.wrap(limits=1)
@@ -248,9 +244,7 @@ def ablation_lines(entries: Sequence[dict[str, Any]]) -> list[list[Any]]:
 ABLATION = ("case", "prior", "rows", "draws", "mean_mm", "std_mm", "ratio_to_all")
 
 
-def few_rows_report(
-    promised: Sequence[Sequence[Any]], ablated: Sequence[Sequence[Any]]
-) -> Report:
+def few_rows_report(promised: Sequence[Sequence[Any]], ablated: Sequence[Sequence[Any]]) -> Report:
     """Return the report of `promise_lines` and `ablation_lines`, with their tables as files."""
     report = Report("Few rows", {})
     report.text("## What the models promise", "Errors on rows with noise.")
@@ -270,9 +264,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run both parts and write the report."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", required=True, help="folder of the report")
-    parser.add_argument(
-        "--data", help="folder of the recordings; default: HYBRIDKIN_DATA"
-    )
+    parser.add_argument("--data", help="folder of the recordings; default: HYBRIDKIN_DATA")
     parser.add_argument("--rows", help="folder that stores the simulated rows")
     parser.add_argument("--draws", type=int, default=20, help="default: 20")
     parser.add_argument(
@@ -284,9 +276,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     promised = []
     for name, n_covered in ((STRUCTURAL, given.draws), (AUTO, given.covered)):
         promised += promise_lines(promises(cases, name, n_covered, given.jobs))
-    ablated = ablation_lines(
-        ablation((25, 100, 400), 5, folder=given.rows, n_jobs=given.jobs)
-    )
+    ablated = ablation_lines(ablation((25, 100, 400), 5, folder=given.rows, n_jobs=given.jobs))
     for path in few_rows_report(promised, ablated).write(given.out):
         print(path)
 

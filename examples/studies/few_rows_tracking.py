@@ -68,9 +68,7 @@ def few_rows_tracking(
             tracks = tracking(models, paths, plant, feedback, n_jobs=n_jobs)
             for model, n in models:
                 error = _errors(tracks, (model, n))
-                entries.append(
-                    {"model": model, "n": n, "loop": loop, "draw": draw, "error": error}
-                )
+                entries.append({"model": model, "n": n, "loop": loop, "draw": draw, "error": error})
     return entries
 
 
@@ -83,9 +81,7 @@ def fitted_models(
     network = ELMRegressor(**PAPER_ELM, random_state=0)
     models = {}
     for n in sizes:
-        models["mechanical, calibrated", n] = HybridForwardModel(
-            chain, "drop", calibrate="default"
-        )
+        models["mechanical, calibrated", n] = HybridForwardModel(chain, "drop", calibrate="default")
     for n in sizes:
         models["auto", n] = HybridForwardModel(chain, "auto", random_state=0)
     models[ELM, max(sizes)] = HybridForwardModel(chain, network, guard=None)
@@ -134,9 +130,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--points", type=int, default=151, help="time steps of a path")
     parser.add_argument("--jobs", type=int, default=-1, help="processes; -1: all cores")
     options = parser.parse_args(argv)
-    entries = few_rows_tracking(
-        n_draws=options.draws, n_points=options.points, n_jobs=options.jobs
-    )
+    entries = few_rows_tracking(n_draws=options.draws, n_points=options.points, n_jobs=options.jobs)
     report = report_of(entries)
     report.write(options.out)
     print(report.plain())

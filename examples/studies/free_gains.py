@@ -66,18 +66,14 @@ def folds_of(data_home: Any, thin: int = 1) -> Iterator[Fold]:
 def examined(fold: Fold) -> dict[str, float]:
     """Return the mean tip distance on the held-out rows, by what was calibrated [mm]."""
     found = {}
-    with (
-        warnings.catch_warnings()
-    ):  # of slack tendons, and of lengths that leave what is physical
+    with warnings.catch_warnings():  # of slack tendons, and of lengths that leave what is physical
         warnings.simplefilter("ignore", UserWarning)
         for name, extra in EXTRA.items():
             names = (*fold.parameters, *extra)
             chain = calibrate(fold.chain, *fold.train, names).chain
             with torch.no_grad():
                 tips = chain(torch.from_numpy(fold.test[0])).numpy()
-            found[name] = 1e3 * float(
-                np.linalg.norm(tips - fold.test[1], axis=1).mean()
-            )
+            found[name] = 1e3 * float(np.linalg.norm(tips - fold.test[1], axis=1).mean())
     return found
 
 
@@ -97,9 +93,7 @@ def gains_report(data_home: Any, thin: int = 1) -> Report:
     report.record["errors"] = entries
     changed = [f"change, {name}" for name in [*EXTRA][1:]]
     report.table(["robot", *EXTRA, *changed], rows)
-    report.text(
-        "Mean tip distance in mm over five folds; changes: mean ± standard deviation."
-    )
+    report.text("Mean tip distance in mm over five folds; changes: mean ± standard deviation.")
     return report
 
 
@@ -108,9 +102,7 @@ def main(given: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=str(__doc__).partition("\n")[0])
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--data", type=Path)
-    parser.add_argument(
-        "--thin", type=int, default=1, help="every so many rows of a fold"
-    )
+    parser.add_argument("--thin", type=int, default=1, help="every so many rows of a fold")
     arguments = parser.parse_args(given)
     report = gains_report(arguments.data, arguments.thin)
     report.write(arguments.out)

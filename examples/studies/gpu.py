@@ -247,9 +247,7 @@ def compare_fits(study: Study) -> None:
     y = np.sin(10.0 * X[:, :3] + X[:, 3:6])
     weights = rng.uniform(0.5, 2.0, len(X))
 
-    def both(
-        name: str, fit: Callable[[Any], Any], *names: str, rows: Any = X[:100]
-    ) -> None:
+    def both(name: str, fit: Callable[[Any], Any], *names: str, rows: Any = X[:100]) -> None:
         with study.attempt(name):
             models = fit(None), fit(str(study.device))
             for what in names:
@@ -269,9 +267,7 @@ def compare_fits(study: Study) -> None:
         return elm.fit(X[:100], y[:100])
 
     def of_hybrid(device: Any, **settings: Any) -> Any:
-        return hybrid(
-            network(device=device), moved(segment(), device or "cpu"), **settings
-        )
+        return hybrid(network(device=device), moved(segment(), device or "cpu"), **settings)
 
     def refitted(device: Any) -> Any:
         model = of_hybrid(None)
@@ -511,9 +507,7 @@ def measure(
         study.leave_out(f"{what}: about {seconds:.3g} s")
         return
     # What it takes on the device it takes on the CPU too.
-    there = seen.get(
-        (job.name, job.what, Place(str(study.device), study.device, place.dtype))
-    )
+    there = seen.get((job.name, job.what, Place(str(study.device), study.device, place.dtype)))
     bytes_per_row = there.bytes_per_row if there else 0.0
     if 1.2 * bytes_per_row * n > free_memory(device):
         study.leave_out(f"{what}: about {bytes_per_row * n / 1e9:.3g} GB")
@@ -567,9 +561,7 @@ def fits_of_many_rows(study: Study) -> None:
             if not study.has_time(what, 1.0, per_row * n):
                 continue
             with study.attempt(what):
-                elm = ELMRegressor(
-                    input_scaling=bounds, device=str(device), random_state=0
-                )
+                elm = ELMRegressor(input_scaling=bounds, device=str(device), random_state=0)
                 elm.partial_fit(X[:1000], y[:1000])
 
                 def fit(elm: Any = elm, n: int = n) -> None:
@@ -596,9 +588,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--device", default="cuda", help="default: cuda")
     parser.add_argument("--out", default="results/gpu", help="folder of the report")
-    parser.add_argument(
-        "--minutes", type=float, default=3.5, help="time after the imports (3.5)"
-    )
+    parser.add_argument("--minutes", type=float, default=3.5, help="time after the imports (3.5)")
     parser.add_argument("--quick", action="store_true", help="few rows")
     given = parser.parse_args(arguments)
     device = torch.device(given.device)

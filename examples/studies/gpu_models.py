@@ -132,9 +132,7 @@ def arm_urdf() -> str:
             moves = f'<axis xyz="{numbers}"/>{limit}'
         ends = f'<parent link="{names[k]}"/><child link="{names[k + 1]}"/>'
         place = f'<origin xyz="0 0 {z}" rpy="0 0 0"/>'
-        lines.append(
-            f'<joint name="joint_{k}" type="{kind}">{ends}{place}{moves}</joint>'
-        )
+        lines.append(f'<joint name="joint_{k}" type="{kind}">{ends}{place}{moves}</joint>')
     return f'<robot name="arm">{"".join(lines)}</robot>'
 
 
@@ -163,9 +161,7 @@ def hybrid(error_model: Any, chain: Any = None, **settings: Any) -> Any:
     q, x, groups = log()
     if settings.get("output") == "pose":
         x = np.hstack([x, 5 * (q - 0.25)])
-    model = HybridForwardModel(
-        chain or segment(), error_model, random_state=0, **settings
-    )
+    model = HybridForwardModel(chain or segment(), error_model, random_state=0, **settings)
     commands = Commands(q, groups, np.arange(len(q)) * 0.1)
     return model.fit(commands, x, groups=groups)
 
@@ -220,18 +216,12 @@ _CREEP = Hysteresis.creep([[0.1, 0.2, 0.3], [0.2, 0.1, 0.0]], [2.0, 30.0])
 
 CHAINS: dict[str, Callable[[], Kind]] = {
     "extensible segments": lambda: Kind(trunk(), *limits(9, LOW, HIGH)),
-    "extensible, towards poses": lambda: Kind(
-        trunk(), *limits(9, LOW, HIGH), pose_of_rows
-    ),
+    "extensible, towards poses": lambda: Kind(trunk(), *limits(9, LOW, HIGH), pose_of_rows),
     "tendons of fixed length, all parts": lambda: Kind(
-        tendons(
-            rest_bends=[[0.1, 0.2], [0.0, -0.3]], actuator_zeros=1e-4 * np.arange(7)
-        ),
+        tendons(rest_bends=[[0.1, 0.2], [0.0, -0.3]], actuator_zeros=1e-4 * np.arange(7)),
         *_PULLED,
     ),
-    "tendons with gains": lambda: Kind(
-        tendons(gains=[1.0, -2.0]), *(0.4 * end for end in _PULLED)
-    ),
+    "tendons with gains": lambda: Kind(tendons(gains=[1.0, -2.0]), *(0.4 * end for end in _PULLED)),
     "two opposite chambers": lambda: Kind(
         ConstantCurvatureChain([0.05], n_actuators=2, angles=[0.0, np.pi]),
         *limits(2, 0.2, 0.3),
@@ -264,9 +254,7 @@ LEARNED: dict[str, Callable[[], Kind]] = {
         .fit(*log()[:2]),
         *_CHAMBERS,
     ),
-    "network, sine": lambda: Kind(
-        network(activation="sin").fit(*log()[:2]), *_CHAMBERS
-    ),
+    "network, sine": lambda: Kind(network(activation="sin").fit(*log()[:2]), *_CHAMBERS),
     "network by cross-validation": lambda: Kind(
         ELMRegressorCV(8, cv=3, max_hidden=8, random_state=0).fit(*log()[:2]),
         *_CHAMBERS,
@@ -288,37 +276,25 @@ LEARNED: dict[str, Callable[[], Kind]] = {
         is_saved=False,
     ),
     "serial, linear": lambda: Kind(hybrid("linear", coupling="serial"), *_CHAMBERS),
-    "serial, quadratic": lambda: Kind(
-        hybrid("quadratic", coupling="serial"), *_CHAMBERS
-    ),
+    "serial, quadratic": lambda: Kind(hybrid("quadratic", coupling="serial"), *_CHAMBERS),
     "serial, pose": lambda: Kind(hybrid("pose", coupling="serial"), *_CHAMBERS),
     "serial, network": lambda: Kind(hybrid(network(), coupling="serial"), *_CHAMBERS),
-    "poses as outputs": lambda: Kind(
-        hybrid(network(), output="pose"), *_CHAMBERS, pose_of_rows
-    ),
-    "data alone": lambda: Kind(
-        HybridForwardModel(None, network()).fit(*log()[:2]), *_CHAMBERS
-    ),
+    "poses as outputs": lambda: Kind(hybrid(network(), output="pose"), *_CHAMBERS, pose_of_rows),
+    "data alone": lambda: Kind(HybridForwardModel(None, network()).fit(*log()[:2]), *_CHAMBERS),
     "blend": lambda: Kind(blend(), *_CHAMBERS, is_saved=False),
     "backlash": lambda: Kind(hybrid("linear", hysteresis=_BACKLASH), *_CHAMBERS),
     "smooth hysteresis": lambda: Kind(hybrid("linear", hysteresis=_SMOOTH), *_CHAMBERS),
-    "backlash and creep": lambda: Kind(
-        hybrid("linear", hysteresis=_BACKLASH | _CREEP), *_CHAMBERS
-    ),
+    "backlash and creep": lambda: Kind(hybrid("linear", hysteresis=_BACKLASH | _CREEP), *_CHAMBERS),
     "adapted": lambda: Kind(adapted(), *_CHAMBERS),
     "adapted poses": lambda: Kind(adapted(output="pose"), *_CHAMBERS, pose_of_rows),
     "hybrid of markers": lambda: Kind(
-        on_chain(
-            tendons().with_markers([(0, 1.0), (1, 1.0)]), *_PULLED, LinearRegression()
-        ),
+        on_chain(tendons().with_markers([(0, 1.0), (1, 1.0)]), *_PULLED, LinearRegression()),
         *_PULLED,
     ),
     "hybrid of elastic tendons": lambda: Kind(
         on_chain(elastic(), *_PULLED, LinearRegression()), *_PULLED
     ),
-    "hybrid of tendons by force": lambda: Kind(
-        on_chain(forced(), *_FORCES, network()), *_FORCES
-    ),
+    "hybrid of tendons by force": lambda: Kind(on_chain(forced(), *_FORCES, network()), *_FORCES),
     "hybrid of a rigid arm": lambda: Kind(on_chain(arm(), *_TURNS, network()), *_TURNS),
 }
 """Learned and hybrid models by kind."""

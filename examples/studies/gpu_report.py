@@ -82,14 +82,10 @@ class Study:
         self.leave_out(f"{what}: no time left{about}")
         return False
 
-    def compare(
-        self, model: str, what: str, value: float, allowed: float, rows: int = 0
-    ) -> None:
+    def compare(self, model: str, what: str, value: float, allowed: float, rows: int = 0) -> None:
         """Add a comparison."""
         name = str(self.device)
-        result = Result(
-            "correctness", model, what, name, "float64", rows, value, "", allowed
-        )
+        result = Result("correctness", model, what, name, "float64", rows, value, "", allowed)
         self.results.append(result)
         if result.verdict != "agrees":
             self.failed.append(f"{model}, {what}: {value:.3g}, allowed {allowed:.3g}")
@@ -143,9 +139,7 @@ def driver() -> str:
     """Return the version of the driver."""
     command = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
     try:
-        answer = subprocess.run(
-            command, capture_output=True, text=True, timeout=10, check=True
-        )
+        answer = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
     except (OSError, subprocess.SubprocessError):
         return "unknown"
     return answer.stdout.splitlines()[0].strip()
@@ -179,21 +173,15 @@ def written(study: Study) -> str:
     return "\n".join(lines) + "\n"
 
 
-def measured_table(
-    study: Study, part: str, unit: str, others: Sequence[str]
-) -> list[str]:
+def measured_table(study: Study, part: str, unit: str, others: Sequence[str]) -> list[str]:
     """Return the lines of a table of measurements, with columns of other places."""
     name = str(study.device)
     columns = [*dict.fromkeys([name, *others])]
-    measured = {
-        result[1:6]: result.value for result in study.results if result.part == part
-    }
+    measured = {result[1:6]: result.value for result in study.results if result.part == part}
     titles = ["model", "work", "dtype", "rows", *columns]
     lines = ["", f"## {part.capitalize()}, {unit}", ""]
     lines += [in_row(titles), in_row(["---"] * len(titles))]
-    for model, work, dtype, n in dict.fromkeys(
-        (m, w, d, n) for m, w, _, d, n in measured
-    ):
+    for model, work, dtype, n in dict.fromkeys((m, w, d, n) for m, w, _, d, n in measured):
         cells: list[object] = [model, work, dtype, n]
         for column in columns:
             value = measured.get((model, work, column, dtype, n))

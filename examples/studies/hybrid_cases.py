@@ -75,9 +75,7 @@ class Case(NamedTuple):
 def examined(case: Case, names: Sequence[str] | None) -> list[dict[str, Any]]:
     """Return the entries of a case, of the models with these names or all."""
     entries = []
-    with (
-        warnings.catch_warnings()
-    ):  # a plain chain warns of slack tendons, as in ftdcr_v4
+    with warnings.catch_warnings():  # a plain chain warns of slack tendons, as in ftdcr_v4
         warnings.simplefilter("ignore", UserWarning)
         for name, learner in _learners(case).items():
             if names is not None and name not in names:
@@ -93,9 +91,7 @@ def examined(case: Case, names: Sequence[str] | None) -> list[dict[str, Any]]:
             entry["seconds"] = time.process_time() - start
             if model.cv_results_ is not None:
                 results = model.cv_results_
-                scores = zip(
-                    results["candidate"], results["mean_distance"].tolist(), strict=True
-                )
+                scores = zip(results["candidate"], results["mean_distance"].tolist(), strict=True)
                 entry |= {"chosen": results["chosen"], "scores": dict(scores)}
                 entry |= {key: results[key] for key in ("expected_distance", "weights")}
                 entry["parameters"] = results["parameters"]
@@ -103,12 +99,8 @@ def examined(case: Case, names: Sequence[str] | None) -> list[dict[str, Any]]:
             errors = {test: _errors(model, *rows) for test, rows in case.tests.items()}
             entries.append({**entry, "errors": errors})
             if name == AUTO:
-                alone = HybridForwardModel(model.mechanical_model_, "drop").fit(
-                    case.q, case.x
-                )
-                errors = {
-                    test: _errors(alone, *rows) for test, rows in case.tests.items()
-                }
+                alone = HybridForwardModel(model.mechanical_model_, "drop").fit(case.q, case.x)
+                errors = {test: _errors(alone, *rows) for test, rows in case.tests.items()}
                 parts = {key: entry[key] for key in ("case", "draw", "n")}
                 entries.append({**parts, "model": AUTO_MECHANICS, "errors": errors})
     return entries
@@ -132,12 +124,8 @@ def _learners(case: Case) -> dict[str, Callable[[], HybridForwardModel]]:
     if groups is not None:
         splitter = GroupKFold(min(5, len(np.unique(groups))))
     folds = [*splitter.split(q, groups=groups)]
-    calibrated = HybridForwardModel(case.chain, "drop", calibrate=case.calibrate).fit(
-        q, x
-    )
-    hybrid = partial(
-        HybridForwardModel, calibrated.mechanical_model_, random_state=seed
-    )
+    calibrated = HybridForwardModel(case.chain, "drop", calibrate=case.calibrate).fit(q, x)
+    hybrid = partial(HybridForwardModel, calibrated.mechanical_model_, random_state=seed)
     learners: dict[str, Callable[[], HybridForwardModel]] = {
         NOMINAL: lambda: HybridForwardModel(case.chain, "drop", calibrate=case.frame),
         CALIBRATED: lambda: hybrid("drop"),
@@ -152,9 +140,7 @@ def _learners(case: Case) -> dict[str, Callable[[], HybridForwardModel]]:
     for coupling in COUPLINGS:
         for kind in READOUTS:
             learners[f"{coupling}, {kind}"] = partial(hybrid, kind, coupling=coupling)
-    learners["serial, pose, no guard"] = partial(
-        hybrid, "pose", coupling="serial", guard=None
-    )
+    learners["serial, pose, no guard"] = partial(hybrid, "pose", coupling="serial", guard=None)
     learners[STRUCTURAL] = partial(hybrid, "structural", coupling="serial")
     auto = partial(HybridForwardModel, case.chain, AUTO, random_state=seed)
     learners[AUTO] = auto
@@ -165,9 +151,7 @@ def _learners(case: Case) -> dict[str, Callable[[], HybridForwardModel]]:
 
 def _quadratic() -> Any:
     features = PolynomialFeatures(2, include_bias=False)
-    return make_pipeline(
-        MinMaxScaler((-1, 1)), features, RidgeCV(np.logspace(-6, 3, 19))
-    )
+    return make_pipeline(MinMaxScaler((-1, 1)), features, RidgeCV(np.logspace(-6, 3, 19)))
 
 
 def _kernel(q: NDArray, y: NDArray, folds: list[tuple[NDArray, NDArray]]) -> Any:
@@ -175,9 +159,7 @@ def _kernel(q: NDArray, y: NDArray, folds: list[tuple[NDArray, NDArray]]) -> Any
     ridge = make_pipeline(StandardScaler(), KernelRidge(kernel="rbf"))
     grid = {"alpha": np.logspace(-5, 0, 6), "gamma": (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)}
     grid = {f"kernelridge__{name}": values for name, values in grid.items()}
-    search = GridSearchCV(
-        ridge, grid, cv=folds, scoring="neg_mean_squared_error", refit=False
-    )
+    search = GridSearchCV(ridge, grid, cv=folds, scoring="neg_mean_squared_error", refit=False)
     ridge.set_params(**search.fit(q, y - y.mean(0)).best_params_)
     return TransformedTargetRegressor(ridge, transformer=StandardScaler(with_std=False))
 
@@ -213,8 +195,7 @@ def trunk_cases(
             q, x = _noisy(data[0][drawn], data[1][drawn], [seed, 2, draw])
             chain = robots.bionic_handling_assistant()
             cases += [
-                Case(name, draw, chain, (), "default", q[:n], x[:n], None, tests)
-                for n in sizes
+                Case(name, draw, chain, (), "default", q[:n], x[:n], None, tests) for n in sizes
             ]
     return cases
 
@@ -265,9 +246,7 @@ class Robot(NamedTuple):
     x: NDArray
     groups: NDArray
 
-    def drawn(
-        self, draw: int, rows: NDArray, test: NDArray, sizes: Sequence[int]
-    ) -> list[Case]:
+    def drawn(self, draw: int, rows: NDArray, test: NDArray, sizes: Sequence[int]) -> list[Case]:
         """Return a case for every size: the first ones of these rows, tested on others."""
         tests = {"measured": (self.q[test], self.x[test])}
         cases = []
@@ -279,9 +258,7 @@ class Robot(NamedTuple):
         return cases
 
 
-def recorded_cases(
-    robot: Robot, sizes: Sequence[int], n_draws: int, n_test: int
-) -> list[Case]:
+def recorded_cases(robot: Robot, sizes: Sequence[int], n_draws: int, n_test: int) -> list[Case]:
     """Return the cases of a recorded robot: single rows, a fifth of its groups held out.
 
     The rows and the groups are drawn at random. Sizes with more rows than there are are left out.
@@ -309,9 +286,7 @@ def armlab(data_home: Any) -> Robot | None:
     return Robot("armlab_3cable", chain, ("base",), parameters, *rows)
 
 
-def pull_cases_of_armlab(
-    n: int, n_draws: int, n_test: int, data_home: Any
-) -> list[Case]:
+def pull_cases_of_armlab(n: int, n_draws: int, n_test: int, data_home: Any) -> list[Case]:
     """Return the cases of armlab_3cable that are learned from small pulls."""
     robot = armlab(data_home)
     if robot is None:
@@ -344,15 +319,9 @@ def asl_trunk(data_home: Any) -> Robot | None:
     data = recording(datasets.load_asl_trunk, data_home)
     if data is None:
         return None
-    q = np.hstack(
-        [SPOOL * sign * data.q[:, pair] for pair in _PAIRS for sign in (-1.0, 1.0)]
-    )
-    chain = ConstantCurvatureChain(
-        np.full(3, 0.02), n_actuators=4, lengths=(0.107, 0.098, 0.12)
-    )
-    return Robot(
-        "asl_trunk_static", chain, ("base",), "default", q, data.x, data.groups
-    )
+    q = np.hstack([SPOOL * sign * data.q[:, pair] for pair in _PAIRS for sign in (-1.0, 1.0)])
+    chain = ConstantCurvatureChain(np.full(3, 0.02), n_actuators=4, lengths=(0.107, 0.098, 0.12))
+    return Robot("asl_trunk_static", chain, ("base",), "default", q, data.x, data.groups)
 
 
 def nine_tendons() -> dict[str, tuple[Any, tuple[str, ...]]]:
@@ -411,9 +380,7 @@ def motion_cases(data_home: Any, thin: int) -> list[Case]:
     if data is None:
         return []
     families = np.array([label.split("_")[1] for label in data.groups])
-    single, pair = (
-        np.flatnonzero(np.char.startswith(families, w)) for w in ("seg", "pair")
-    )
+    single, pair = (np.flatnonzero(np.char.startswith(families, w)) for w in ("seg", "pair"))
     folds = list(GroupKFold(5).split(data.q, groups=data.groups))
     pairs = [
         (np.flatnonzero(families != name), np.flatnonzero(families == name))
@@ -433,7 +400,5 @@ def motion_cases(data_home: Any, thin: int) -> list[Case]:
                 part = data.q[rows], data.x[rows], groups[rows]
                 tests = {way: (data.q[test], data.x[test], data.groups[test])}
                 in_time = groups is data.groups
-                cases.append(
-                    Case(name, k, chain, ("base",), parameters, *part, tests, in_time)
-                )
+                cases.append(Case(name, k, chain, ("base",), parameters, *part, tests, in_time))
     return cases

@@ -151,9 +151,7 @@ def extrapolation(
     list of dict
         One entry per case and model, as in `learning_curves`.
     """
-    trunks = (
-        trunk_cases([n], n_draws, n_test, folder, n_jobs, inner=part) for part in INNER
-    )
+    trunks = (trunk_cases([n], n_draws, n_test, folder, n_jobs, inner=part) for part in INNER)
     cases = [case for one in trunks for case in one]
     cases += pull_cases_of_armlab(n, n_draws, n_test, data_home)
     cases += pull_cases(data_home, thin=2)
@@ -235,46 +233,30 @@ def hybrids_report(
         report.text(f"{case}, {test}:")
         rows = []
         for model in dict.fromkeys(model for model, _ in means):
-            cells = [
-                _spread(means[model, n]) if (model, n) in means else "" for n in sizes
-            ]
+            cells = [_spread(means[model, n]) if (model, n) in means else "" for n in sizes]
             rows.append([model, *cells])
         report.table(["rows", *map(str, sizes)], rows)
     if curves:
-        report.figure(
-            "hybrid_curves", _curves_figure(curves), "Tip error against training rows."
-        )
+        report.figure("hybrid_curves", _curves_figure(curves), "Tip error against training rows.")
     for title, entries in (
         ("Outside the training range", outside),
         ("Held-out motions", motions),
     ):
         cases = _tests(entries)
         found = [_means(entries, *case) for case in cases]
-        report.text(
-            f"## {title}", "Tip error in mm, mean over draws or folds (largest of all)."
-        )
+        report.text(f"## {title}", "Tip error in mm, mean over draws or folds (largest of all).")
         rows = []
         for model in dict.fromkeys(entry["model"] for entry in entries):
             values = (1e3 * np.array(means.get(model, [np.nan] * 3)) for means in found)
-            rows.append(
-                [model, *(f"{mean:.2f} ({largest:.1f})" for mean, _, largest in values)]
-            )
+            rows.append([model, *(f"{mean:.2f} ({largest:.1f})" for mean, _, largest in values)])
         report.table(["model", *(", ".join(case) for case in cases)], rows)
-        report.text(
-            "Choice of auto, its cross-validated error and its test error, in mm:"
-        )
-        report.table(
-            _CHOICES, [_choice(entry) for entry in entries if "scores" in entry]
-        )
+        report.text("Choice of auto, its cross-validated error and its test error, in mm:")
+        report.table(_CHOICES, [_choice(entry) for entry in entries if "scores" in entry])
     if outside:
-        report.figure(
-            "hybrid_outside", _outside_figure(outside), "Tip error outside the range."
-        )
+        report.figure("hybrid_outside", _outside_figure(outside), "Tip error outside the range.")
     parts = {"few rows": curves, "outside the training range": outside}
     parts["held-out motions"] = motions
-    lines = [
-        line for study, entries in parts.items() for line in csv_lines(study, entries)
-    ]
+    lines = [line for study, entries in parts.items() for line in csv_lines(study, entries)]
     add_csv(report, "hybrids.csv", _COLUMNS, lines)
     return report
 
@@ -289,12 +271,8 @@ def stored_entries(path: Any) -> dict[str, list[dict[str, Any]]]:
     with open(path, newline="", encoding="utf-8") as file:
         for line in csv.DictReader(file):
             entry: dict[str, Any] = {key: line[key] for key in ("case", "model")}
-            mean, largest = (
-                1e-3 * float(line[key] or "nan") for key in ("mean_mm", "max_mm")
-            )
-            entry["errors"] = {
-                line["test"]: {"mean": mean, "max": largest, "n_test": 1}
-            }
+            mean, largest = (1e-3 * float(line[key] or "nan") for key in ("mean_mm", "max_mm"))
+            entry["errors"] = {line["test"]: {"mean": mean, "max": largest, "n_test": 1}}
             entry["n"] = int(line["rows"] or 0)
             found.setdefault(line["study"], []).append(entry)
     return found
@@ -309,17 +287,13 @@ def csv_lines(study: str, entries: list[dict[str, Any]]) -> list[list[Any]]:
             some = [e for e in entries if (e["case"], e["model"]) == (case, model)]
             some = [e for e in some if test in e["errors"] and size in (None, e["n"])]
             scores = [e["scores"][e["chosen"]] for e in some if "scores" in e]
-            rows = (
-                "" if size is None and len({e["n"] for e in some}) > 1 else some[0]["n"]
-            )
+            rows = "" if size is None and len({e["n"] for e in some}) > 1 else some[0]["n"]
             errors = [1e3 * float(error) for error in found]
             expected = [e["expected_distance"] for e in some if "scores" in e]
             promised = ["", ""]
             if scores:
                 promised = [1e3 * float(np.mean(part)) for part in (scores, expected)]
-            lines.append(
-                [study, case, test, rows, model, *errors, *promised, len(some)]
-            )
+            lines.append([study, case, test, rows, model, *errors, *promised, len(some)])
     return lines
 
 
@@ -333,19 +307,13 @@ _CHOICES = ("case", "draw", "model", "calibrated", "chosen", "cross-validated", 
 
 def _choice(entry: dict[str, Any]) -> list[str]:
     errors = next(iter(entry["errors"].values()))
-    numbers = [
-        f"{1e3 * e:.2f}" for e in (entry["scores"][entry["chosen"]], errors["mean"])
-    ]
+    numbers = [f"{1e3 * e:.2f}" for e in (entry["scores"][entry["chosen"]], errors["mean"])]
     names = [entry[key] for key in ("model", "parameters", "chosen")]
     return [entry["case"], str(entry["draw"]), *names, *numbers]
 
 
 def _tests(table: list[dict[str, Any]]) -> list[tuple[str, str]]:
-    return [
-        *dict.fromkeys(
-            (entry["case"], test) for entry in table for test in entry["errors"]
-        )
-    ]
+    return [*dict.fromkeys((entry["case"], test) for entry in table for test in entry["errors"])]
 
 
 def _means(
@@ -357,9 +325,7 @@ def _means(
         if entry["case"] == case and test in entry["errors"]:
             key = (entry["model"], entry["n"]) if by_size else entry["model"]
             errors = entry["errors"][test]
-            runs.setdefault(key, []).append(
-                [errors["mean"], errors["max"], errors["n_test"]]
-            )
+            runs.setdefault(key, []).append([errors["mean"], errors["max"], errors["n_test"]])
     found = {}
     for key, rows in runs.items():
         means, largest, weights = np.array(rows).T
@@ -401,9 +367,7 @@ def _outside_figure(outside: list[dict[str, Any]]) -> Any:
     cases = [(case, test) for case, test in _tests(outside) if test != "with noise"]
     n_lines = -(-len(cases) // _PANELS)
     shape = n_lines, -(-len(cases) // n_lines)
-    figure, axes = plots.new_figure(
-        9.0, 3.6 * n_lines, *shape, sharey=True, squeeze=False
-    )
+    figure, axes = plots.new_figure(9.0, 3.6 * n_lines, *shape, sharey=True, squeeze=False)
     for ax in axes.flat[len(cases) :]:
         ax.set_axis_off()
     names = list(dict.fromkeys(entry["model"] for entry in outside))
@@ -417,9 +381,7 @@ def _outside_figure(outside: list[dict[str, Any]]) -> Any:
         ):
             values = [1e3 * means[name][k] for name in shown]
             ax.plot(values, places, mark, color=color, label=label)
-            least = min(
-                (NOMINAL, CALIBRATED), key=lambda name: means.get(name, [np.inf])[0]
-            )
+            least = min((NOMINAL, CALIBRATED), key=lambda name: means.get(name, [np.inf])[0])
             better = f"{label} of nominal or calibrated, the better one"
             ax.axvline(
                 1e3 * means[least][k],
@@ -456,18 +418,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run all comparisons and write the report."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", required=True, help="folder of the report")
-    parser.add_argument(
-        "--data", help="folder of the recordings; default: HYBRIDKIN_DATA"
-    )
-    parser.add_argument(
-        "--rows", help="folder that stores the simulated rows for the next run"
-    )
-    parser.add_argument(
-        "--sizes", type=int, nargs="+", default=SIZES, help="training rows"
-    )
-    parser.add_argument(
-        "--draws", type=int, default=5, help="draws of the few rows; default: 5"
-    )
+    parser.add_argument("--data", help="folder of the recordings; default: HYBRIDKIN_DATA")
+    parser.add_argument("--rows", help="folder that stores the simulated rows for the next run")
+    parser.add_argument("--sizes", type=int, nargs="+", default=SIZES, help="training rows")
+    parser.add_argument("--draws", type=int, default=5, help="draws of the few rows; default: 5")
     parser.add_argument("--test-rows", type=int, default=1000, help="default: 1000")
     parser.add_argument(
         "--models",
@@ -475,17 +429,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
         help="names as in the report, besides the two mechanical models; default: all",
     )
     parser.add_argument("--jobs", type=int, default=1, help="processes; default: 1")
-    parser.add_argument(
-        "--draw", metavar="CSV", help="only draw the figures of a hybrids.csv"
-    )
+    parser.add_argument("--draw", metavar="CSV", help="only draw the figures of a hybrids.csv")
     given = parser.parse_args(arguments)
     if given.draw is not None:
         entries = stored_entries(given.draw)
         report = Report("Hybrid models compared", {})
         report.figure("hybrid_curves", _curves_figure(entries["few rows"]), "")
-        report.figure(
-            "hybrid_outside", _outside_figure(entries["outside the training range"]), ""
-        )
+        report.figure("hybrid_outside", _outside_figure(entries["outside the training range"]), "")
         print(*report.write(given.out), sep="\n")
         return
 
@@ -500,9 +450,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     trunks = {"n_test": given.test_rows, "folder": given.rows, **common}
     curves = learning_curves(given.sizes, given.draws, **trunks)
     outside = extrapolation(min(400, max(given.sizes)), min(3, given.draws), **trunks)
-    for path in hybrids_report(curves, outside, held_out_motions(**common)).write(
-        given.out
-    ):
+    for path in hybrids_report(curves, outside, held_out_motions(**common)).write(given.out):
         print(path)
 
 

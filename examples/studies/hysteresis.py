@@ -73,14 +73,10 @@ def creep(q: NDArray) -> NDArray:
     return effective
 
 
-def by_group(
-    function: Callable[[NDArray], NDArray], q: NDArray, groups: NDArray
-) -> NDArray:
+def by_group(function: Callable[[NDArray], NDArray], q: NDArray, groups: NDArray) -> NDArray:
     """Return a function of the rows of each motion, for all rows."""
     parts = [function(q[groups == name]) for name in np.unique(groups)]
-    order = np.concatenate(
-        [np.flatnonzero(groups == name) for name in np.unique(groups)]
-    )
+    order = np.concatenate([np.flatnonzero(groups == name) for name in np.unique(groups)])
     result = np.empty((len(q), *parts[0].shape[1:]))
     result[order] = np.concatenate(parts)
     return result
@@ -274,9 +270,7 @@ def draw_loops(path: Path) -> None:
     turn = np.linspace(0.0, 4.0 * np.pi, 300)
     swing = np.linspace(1.0, 0.4, len(turn)) * np.sin(turn)
     loop = 0.25 + np.outer(swing, 0.04 * np.eye(9)[0])
-    figure, axes = plt.subplots(
-        1, 3, figsize=(9.0, 3.2), sharey=True, layout="constrained"
-    )
+    figure, axes = plt.subplots(1, 3, figsize=(9.0, 3.2), sharey=True, layout="constrained")
     titles = "no hysteresis", "one backlash", "found by auto"
     for ax, title, model in zip(axes, titles, models, strict=True):
         ax.plot(

@@ -59,9 +59,7 @@ class Arm(NamedTuple):
         poses = np.eye(4)
         for k, (xyz, rpy, axis, *_) in enumerate(self.joints):
             turn = np.tile(np.eye(4), (len(q), 1, 1))
-            turn[:, :3, :3] = Rotation.from_rotvec(
-                q[:, k, None] * np.array(axis)
-            ).as_matrix()
+            turn[:, :3, :3] = Rotation.from_rotvec(q[:, k, None] * np.array(axis)).as_matrix()
             poses = poses @ _pose(xyz, rpy) @ turn
         return poses @ _pose(*self.tip)
 
@@ -209,9 +207,7 @@ def mink_solver(arm: Arm, n_starts: int, seed: int) -> Solve:
     spec = mujoco.MjSpec.from_string(arm.urdf().replace('="arm">', '="arm">' + _MUJOCO))
     model = spec.compile()
     configuration, limits = mink.Configuration(model), [mink.ConfigurationLimit(model)]
-    task = mink.FrameTask(
-        "tip", "body", position_cost=1.0, orientation_cost=0.1, lm_damping=0.1
-    )
+    task = mink.FrameTask("tip", "body", position_cost=1.0, orientation_cost=0.1, lm_damping=0.1)
 
     def follow(q: NDArray, pose: NDArray) -> NDArray:
         configuration.update(q)
@@ -220,9 +216,7 @@ def mink_solver(arm: Arm, n_starts: int, seed: int) -> Solve:
             error = task.compute_error(configuration)
             if _arrived(error):
                 break
-            speed = mink.solve_ik(
-                configuration, [task], _DT, "daqp", damping=1e-9, limits=limits
-            )
+            speed = mink.solve_ik(configuration, [task], _DT, "daqp", damping=1e-9, limits=limits)
             configuration.integrate_inplace(speed, _DT)
         return configuration.q.copy()
 
@@ -239,9 +233,7 @@ def pink_solver(arm: Arm, n_starts: int, seed: int) -> Solve:
 
     model = pinocchio.buildModelFromXML(arm.urdf())
     data = model.createData()
-    task = pink.FrameTask(
-        "tip", position_cost=1.0, orientation_cost=0.1, lm_damping=0.1
-    )
+    task = pink.FrameTask("tip", position_cost=1.0, orientation_cost=0.1, lm_damping=0.1)
     limits = [pink.limits.ConfigurationLimit(model)]
 
     def follow(q: NDArray, pose: NDArray) -> NDArray:
@@ -266,9 +258,7 @@ def pink_solver(arm: Arm, n_starts: int, seed: int) -> Solve:
 
 
 def _arrived(error: NDArray) -> bool:
-    return bool(
-        np.linalg.norm(error[:3]) <= TOL[0] and np.linalg.norm(error[3:]) <= TOL[1]
-    )
+    return bool(np.linalg.norm(error[:3]) <= TOL[0] and np.linalg.norm(error[3:]) <= TOL[1])
 
 
 def _one_by_one(arm: Arm, follow: Callable, n_starts: int, seed: int) -> Solve:
@@ -295,9 +285,7 @@ def solved(arm: Arm, q: NDArray, poses: NDArray) -> NDArray:
     low, high = arm.limits
     found = arm.poses(q)
     away = np.linalg.norm(found[:, :3, 3] - poses[:, :3, 3], axis=1)
-    turned = Rotation.from_matrix(
-        found[:, :3, :3] @ poses[:, :3, :3].swapaxes(1, 2)
-    ).magnitude()
+    turned = Rotation.from_matrix(found[:, :3, :3] @ poses[:, :3, :3].swapaxes(1, 2)).magnitude()
     inside = ((q >= low) & (q <= high)).all(1)
     return inside & (away <= TOL[0] * (1.0 + 1e-9)) & (turned <= TOL[1] * (1.0 + 1e-9))
 
@@ -326,9 +314,7 @@ def ur5_branches(poses: NDArray) -> NDArray:
     ahead = np.sqrt(np.maximum(radius_sq - across**2, 0.0))
     x, y = wrist[:, 0], wrist[:, 1]
     for side in (-1.0, 1.0):
-        u = np.stack(
-            [across * x - side * ahead * y, across * y + side * ahead * x, 0.0 * x], 1
-        )
+        u = np.stack([across * x - side * ahead * y, across * y + side * ahead * x, 0.0 * x], 1)
         u /= radius_sq[:, None]
         fifth = np.cross(u, last)
         fifth /= np.linalg.norm(fifth, axis=1, keepdims=True)
@@ -403,9 +389,7 @@ def compared(
                     q = solve(poses)
                     seconds.append((time.process_time() - began) / len(poses))
                 share = float(solved(arm, q, poses).mean())
-                entry = dict(
-                    arm=name, program=program, starts=count, n=len(poses), share=share
-                )
+                entry = dict(arm=name, program=program, starts=count, n=len(poses), share=share)
                 entries.append({**entry, "seconds": min(seconds)})
     return entries
 
@@ -457,9 +441,7 @@ def peers_report(entries: list[dict[str, Any]], found: list[dict[str, Any]]) -> 
     """Return the report of what `compared` and `branches` returned."""
     report = Report("Poses of rigid arms", {})
     report.record.update(entries=entries, branches=found, tol=TOL)
-    report.text(
-        "Share of targets solved within tolerance and limits, CPU time per target."
-    )
+    report.text("Share of targets solved within tolerance and limits, CPU time per target.")
     header = ["arm", "program", "starts", "targets", "solved [%]", "CPU time [ms]"]
     report.table(
         header,
@@ -502,9 +484,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", required=True, help="folder of the report")
     parser.add_argument("--programs", nargs="+", choices=PROGRAMS, default=[*PROGRAMS])
-    parser.add_argument(
-        "--targets", type=int, default=1000, help="per arm; default: 1000"
-    )
+    parser.add_argument("--targets", type=int, default=1000, help="per arm; default: 1000")
     parser.add_argument("--seed", type=int, default=0, help="of the draws; default: 0")
     given = parser.parse_args(arguments)
     torch.set_num_threads(1)

@@ -55,9 +55,7 @@ class Latencies(NamedTuple):
 def trunk_ik() -> InverseKinematics:
     """Return inverse kinematics of a hybrid of the simulated trunk (ELM, leverage guard)."""
     data = datasets.load_trunk()
-    model = HybridForwardModel(
-        ConstantCurvatureChain([0.100, 0.093, 0.079]), random_state=0
-    )
+    model = HybridForwardModel(ConstantCurvatureChain([0.100, 0.093, 0.079]), random_state=0)
     model.fit(data.q[:600], data.x[:600])
     low, high = data.q.min(0), data.q.max(0)
     return InverseKinematics(model, q_min=low, q_max=high, dq_max=0.5, dt=1e-9 * PERIOD)
@@ -68,16 +66,8 @@ def python_loop(ik: InverseKinematics, n_ticks: int) -> Latencies:
     home = ik.settings.start(ik.settings.q_min).numpy()
     tracker, rate = ik.tracker(home), 2.0 * np.pi / TURN
     angle = rate * np.arange(n_ticks)[:, None]
-    path = tracker.x + RADIUS * np.hstack(
-        [np.cos(angle) - 1.0, np.sin(angle), 0.0 * angle]
-    )
-    speed = (
-        RADIUS
-        * rate
-        * 1e9
-        / PERIOD
-        * np.hstack([-np.sin(angle), np.cos(angle), 0.0 * angle])
-    )
+    path = tracker.x + RADIUS * np.hstack([np.cos(angle) - 1.0, np.sin(angle), 0.0 * angle])
+    speed = RADIUS * rate * 1e9 / PERIOD * np.hstack([-np.sin(angle), np.cos(angle), 0.0 * angle])
     after, step = np.empty(n_ticks), np.empty(n_ticks)
     gc.collect()
     gc.disable()  # a collection takes milliseconds
@@ -136,34 +126,24 @@ def latency_report(found: dict[str, Latencies]) -> Report:
     report.record["table"] = rows
     step, after = "step [us]", "command after its deadline [us]"
     rest = ("99.9 % below", "worst")
-    report.table(
-        ["loop", "ticks", f"{step}: median", *rest, f"{after}: median", *rest], rows
-    )
-    report.figure(
-        "latency", _figure(found), "All ticks of both loops; dashed: the worst."
-    )
+    report.table(["loop", "ticks", f"{step}: median", *rest, f"{after}: median", *rest], rows)
+    report.figure("latency", _figure(found), "All ticks of both loops; dashed: the worst.")
     return report
 
 
 def _quantile(counts: NDArray, share: float) -> float:
     """Return the upper end of the bin [us] that a share of all ticks lies below."""
-    return 1e-3 * 10.0 ** (
-        0.1 * (1 + np.searchsorted(counts.cumsum(), share * counts.sum()))
-    )
+    return 1e-3 * 10.0 ** (0.1 * (1 + np.searchsorted(counts.cumsum(), share * counts.sum())))
 
 
 def _figure(found: dict[str, Latencies]) -> Any:
     figure, axes = new_figure(8.0, 3.4, 1, 2, sharey=True)
     edges = 10.0 ** (0.1 * np.arange(BINS + 1) - 3.0)
-    for axis, title, what in zip(
-        axes, ("Step", "Command after its deadline"), (1, 0), strict=True
-    ):
+    for axis, title, what in zip(axes, ("Step", "Command after its deadline"), (1, 0), strict=True):
         for k, (name, one) in enumerate(found.items()):
             axis.stairs(one[what], edges, color=f"C{k}", linewidth=1.5, label=name)
             axis.axvline(one[what + 2], color=f"C{k}", linestyle="--", linewidth=1.0)
-        axis.set(
-            xscale="log", yscale="log", xlim=(1.0, 1e4), ylim=(0.5, None), title=title
-        )
+        axis.set(xscale="log", yscale="log", xlim=(1.0, 1e4), ylim=(0.5, None), title=title)
         axis.set_xlabel("time [µs]; dashed: the worst tick")
     axes[0].set_ylabel("ticks")
     axes[0].legend(loc="upper right")
@@ -179,10 +159,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     ik = trunk_ik()
     backend = ik.tracker(ik.settings.start(ik.settings.q_min).numpy()).backend
     found = {f"Python ({backend})": python_loop(ik, given.ticks)}
-    found |= {
-        f"C, {dtype}": c_loop(ik, given.ticks, dtype)
-        for dtype in ("float64", "float32")
-    }
+    found |= {f"C, {dtype}": c_loop(ik, given.ticks, dtype) for dtype in ("float64", "float32")}
     for path in latency_report(found).write(given.out):
         print(path)
 

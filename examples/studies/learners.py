@@ -74,9 +74,7 @@ def _tuned(regressor: Any, seed: int, **grid: Any) -> Any:
 
 
 def _gaussian_process(scales: Any) -> Any:
-    kernel = ConstantKernel(1.0, (1e-3, 1e5)) * RBF(scales, (1e-2, 1e4)) + WhiteKernel(
-        0.1
-    )
+    kernel = ConstantKernel(1.0, (1e-3, 1e5)) * RBF(scales, (1e-2, 1e4)) + WhiteKernel(0.1)
     return _scaled(GaussianProcessRegressor(kernel))
 
 
@@ -106,9 +104,7 @@ TIMED = {name: LEARNERS[name] for name in ("ELMRegressorCV", "KernelRidge", "GP"
 """Learners of the speed curve."""
 
 
-def make_arm(
-    n_samples: int = 2000, random_state: int = 0, swing: float = np.pi / 2
-) -> Rows:
+def make_arm(n_samples: int = 2000, random_state: int = 0, swing: float = np.pi / 2) -> Rows:
     """Return a simulated arm in the manner of kin8nm: 8 angles [rad], distance of the hand [mm].
 
     Eight revolute joints, links of 63 to 188 mm and twists drawn at random; angles uniform in
@@ -186,9 +182,7 @@ def compare_learners(
     for name, (X, y) in sets.items():
         folds = list(zip(splitter.split(X), seeds, strict=True))
         for label, learner in learners.items():
-            runs = [
-                _fit(learner, X, y, train, test, seed) for (train, test), seed in folds
-            ]
+            runs = [_fit(learner, X, y, train, test, seed) for (train, test), seed in folds]
             rmse, seconds = (list(values) for values in zip(*runs, strict=True))
             entry = {"set": name, "learner": label, "n": len(X), "n_inputs": X.shape[1]}
             table.append({**entry, "seeds": seeds, "rmse": rmse, "seconds": seconds})
@@ -263,23 +257,17 @@ def learners_report(table: list[dict[str, Any]], curve: list[dict[str, Any]]) ->
     for name in dict.fromkeys(entry["set"] for entry in table):
         row = [entry for entry in table if entry["set"] == name]
         label = f"{name}, {row[0]['n']} x {row[0]['n_inputs']}"
-        mean, std = np.array(
-            [(np.mean(e["rmse"]), np.std(e["rmse"], ddof=1)) for e in row]
-        ).T
+        mean, std = np.array([(np.mean(e["rmse"]), np.std(e["rmse"], ddof=1)) for e in row]).T
         cells = [f"{m:.4g} ± {s:.2g}" for m, s in zip(mean, std, strict=True)]
         cells[mean.argmin()] = f"**{cells[mean.argmin()]}**"
         errors.append([label, *cells])
         seconds.append([label, *(f"{np.mean(entry['seconds']):.2g}" for entry in row)])
-    report.text(
-        "Root mean square error on held-out rows, mean ± standard deviation over folds."
-    )
+    report.text("Root mean square error on held-out rows, mean ± standard deviation over folds.")
     report.table(header, errors)
     report.text("CPU seconds per fit on one thread, choices included, mean over folds.")
     report.table(header, seconds)
     if curve:
-        report.figure(
-            "elm_speed", _speed_figure(curve), "CPU time per fit and test error, arm."
-        )
+        report.figure("elm_speed", _speed_figure(curve), "CPU time per fit and test error, arm.")
     return report
 
 
@@ -288,12 +276,8 @@ def _speed_figure(curve: list[dict[str, Any]]) -> Any:
     sizes = sorted({entry["n"] for entry in curve})
     labels = ("CPU time per fit [s]", "error on other rows [mm]")
     for ax, key, label in zip(axes, ("seconds", "rmse"), labels, strict=True):
-        for name, look in zip(
-            dict.fromkeys(e["learner"] for e in curve), _LOOKS, strict=False
-        ):
-            n, values = zip(
-                *((e["n"], e[key]) for e in curve if e["learner"] == name), strict=True
-            )
+        for name, look in zip(dict.fromkeys(e["learner"] for e in curve), _LOOKS, strict=False):
+            n, values = zip(*((e["n"], e[key]) for e in curve if e["learner"] == name), strict=True)
             ax.plot(n, values, look[:2], color=look[2:], label=name)
         ax.set(xlabel="training rows", ylabel=label, xscale="log")
         ax.set_xticks(sizes, [str(n) for n in sizes])
@@ -328,9 +312,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", required=True, help="folder of the report")
     parser.add_argument("--learners", nargs="+", choices=LEARNERS, default=[*LEARNERS])
-    parser.add_argument(
-        "--rows", type=int, default=2000, help="rows of a set; default: 2000"
-    )
+    parser.add_argument("--rows", type=int, default=2000, help="rows of a set; default: 2000")
     parser.add_argument(
         "--sizes",
         type=int,
@@ -344,11 +326,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(f"{done}/{total} {what}", file=sys.stderr)
 
     learners = {name: LEARNERS[name] for name in given.learners}
-    timed = {
-        name: learner
-        for name, learner in TIMED.items()
-        if name.split(",")[0] in learners
-    }
+    timed = {name: learner for name, learner in TIMED.items() if name.split(",")[0] in learners}
     table = compare_learners(learning_sets(given.rows), learners, progress=shown)
     curve = time_learners(timed, given.sizes, progress=shown)
     for path in learners_report(table, curve).write(given.out):

@@ -84,12 +84,8 @@ def random_case(seed: int) -> Case:
     lengths = size * rng.dirichlet(np.full(n_segments, 20.0))
     radii = size * rng.uniform(0.03, 0.08) * rng.uniform(0.85, 1.15, n_segments)
     counts = [int(n) for n in rng.integers(3, 5, n_segments)]
-    turns = (
-        rng.uniform(0.0, 2 * np.pi / 3, n_segments) if rng.random() < 0.5 else 0 * radii
-    )
-    angles = [
-        a + 2 * np.pi * np.arange(n) / n for a, n in zip(turns, counts, strict=True)
-    ]
+    turns = rng.uniform(0.0, 2 * np.pi / 3, n_segments) if rng.random() < 0.5 else 0 * radii
+    angles = [a + 2 * np.pi * np.arange(n) / n for a, n in zip(turns, counts, strict=True)]
     base_is_free = bool(rng.random() < 0.75)
     base = np.eye(4)
     if base_is_free:
@@ -108,9 +104,7 @@ def random_case(seed: int) -> Case:
 
     truth = build(radii, lengths, base)
     off = rng.uniform(0.95, 1.05, (2, n_segments))
-    nominal = build(
-        off[0] * radii, off[1] * lengths, np.eye(4) if base_is_free else base
-    )
+    nominal = build(off[0] * radii, off[1] * lengths, np.eye(4) if base_is_free else base)
     q = _commands(rng, truth, lengths, kind)
     x = _tips(truth, q)
     x += ERROR * size * _smooth(rng, (q - q.mean(axis=0)) / q.std(axis=0))
@@ -129,9 +123,7 @@ def random_case(seed: int) -> Case:
     return Case(nominal, base_is_free, log.rows(slice(n)), log.rows(slice(n, None)))
 
 
-def _commands(
-    rng: np.random.Generator, chain: Chain, lengths: NDArray, kind: str
-) -> NDArray:
+def _commands(rng: np.random.Generator, chain: Chain, lengths: NDArray, kind: str) -> NDArray:
     """Return the commands of smooth motions, (N, n) [m]."""
     radii, angles = (
         chain.radii.numpy(),
@@ -150,9 +142,7 @@ def _commands(
             part = -radii[k] * (seen @ np.stack([np.cos(around), np.sin(around)]))
             if kind == "extensible":
                 stretch = 1.0 + 0.08 * rng.standard_normal() + 0.04 * np.sin(np.pi * s)
-                whole = (
-                    lengths[: k + 1].sum() if chain.routing == "base" else lengths[k]
-                )
+                whole = lengths[: k + 1].sum() if chain.routing == "base" else lengths[k]
                 part = part + whole * stretch
             elif kind == "elastic":
                 part = part - 0.1 * radii[k] * bend * abs(rng.standard_normal())
@@ -170,9 +160,7 @@ def _tips(chain: Chain, q: NDArray) -> NDArray:
 def _smooth(rng: np.random.Generator, z: NDArray) -> NDArray:
     """Return a smooth function (N, 3) of unit size."""
     weights, phases = rng.standard_normal((z.shape[1], 8)), rng.uniform(0, 2 * np.pi, 8)
-    y = np.sin(0.5 * z @ weights / z.shape[1] ** 0.5 + phases) @ rng.standard_normal(
-        (8, 3)
-    )
+    y = np.sin(0.5 * z @ weights / z.shape[1] ** 0.5 + phases) @ rng.standard_normal((8, 3))
     y -= y.mean(axis=0)
     return y / np.sqrt((y**2).sum(axis=1).mean())
 
@@ -207,12 +195,7 @@ def _within(case: Case, rng: np.random.Generator) -> Case:
 
 def _segments(case: Case, rng: np.random.Generator) -> Case | None:
     parts = case.parts
-    pairs = [
-        (i, j)
-        for i in range(len(parts))
-        for j in range(i)
-        if len(parts[i]) == len(parts[j])
-    ]
+    pairs = [(i, j) for i in range(len(parts)) for j in range(i) if len(parts[i]) == len(parts[j])]
     if not pairs:
         return None
     order = np.arange(case.chain.n_actuators)
@@ -259,17 +242,13 @@ def _absolute(case: Case, rng: np.random.Generator) -> Case:
     whole = case.chain.lengths.numpy()
     whole = np.cumsum(whole) if case.chain.routing == "base" else whole
     return case.both(
-        lambda log: replace(
-            log, q=log.q + np.repeat(whole, case.chain.actuators_per_segment)
-        )
+        lambda log: replace(log, q=log.q + np.repeat(whole, case.chain.actuators_per_segment))
     )
 
 
 def _gap(case: Case, rng: np.random.Generator) -> Case:
     t = np.array(case.log.time)
-    t[int(rng.integers(5, N_ROWS - 5)) + N_ROWS * int(rng.integers(N_MOTIONS)) :] += (
-        30 * STEP
-    )
+    t[int(rng.integers(5, N_ROWS - 5)) + N_ROWS * int(rng.integers(N_MOTIONS)) :] += 30 * STEP
     return case.only(time=t)
 
 
@@ -294,9 +273,7 @@ def _q_drift(case: Case, rng: np.random.Generator) -> Case:
 def _x_drift(case: Case, rng: np.random.Generator) -> Case:
     way = rng.standard_normal(3)
     way *= 0.6 * np.sqrt(case.log.x.var(axis=0).sum()) / np.linalg.norm(way)
-    return case.only(
-        x=case.log.x + np.linspace(0.0, 1.0, len(case.log.x))[:, None] * way
-    )
+    return case.only(x=case.log.x + np.linspace(0.0, 1.0, len(case.log.x))[:, None] * way)
 
 
 def _camera(case: Case, rng: np.random.Generator) -> Case:
@@ -323,9 +300,7 @@ def _frozen_marker(case: Case, rng: np.random.Generator) -> Case:
 def _dead(case: Case, rng: np.random.Generator) -> Case:
     """Return a log in which one actuator's column is constant."""
     i, value = int(rng.integers(case.chain.n_actuators)), case.log.q[0]
-    return case.both(
-        lambda log: replace(log, q=np.where(np.arange(len(value)) == i, value, log.q))
-    )
+    return case.both(lambda log: replace(log, q=np.where(np.arange(len(value)) == i, value, log.q)))
 
 
 def _rebuilt(case: Case, **changes: Any) -> Case:
@@ -481,9 +456,7 @@ def examined(case: Case, fit: bool | None = None) -> Outcome:
     try:
         report = check_log(case.log, chain=case.chain, base_is_free=case.base_is_free)
     except ValueError as error:
-        return Outcome(
-            ("actuators",) if "actuators" in str(error) else (), str(error), None
-        )
+        return Outcome(("actuators",) if "actuators" in str(error) else (), str(error), None)
     found = [f for f in report.findings if f.severity != "note"]
     kinds, advice = tuple(f.kind for f in found), " ".join(f.advice for f in found)
     if not (not kinds if fit is None else fit):
@@ -509,9 +482,7 @@ def advised(case: Case, advice: str) -> Case | None:
             changed = _permuted(changed, [names.index(name) for name in value])
     for key, text in re.findall(r"\b(q|q_sign) = (\[[^\]]*\]|-?1)", advice):
         if key == "q_sign":
-            changed = _scaled("q", np.array(json.loads(text)))(
-                changed, np.random.default_rng(0)
-            )
+            changed = _scaled("q", np.array(json.loads(text)))(changed, np.random.default_rng(0))
     if "clockwise = true" in advice or "clockwise = false" in advice:
         changed = _clockwise(changed, np.random.default_rng(0))
     return None if changed is case or changed is None else changed
@@ -601,10 +572,7 @@ def write(found: dict[str, Any], seconds: float) -> Report:
         [name, *(str(count.get(key, 0)) for key in columns)]
         for name, count in found["mistakes"].items()
     ]
-    total = [
-        sum(count.get(key, 0) for count in found["mistakes"].values())
-        for key in columns
-    ]
+    total = [sum(count.get(key, 0) for count in found["mistakes"].values()) for key in columns]
     rows.append(["all", *map(str, total)])
     report.table(["mistake", *columns], rows)
     report.text(
@@ -617,9 +585,7 @@ def write(found: dict[str, Any], seconds: float) -> Report:
 
 def main() -> None:
     """Run the study and print its table."""
-    parser = argparse.ArgumentParser(
-        description="Make mistakes in logs and count the named ones."
-    )
+    parser = argparse.ArgumentParser(description="Make mistakes in logs and count the named ones.")
     parser.add_argument("--n", type=int, default=200, help="robots")
     parser.add_argument("--first", type=int, default=0, help="seed of the first robot")
     parser.add_argument("--only", nargs="*", help="mistakes")

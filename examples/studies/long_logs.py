@@ -103,9 +103,7 @@ def write_long_log(path: Path, n_rows: int) -> None:
     x += NOISE * rng.standard_normal(x.shape)
     columns = {"q": q, "x": x, "motion": groups, "time": 0.01 * np.arange(len(q))}
     np.savez(path, **columns)
-    text = "".join(
-        f"[[segment]]\nradius = {radius}\n" for radius in (0.1, 0.093, 0.079)
-    )
+    text = "".join(f"[[segment]]\nradius = {radius}\n" for radius in (0.1, 0.093, 0.079))
     Path(path).with_suffix(".toml").write_text(
         f'name = "trunk"\ncalibrate = "auto"\n{text}'
         f"[log]\nq = {[f'q[{i}]' for i in range(9)]}\nx = {[f'x[{i}]' for i in range(3)]}\n"

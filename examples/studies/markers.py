@@ -65,9 +65,7 @@ def settled(name: str, targets: NDArray) -> tuple[NDArray, NDArray]:
     return np.array(q), np.array(x)
 
 
-def trunks(
-    sizes: Sequence[int], n_draws: int, n_test: int, folder: Any
-) -> Iterator[Case]:
+def trunks(sizes: Sequence[int], n_draws: int, n_test: int, folder: Any) -> Iterator[Case]:
     """Yield the cases of the simulated trunks."""
     for seed, name in enumerate(PLANTS):
         most = max(sizes)
@@ -91,13 +89,9 @@ def runs(sizes: Sequence[int], data_home: Any) -> Iterator[Case]:
     data = recording(datasets.load_asl_trunk, data_home)
     if data is None:
         return
-    q = np.hstack(
-        [SPOOL * sign * data.q[:, pair] for pair in _PAIRS for sign in (-1.0, 1.0)]
-    )
+    q = np.hstack([SPOOL * sign * data.q[:, pair] for pair in _PAIRS for sign in (-1.0, 1.0)])
     x = data.disks.reshape(-1, 9)
-    chain = ConstantCurvatureChain(
-        np.full(3, 0.02), n_actuators=4, lengths=(0.107, 0.098, 0.12)
-    )
+    chain = ConstantCurvatureChain(np.full(3, 0.02), n_actuators=4, lengths=(0.107, 0.098, 0.12))
     for fold, (train, test) in enumerate(GroupKFold(5).split(q, groups=data.groups)):
         for n in sizes:
             rows = train[np.linspace(0, len(train) - 1, n).astype(int)]
@@ -115,17 +109,11 @@ def examined(case: Case, models: Sequence[str]) -> list[dict[str, Any]]:
         for markers, columns in MARKERS.items():
             chain = case.chain if markers == "three" else case.chain.tip_model
             how = None if name == "auto" else "default"
-            model = HybridForwardModel(
-                chain, calibrate=how, random_state=0, **MODELS[name]
-            )
+            model = HybridForwardModel(chain, calibrate=how, random_state=0, **MODELS[name])
             start = time.process_time()
-            with (
-                warnings.catch_warnings()
-            ):  # few rows; tendons that contradict each other
+            with warnings.catch_warnings():  # few rows; tendons that contradict each other
                 warnings.simplefilter("ignore", UserWarning)
-                tips = model.fit(q, x[:, columns], groups=groups).predict(q_test)[
-                    :, -3:
-                ]
+                tips = model.fit(q, x[:, columns], groups=groups).predict(q_test)[:, -3:]
             errors = np.linalg.norm(tips - x_test[:, 6:], axis=1)
             entry[markers] = {"mean": float(errors.mean()), "max": float(errors.max())}
             entry[markers] |= {
@@ -134,9 +122,7 @@ def examined(case: Case, models: Sequence[str]) -> list[dict[str, Any]]:
             }
             if name == "calibrated chain":
                 body = model.mechanical_model_.with_markers(ENDS[:2])
-                found = (
-                    HybridForwardModel(body, "drop").fit(q, x[:, :6]).predict(q_test)
-                )
+                found = HybridForwardModel(body, "drop").fit(q, x[:, :6]).predict(q_test)
                 far = np.linalg.norm((found - x_test[:, :6]).reshape(-1, 2, 3), axis=2)
                 entry[markers]["others"] = float(far.mean())
         entries.append(entry)
@@ -187,9 +173,7 @@ def write(entries: list[dict[str, Any]]) -> Report:
         rows.append(["the same chain, other two ends"])
         for n in sizes:
             some = [e for e in own if e["n"] == n and "others" in e["one"]]
-            both = 1e3 * np.mean(
-                [[e[m]["others"] for m in MARKERS] for e in some], axis=0
-            )
+            both = 1e3 * np.mean([[e[m]["others"] for m in MARKERS] for e in some], axis=0)
             rows[-1].append(f"{both[0]:.2f} / {both[1]:.2f}")
             lines.append([robot, n, rows[-1][0], *map(float, both)])
         report.table(["model", *(f"n = {n}" for n in sizes)], rows)
@@ -201,17 +185,13 @@ def write(entries: list[dict[str, Any]]) -> Report:
 def main() -> None:
     """Run the study from the command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "--out", required=True, help="folder for report.md and report.json"
-    )
+    parser.add_argument("--out", required=True, help="folder for report.md and report.json")
     parser.add_argument("--data", help="folder of the recordings")
     parser.add_argument("--rows", help="folder that keeps the simulated rows")
     parser.add_argument("--models", nargs="+", default=[*MODELS], choices=MODELS)
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     given = parser.parse_args()
-    entries = study(
-        models=given.models, data_home=given.data, folder=given.rows, n_jobs=given.jobs
-    )
+    entries = study(models=given.models, data_home=given.data, folder=given.rows, n_jobs=given.jobs)
     write(entries).write(given.out)
 
 

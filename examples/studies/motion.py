@@ -23,9 +23,7 @@ JUMP = np.array([0.1, 0.05, -0.02])
 def loop(dt: float, duration: float = 8.0) -> NDArray:
     """Return a loop with a radius of 15 cm, from the tip at HOME."""
     phase = 2.0 * np.pi * np.arange(0.0, 1.0, dt / duration)
-    way = np.stack(
-        [np.sin(phase), np.cos(phase) - 1.0, 0.4 * np.sin(2.0 * phase)], axis=1
-    )
+    way = np.stack([np.sin(phase), np.cos(phase) - 1.0, 0.4 * np.sin(2.0 * phase)], axis=1)
     return _tip() + 0.15 * way
 
 
@@ -37,9 +35,7 @@ def beyond_plane(dt: float, **options: float) -> tuple[float, float]:
     planes = ([normal], [offset])
     ik = InverseKinematics(trunk, **LIMITS, **options, dt=dt, tip_limits=planes)
     track = ik.track(path, q0=HOME)
-    return float((track.x @ normal).max() - offset), float(
-        (path @ normal > offset).mean()
-    )
+    return float((track.x @ normal).max() - offset), float((path @ normal > offset).mean())
 
 
 def overshoot(ddq_max: float, dt: float = 0.01, duration: float = 4.0) -> float:
@@ -60,8 +56,6 @@ def _tip() -> NDArray:
 if __name__ == "__main__":
     for dt in (0.02, 0.01, 0.005):
         passed, share = beyond_plane(dt)
-        print(
-            f"dt = {dt} s: {1e6 * passed:.2f} um beyond the plane, {100 * share:.0f} % behind it"
-        )
+        print(f"dt = {dt} s: {1e6 * passed:.2f} um beyond the plane, {100 * share:.0f} % behind it")
     for ddq_max in (0.05, 0.5, 5.0):
         print(f"ddq_max = {ddq_max} m/s^2: overshoot {100 * overshoot(ddq_max):.4f} %")

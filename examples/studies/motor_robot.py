@@ -137,11 +137,7 @@ class MotorRobot:
         camera[:3, 3] = rng.uniform(-0.1, 0.1, 3)
         common_zero = rng.integers(1500, 2500) if rng.random() < 0.5 else 0
         mixed_signs = rng.random() < 0.25
-        signs = (
-            rng.choice([-1.0, 1.0], n)
-            if mixed_signs
-            else np.full(n, rng.choice([-1.0, 1.0]))
-        )
+        signs = rng.choice([-1.0, 1.0], n) if mixed_signs else np.full(n, rng.choice([-1.0, 1.0]))
         per_metre = 1e3 * np.exp(rng.uniform(np.log(25), np.log(150)))
         return cls(
             lengths=rng.uniform(0.07, 0.11, 2),
@@ -159,8 +155,7 @@ class MotorRobot:
             camera=camera,
             counts_per_metre=per_metre * rng.uniform(0.995, 1.005, n),
             signs=signs,
-            zeros=common_zero
-            + (rng.integers(-40, 41, n) if common_zero else np.zeros(n)),
+            zeros=common_zero + (rng.integers(-40, 41, n) if common_zero else np.zeros(n)),
             backlash=backlash,
         )
 
@@ -201,11 +196,7 @@ class MotorRobot:
 
     def pulls(self, counts: ArrayLike) -> NDArray:
         """Return the pulls that counts (N, n) command, without backlash [m]."""
-        return (
-            self.signs
-            * (np.asarray(counts, dtype=float) - self.zeros)
-            / self.counts_per_metre
-        )
+        return self.signs * (np.asarray(counts, dtype=float) - self.zeros) / self.counts_per_metre
 
     def counts(self, pulls: ArrayLike) -> NDArray:
         """Return the counts (N, n), not rounded, of pulls [m]."""
@@ -267,9 +258,7 @@ class MotorRobot:
             todo, shape, own = todo[is_open], shape[is_open], own[is_open]
             step = -torch.linalg.solve(self._hessian(shape, own), gradient[is_open])
             shapes[todo] = self._descended(shape, step, own)
-        raise ValueError(
-            f"{len(todo)} of {len(distinct)} shapes have no balance of forces."
-        )
+        raise ValueError(f"{len(todo)} of {len(distinct)} shapes have no balance of forces.")
 
     def energy(self, shapes: Tensor, pulls: Tensor) -> Tensor:
         """Return the energy (N,) of shapes (N, 22) at pulls (N, n) [J]."""
@@ -315,9 +304,7 @@ class MotorRobot:
 
     def _tensors(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         arrays = self.stiffness, self.paths, self.tendon_stiffness, self.pretension
-        stiffness, paths, tendon, pretension = (
-            torch.from_numpy(array) for array in arrays
-        )
+        stiffness, paths, tendon, pretension = (torch.from_numpy(array) for array in arrays)
         return stiffness, paths, tendon, pretension
 
     def _weight(self, shapes: Tensor) -> Tensor:
@@ -418,9 +405,7 @@ class MotorRobot:
         for _ in range(motions):
             direction = rng.uniform(0.0, 2 * np.pi, (3, 2))
             size = bend * np.sqrt(rng.random((3, 2)))
-            goals = size[..., None] * np.stack(
-                [np.cos(direction), np.sin(direction)], axis=-1
-            )
+            goals = size[..., None] * np.stack([np.cos(direction), np.sin(direction)], axis=-1)
             goals = np.concatenate([np.zeros((1, 2, 2)), goals, np.zeros((1, 2, 2))])
             bends = np.cumsum(CubicSpline(knots, goals)(along), axis=1)[:, self.segment]
             around = np.stack([np.cos(self.angles), np.sin(self.angles)], axis=1)

@@ -60,9 +60,7 @@ from hybridkin.app.workflow.report import Report
 
 FIT = "fit"  # models that begin so are made by the command line
 _STILL = 0.02  # of the rms of the direction with the largest motion
-_NEAR = (
-    0.025  # largest distance of a path from a measured tip, relative to their extent
-)
+_NEAR = 0.025  # largest distance of a path from a measured tip, relative to their extent
 # of the path, relative to the extent of the tips.
 _SIZES = (
     0.5,
@@ -98,9 +96,7 @@ class Directions(NamedTuple):
     moved_rms: NDArray  # (n - k,) [counts]
 
 
-def set_up(
-    seed: int, folder: Path, tendons: int = 3, commands: str = "rounded"
-) -> Setup:
+def set_up(seed: int, folder: Path, tendons: int = 3, commands: str = "rounded") -> Setup:
     """Write the log and the description of a random robot and return them.
 
     Parameters
@@ -161,9 +157,7 @@ def _shape(shape: str, centre: NDArray, size: float, normal: NDArray) -> NDArray
     timing = {"duration": _DURATION, "dt": _DT, "normal": normal}
     if shape == "circle":
         radius = 0.5 * size
-        return trajectories.spiral(
-            centre, (radius, radius), turns=1.0, rise=0.0, **timing
-        ).x
+        return trajectories.spiral(centre, (radius, radius), turns=1.0, rise=0.0, **timing).x
     return trajectories.figure_eight(centre, (size, 0.5 * size), **timing).x
 
 
@@ -219,9 +213,7 @@ def _fit_in_python(setup: Setup, error_model: str) -> dict[str, float]:
     if robot.log is None:
         raise ValueError("the description lacks [log].")
     data = datasets.load_log(setup.folder / "log.csv", **robot.log.reading)
-    hybrid = HybridForwardModel(
-        robot.chain, error_model, calibrate=robot.calibrate, random_state=0
-    )
+    hybrid = HybridForwardModel(robot.chain, error_model, calibrate=robot.calibrate, random_state=0)
     compared = cross_fit({"hybrid": hybrid}, data, _FOLDS)
     errors, far = compared.distances[0], compared.distances_from_others
     held_out = {"mean": float(errors.mean()), "p95": float(np.quantile(errors, 0.95))}
@@ -255,9 +247,7 @@ def _run(arguments: list[Any]) -> tuple[dict[str, Any], str]:
         "--quiet",
     ]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(
-        command, capture_output=True, text=True, env=environment, check=False
-    )
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
     if done.returncode > 1:  # 1: points were not reached
         return {}, (done.stdout + done.stderr).strip()
     return json.loads(done.stdout), ""
@@ -265,10 +255,7 @@ def _run(arguments: list[Any]) -> tuple[dict[str, Any], str]:
 
 def _cpu() -> float:
     """Return the CPU time of this process and of those that it waited for [s]."""
-    usages = (
-        resource.getrusage(who)
-        for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
-    )
+    usages = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     return sum(usage.ru_utime + usage.ru_stime for usage in usages)
 
 
@@ -312,9 +299,7 @@ def track(setup: Setup, model: str, number: int, larger: float = 1.0) -> dict[st
         record, error = _run([*command, "--scale", advice.group(1)])
     if error:
         return {**entry, "error": error}
-    sent = np.genfromtxt(
-        out / "track.csv", delimiter=",", names=True, dtype=None, encoding="utf-8"
-    )
+    sent = np.genfromtxt(out / "track.csv", delimiter=",", names=True, dtype=None, encoding="utf-8")
     on_path = sent["status"] != "LEAD_IN"
     n = setup.robot.n_tendons
     counts = np.stack([sent[f"q{i + 1}"] for i in range(n)], axis=1)
@@ -322,9 +307,7 @@ def track(setup: Setup, model: str, number: int, larger: float = 1.0) -> dict[st
     motion = counts
     if "effective_q1" in sent.dtype.names:
         motion = np.stack([sent[f"effective_q{i + 1}"] for i in range(n)], axis=1)
-    target = (
-        1e-3 * np.stack([sent[f"target_{axis}"] for axis in "xyz"], axis=1)[on_path]
-    )
+    target = 1e-3 * np.stack([sent[f"target_{axis}"] for axis in "xyz"], axis=1)[on_path]
     tips = setup.robot.tips(counts, setup.log.pulls, round=True)[on_path]
     errors = np.linalg.norm(tips - target, axis=1)
     noise = _NOISE * np.random.default_rng(number).standard_normal(tips.shape)
@@ -398,9 +381,7 @@ def along_still(setup: Setup, folder: Path, counts: NDArray) -> dict[str, float]
             entry[f"{name}_{kind}"] = _per_count(function, counts[rows], axes)
             entry[f"{name}_{kind}_in_log"] = _per_count(function, projected[rows], axes)
     for name, at in {"model_error": counts, "model_error_projected": projected}.items():
-        distance = np.linalg.norm(
-            functions["model"](at) - functions["robot"](at), axis=1
-        )
+        distance = np.linalg.norm(functions["model"](at) - functions["robot"](at), axis=1)
         entry[name] = float(distance.mean())
     correction = functions["model"](counts) - functions["mechanical"](counts)
     in_log = functions["model"](projected) - functions["mechanical"](projected)
@@ -412,11 +393,7 @@ def along_still(setup: Setup, folder: Path, counts: NDArray) -> dict[str, float]
 def _per_count(function: Any, counts: NDArray, axes: NDArray) -> float:
     """Return the rms motion of the tip for one count along the axes, by central differences."""
     steps = [function(counts + axis) - function(counts - axis) for axis in axes.T]
-    return (
-        float(np.sqrt(np.mean(np.sum((0.5 * np.array(steps)) ** 2, axis=-1))))
-        if steps
-        else 0.0
-    )
+    return float(np.sqrt(np.mean(np.sum((0.5 * np.array(steps)) ** 2, axis=-1)))) if steps else 0.0
 
 
 def one_robot(
@@ -430,9 +407,7 @@ def one_robot(
 ) -> list[dict[str, Any]]:
     """Return the entries of all models and paths of a robot; a refusal is an entry, too."""
     torch.set_num_threads(1)
-    setup = set_up(
-        seed, out / "robots" / f"{seed}_{tendons}_{commands}", tendons, commands
-    )
+    setup = set_up(seed, out / "robots" / f"{seed}_{tendons}_{commands}", tendons, commands)
     entries = []
     for model in models:
         common: dict[str, Any] = {"robot": seed, "model": model, "commands": commands}
@@ -500,9 +475,7 @@ def tracks_report(entries: list[dict[str, Any]]) -> Report:
     Report
         ``report.write(folder)`` writes it, with the figures in ``motor_tracks.csv``.
     """
-    report = Report(
-        "Promised and true errors of commands on simulated motor robots", {}
-    )
+    report = Report("Promised and true errors of commands on simulated motor robots", {})
     report.record.update(entries=entries)
     done = [entry for entry in entries if "error" not in entry]
     keys = ("robot", "model", "commands", "path")
@@ -529,9 +502,7 @@ def tracks_report(entries: list[dict[str, Any]]) -> Report:
                 )
     for entry in entries:
         if "error" in entry:
-            report.text(
-                f"Refused: robot {entry['robot']}, {entry['model']}, {entry['error']}"
-            )
+            report.text(f"Refused: robot {entry['robot']}, {entry['model']}, {entry['error']}")
     if done:
         report.figure("motor_tracks", _picture(done), "Promised and true mean errors.")
     numbers = [[*(e[key] for key in keys), *_figures(e), e["saved"]] for e in done]
@@ -542,9 +513,7 @@ def tracks_report(entries: list[dict[str, Any]]) -> Report:
 def _figures(entry: dict[str, Any]) -> list[float]:
     figures = []
     for key, factor in COLUMNS.values():
-        figures.append(
-            float("nan") if entry[key] is None else factor * float(entry[key])
-        )
+        figures.append(float("nan") if entry[key] is None else factor * float(entry[key]))
     return figures
 
 
@@ -555,9 +524,7 @@ def _cell(figure: float) -> str:
 def _picture(entries: list[dict[str, Any]]) -> Any:
     """Return the figure of true errors against promised ones."""
     figure, ax = plt.subplots(figsize=(5.0, 5.0), layout="constrained")
-    for marker, model in zip(
-        "osD^vP*X", dict.fromkeys(e["model"] for e in entries), strict=False
-    ):
+    for marker, model in zip("osD^vP*X", dict.fromkeys(e["model"] for e in entries), strict=False):
         chosen = [entry for entry in entries if entry["model"] == model]
         promised = [1e3 * entry["expected_mean"] for entry in chosen]
         true = [1e3 * entry["true_mean"] for entry in chosen]
@@ -565,12 +532,8 @@ def _picture(entries: list[dict[str, Any]]) -> Any:
     ends = np.array([ax.get_xlim(), ax.get_ylim()])
     line = np.array([max(ends[:, 0].min(), 0.2), ends[:, 1].max()])
     ax.plot(line, line, color="0.4", linewidth=1.0, label="as promised")
-    ax.plot(
-        line, 1.5 * line, color="0.4", linewidth=1.0, linestyle=":", label="1.5 times"
-    )
-    ax.set(
-        xscale="log", yscale="log", xlabel="promised mean [mm]", ylabel="true mean [mm]"
-    )
+    ax.plot(line, 1.5 * line, color="0.4", linewidth=1.0, linestyle=":", label="1.5 times")
+    ax.set(xscale="log", yscale="log", xlabel="promised mean [mm]", ylabel="true mean [mm]")
     ax.set_title("Commands on simulated robots")
     ax.legend()
     return figure
@@ -589,9 +552,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         default=[FIT],
         help='such as "fit --hysteresis auto" lwpr',
     )
-    parser.add_argument(
-        "--tendons", type=int, default=3, help="in a segment; 4: two pairs"
-    )
+    parser.add_argument("--tendons", type=int, default=3, help="in a segment; 4: two pairs")
     parser.add_argument("--commands", default=COMMANDS[0], choices=COMMANDS)
     parser.add_argument(
         "--beyond",

@@ -98,9 +98,7 @@ def box_entries(
     chosen, expected = choose_rows(case.chain, case.q, max(sizes))
     ways = {CHOSEN: [chosen], FARTHEST: [_farthest(case.q, max(sizes))]}
     ways[SOBOL] = [_nearest_to_sobol(case.q, max(sizes), case.draw)]
-    ways[RANDOM] = [
-        np.random.default_rng([case.draw, k]).permutation(len(case.q)) for k in (0, 1)
-    ]
+    ways[RANDOM] = [np.random.default_rng([case.draw, k]).permutation(len(case.q)) for k in (0, 1)]
     test = case.tests["without noise"]
     entries = []
     for way, orders in ways.items():
@@ -120,9 +118,7 @@ def box_entries(
                     entries[-1]["expected"] = expected[n - 1]
             for n in auto if way in (CHOSEN, RANDOM) else ():
                 entries.append(
-                    _entry(
-                        case, way, "auto", case.q[order[:n]], case.x[order[:n]], test
-                    )
+                    _entry(case, way, "auto", case.q[order[:n]], case.x[order[:n]], test)
                 )
     return entries
 
@@ -159,9 +155,7 @@ def along_a_path(
         As of `box`, with the ways "chosen for the path, its own rows too" (with noise),
         "chosen for the path", "chosen" and "random".
     """
-    path = trajectories.figure_eight(
-        (0.0, 0.0, 0.70), (0.50, 0.25), duration=n_points / 10, dt=0.1
-    )
+    path = trajectories.figure_eight((0.0, 0.0, 0.70), (0.50, 0.25), duration=n_points / 10, dt=0.1)
     limits = {"q_min": _LOW, "q_max": _HIGH, "q_pref": 0.25}
     ik = InverseKinematics(robots.bionic_handling_assistant(), dt=0.1, **limits)
     q = ik.track(path).q[:n_points]
@@ -187,9 +181,7 @@ def along_a_path(
             *((RANDOM, pool, random[:k]) for k in more),
         ]
         for way, (lengths, tips), rows in ways:
-            entries.append(
-                _entry(case, way, STRUCTURAL, lengths[rows], tips[rows], test)
-            )
+            entries.append(_entry(case, way, STRUCTURAL, lengths[rows], tips[rows], test))
     return entries
 
 
@@ -227,9 +219,7 @@ def motions(
     list of dict
         As of `box`; n counts motions.
     """
-    cases = [
-        c for c in motion_cases(data_home, None, 1) if c.name == "elastic tendons"
-    ][:1]
+    cases = [c for c in motion_cases(data_home, None, 1) if c.name == "elastic tendons"][:1]
     if not cases:
         return []
     data, entries = datasets.load_ftdcr(data_home), []
@@ -240,14 +230,9 @@ def motions(
         test, pool = np.isin(data.groups, order[:n_out]), order[n_out:]
         rows = np.isin(data.groups, pool)
         case = cases[0]._replace(name="ftdcr_v4", draw=draw)
-        chosen = choose_rows(
-            case.chain, data.q[rows], max(sizes), groups=data.groups[rows]
-        )[0]
+        chosen = choose_rows(case.chain, data.q[rows], max(sizes), groups=data.groups[rows])[0]
         ways = [(CHOSEN, chosen)]
-        ways += [
-            (RANDOM, np.random.default_rng([draw, k]).permutation(pool))
-            for k in range(3)
-        ]
+        ways += [(RANDOM, np.random.default_rng([draw, k]).permutation(pool)) for k in range(3)]
         for way, some in ways:
             for n in sizes:
                 log = [np.flatnonzero(data.groups == name)[::thin] for name in some[:n]]
@@ -313,18 +298,12 @@ def _nearest_to_sobol(q: NDArray, n: int, seed: int) -> NDArray:
     return np.array(rows)
 
 
-def worth(
-    entries: Sequence[dict[str, Any]], case: str, error: float, key: str = "mean"
-) -> float:
+def worth(entries: Sequence[dict[str, Any]], case: str, error: float, key: str = "mean") -> float:
     """Return how many random rows have an error [m], between those that were fitted.
 
     Straight in the logarithms of rows and error; NaN where the error is not between theirs.
     """
-    of = [
-        e
-        for e in entries
-        if (e["case"], e["way"], e["model"]) == (case, RANDOM, STRUCTURAL)
-    ]
+    of = [e for e in entries if (e["case"], e["way"], e["model"]) == (case, RANDOM, STRUCTURAL)]
     sizes = sorted({e["n"] for e in of})
     means = [np.mean([e[key] for e in of if e["n"] == n]) for n in sizes]
     means = np.minimum.accumulate(means)
@@ -393,10 +372,7 @@ def _worths(entries: list[dict[str, Any]], case: str) -> list[str]:
     for way in dict.fromkeys(e["way"] for e in entries if e["way"].startswith(CHOSEN)):
         for n in sorted({e["n"] for e in entries if e["way"] == way}):
             some = [e for e in entries if (e["way"], e["n"]) == (way, n)]
-            by = [
-                worth(entries, case, np.mean([e[k] for e in some]), k)
-                for k in ("mean", "max")
-            ]
+            by = [worth(entries, case, np.mean([e[k] for e in some]), k) for k in ("mean", "max")]
             lines.append(
                 f"- {n} rows, {way}: worth {by[0]:.0f} random ones by the mean, {by[1]:.0f} by the "
                 "largest error (nan: not between those fitted)."
@@ -415,17 +391,11 @@ def _cell(entries: list[dict[str, Any]], way: str, n: int) -> str:
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the study and write its report."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument(
-        "--out", default="results/next_rows", help="folder of the report"
-    )
+    parser.add_argument("--out", default="results/next_rows", help="folder of the report")
     parser.add_argument("--draws", type=int, default=3)
-    parser.add_argument(
-        "--rows", default=None, help="folder that keeps rows of the trunks"
-    )
+    parser.add_argument("--rows", default=None, help="folder that keeps rows of the trunks")
     parser.add_argument("--data", default=None, help="folder of the recordings")
-    parser.add_argument(
-        "--jobs", type=int, default=1, help="processes to simulate with"
-    )
+    parser.add_argument("--jobs", type=int, default=1, help="processes to simulate with")
     given = parser.parse_args(argv)
     torch.set_num_threads(1)
     common = {"n_draws": given.draws, "folder": given.rows, "n_jobs": given.jobs}

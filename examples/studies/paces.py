@@ -46,9 +46,7 @@ def motions(rng: np.random.Generator, n: int, speed: float = 1.0) -> Commands:
     return Commands(q.reshape(-1, 9), np.repeat(np.arange(n), ROWS), np.cumsum(steps))
 
 
-def measured(
-    commands: Commands, operator: Hysteresis, rng: np.random.Generator
-) -> NDArray:
+def measured(commands: Commands, operator: Hysteresis, rng: np.random.Generator) -> NDArray:
     """Return the tips (N, 3) of the robot, whose commands go on between the rows [m]."""
 
     def moved(rows: NDArray) -> NDArray:
@@ -75,9 +73,7 @@ def table_of(kind: str, seed: int) -> list[list[str]]:
     rows = []
     for speed in SPEEDS:
         new = motions(np.random.default_rng(1000 + seed), NEW, speed)
-        error = np.linalg.norm(
-            model.predict(new) - measured(new, operator, rng), axis=1
-        )
+        error = np.linalg.norm(model.predict(new) - measured(new, operator, rng), axis=1)
         inside = model.in_domain(new)
         covered = error <= model.radius_.inside
         shares = [inside.mean(), covered[inside].mean(), covered.mean()]

@@ -89,9 +89,7 @@ ROBOTS: dict[str, Callable[[], Robot]] = {
     "elastic tendons, 3 segments": lambda: _elastic(3),
     "elastic tendons, 2 segments": lambda: _elastic(2),
     "hybrid, parallel ELM": lambda: _hybrid(),
-    "hybrid, serial quadratic": lambda: _hybrid(
-        coupling="serial", error_model="quadratic"
-    ),
+    "hybrid, serial quadratic": lambda: _hybrid(coupling="serial", error_model="quadratic"),
     'hybrid, "auto"': lambda: _hybrid(error_model="auto", calibrate=("radii", "base")),
 }
 """Robots of the study, by name."""
@@ -239,9 +237,7 @@ def study(
     for done, (name, make) in enumerate(robots.items(), 1):
         robot = make()
         for label, options in (("0", {"restarts": 0}), ("default", {})):
-            found = reached_targets(
-                name, robot, each, random_state=random_state, **options
-            )
+            found = reached_targets(name, robot, each, random_state=random_state, **options)
             entries += [{**entry, "restarts": label} for entry in found]
         if progress is not None:
             progress(name, done, len(robots))
@@ -264,13 +260,8 @@ def reachable_report(entries: list[dict[str, Any]]) -> Report:
     report = Report("Reachable targets", {})
     report.record.update(table=entries, tol=TOL)
     for key in ("robot", "kind", "start"):
-        report.text(
-            f"By {key}: targets not reached, with one start and with further ones."
-        )
-        rows = [
-            _row(value, key, entries)
-            for value in dict.fromkeys(e[key] for e in entries)
-        ]
+        report.text(f"By {key}: targets not reached, with one start and with further ones.")
+        rows = [_row(value, key, entries) for value in dict.fromkeys(e[key] for e in entries)]
         report.table(_HEADER, [*rows, _row("all", None, entries)])
     return report
 
@@ -317,9 +308,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", required=True, help="folder of the report")
     parser.add_argument("--robots", nargs="+", choices=ROBOTS, default=[*ROBOTS])
-    parser.add_argument(
-        "--targets", type=int, default=20_000, help="in all; default: 20000"
-    )
+    parser.add_argument("--targets", type=int, default=20_000, help="in all; default: 20000")
     parser.add_argument("--seed", type=int, default=0, help="of the draws; default: 0")
     given = parser.parse_args(arguments)
 

@@ -99,9 +99,7 @@ def kinds() -> Iterator[Kind]:
     arm = seven_joints()
     yield Kind("seven joints", RigidChain.from_urdf(arm.urdf(), "tip"), *arm.limits)
     yield Kind("trunk, poses", PoseTask(trunk), 0.1, 0.4)
-    yield Kind(
-        "tendon segments, two points", PointsTask(tendons[2], [1.0, 2.0]), -0.02, 0.02
-    )
+    yield Kind("tendon segments, two points", PointsTask(tendons[2], [1.0, 2.0]), -0.02, 0.02)
 
 
 def seven_joints() -> Arm:
@@ -133,9 +131,7 @@ def targets(kind: Kind, n: int, beyond: float) -> tuple[NDArray, NDArray]:
     return q[::-1][out], nearest[out]
 
 
-def late_steps(
-    follow: Callable[[NDArray], NDArray], q: NDArray, target: NDArray
-) -> tuple:
+def late_steps(follow: Callable[[NDArray], NDArray], q: NDArray, target: NDArray) -> tuple:
     """Return where a tracker ends, and its largest late step of every actuator."""
     late = np.zeros_like(q)
     for k in range(TICKS):
@@ -146,9 +142,7 @@ def late_steps(
     return q, late
 
 
-def shares_at_rest(
-    kind: Kind, ends: NDArray, goals: NDArray, late: NDArray
-) -> list[str]:
+def shares_at_rest(kind: Kind, ends: NDArray, goals: NDArray, late: NDArray) -> list[str]:
     """Return the share at rest, the largest late step, and the shares near both minima."""
     free = kind.ik()
     error = free.step(ends, goals).error
@@ -206,9 +200,7 @@ def singular_line(kind: Kind, n: int) -> list[Any]:
 def mink_follower(arm: Arm, q: NDArray) -> Callable[[NDArray], NDArray]:
     """Return mink's tracker with limits of q, whole steps."""
     mink, mujoco = import_module("mink"), import_module("mujoco")
-    header = (
-        '="arm"><mujoco><compiler fusestatic="false" discardvisual="false"/></mujoco>'
-    )
+    header = '="arm"><mujoco><compiler fusestatic="false" discardvisual="false"/></mujoco>'
     model = mujoco.MjSpec.from_string(arm.urdf().replace('="arm">', header)).compile()
     configuration = mink.Configuration(model)
     configuration.update(q)
@@ -217,9 +209,7 @@ def mink_follower(arm: Arm, q: NDArray) -> Callable[[NDArray], NDArray]:
 
     def follow(target: NDArray) -> NDArray:
         task.set_target(mink.SE3.from_translation(target))
-        speed = mink.solve_ik(
-            configuration, [task], 1.0, "daqp", damping=1e-9, limits=limits
-        )
+        speed = mink.solve_ik(configuration, [task], 1.0, "daqp", damping=1e-9, limits=limits)
         configuration.integrate_inplace(speed, 1.0)
         return configuration.q.copy()
 

@@ -117,22 +117,16 @@ def measure(case: Case, batches: list[int], seconds: float) -> None:
             partial(_step, ik, q, x),
         )
     )
-    jobs.append(
-        ("tick of the tracker", 1, partial(tracker.step, x), partial(in_torch.step, x))
-    )
+    jobs.append(("tick of the tracker", 1, partial(tracker.step, x), partial(in_torch.step, x)))
     targets = model.predict(draw(_TARGETS))
     solve, tensors = partial(ik.solve, targets), torch.from_numpy(targets)
     jobs.append(("solve", _TARGETS, solve, partial(ik.solve, tensors)))
     print(f"{name}: {native.backend(module)}, ticks {tracker.backend}")
     with torch.no_grad():
         for what, n, ours, eager in jobs:
-            numpy_time, torch_time = (
-                best_time(job, seconds) / n for job in (ours, eager)
-            )
+            numpy_time, torch_time = (best_time(job, seconds) / n for job in (ours, eager))
             ratio = f"{torch_time / numpy_time:8.1f} x"
-            print(
-                f"  {what:32s} {n:7d} {1e6 * numpy_time:10.3g} {1e6 * torch_time:10.3g} {ratio}"
-            )
+            print(f"  {what:32s} {n:7d} {1e6 * numpy_time:10.3g} {1e6 * torch_time:10.3g} {ratio}")
 
 
 def _step(ik: InverseKinematics, q: NDArray, x: NDArray) -> object:
@@ -141,15 +135,11 @@ def _step(ik: InverseKinematics, q: NDArray, x: NDArray) -> object:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(
-        description="Measure how fast models are on this machine."
-    )
+    parser = argparse.ArgumentParser(description="Measure how fast models are on this machine.")
     parser.add_argument("model", nargs="?", help="as for `hybridkin describe`")
     parser.add_argument("--robot", help="robot description (TOML)")
     parser.add_argument("--batches", default="1,1000,10000,100000", help="rows at once")
-    parser.add_argument(
-        "--seconds", type=float, default=0.5, help="of every measurement"
-    )
+    parser.add_argument("--seconds", type=float, default=0.5, help="of every measurement")
     arguments = parser.parse_args()
     if arguments.model is None:
         cases = trunk_cases()
@@ -158,9 +148,7 @@ def main() -> None:
         limits = workflow.path_limits(model)
         cases = [Case(Path(arguments.model).name, model, limits.q_min, limits.q_max)]
     torch.set_num_threads(1)
-    print(
-        f"torch {torch.__version__}, one thread; us per row: NumPy, eager torch, ratio"
-    )
+    print(f"torch {torch.__version__}, one thread; us per row: NumPy, eager torch, ratio")
     for case in cases:
         measure(case, [int(n) for n in arguments.batches.split(",")], arguments.seconds)
 

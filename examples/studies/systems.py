@@ -50,9 +50,7 @@ MODELS = {
     "network": lambda: fitted(ELMRegressor(30, random_state=0)),
     "serial": lambda: fitted("quadratic", coupling="serial"),
 }
-HYSTERESIS = Hysteresis.friction([0.0, 0.001, 0.003], [0.3, 0.6]) | Hysteresis.creep(
-    [0.1], [2.0]
-)
+HYSTERESIS = Hysteresis.friction([0.0, 0.001, 0.003], [0.3, 0.6]) | Hysteresis.creep([0.1], [2.0])
 CONTROLLERS = {
     "trunk": lambda: InverseKinematics(TRUNK, dq_max=0.1, ddq_max=2.0, **LIMITS),
     "network": lambda: InverseKinematics(MODELS["network"](), **LIMITS),
@@ -118,9 +116,7 @@ class Unit:
         return np.array(values)
 
     def step(self, period):
-        self.unit.doStep(
-            currentCommunicationPoint=self.time, communicationStepSize=period
-        )
+        self.unit.doStep(currentCommunicationPoint=self.time, communicationStepSize=period)
         self.time += period
 
 
@@ -166,9 +162,7 @@ def in_octave(controller, q, targets, folder):
     np.savetxt(folder / "T.txt", targets, fmt="%.17g")
     (folder / "run.m").write_text("1;\n" + OCTAVE)
     command = ["octave-cli", "--no-gui", "--quiet", "run.m"]
-    done = subprocess.run(
-        command, cwd=folder, capture_output=True, text=True, check=False
-    )
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     messages = done.stdout.strip().splitlines()
     return np.loadtxt(folder / "X.txt"), np.loadtxt(folder / "C.txt"), messages
 

@@ -71,9 +71,7 @@ def held_out_errors(q: NDArray, x: NDArray, row: int) -> NDArray:
     train = np.arange(len(q)) != row
     chain = nominal()
     with warnings.catch_warnings():
-        warnings.simplefilter(
-            "ignore"
-        )  # fewer rows than parameters: priors determine some
+        warnings.simplefilter("ignore")  # fewer rows than parameters: priors determine some
         calibrated = calibrate(chain, q[train], x[train], PARAMETERS).chain
         errors = []
         for model, name in (
@@ -97,9 +95,7 @@ def main() -> None:
     data = datasets.load_soromox_tentacle(options.data)
     rows = range(len(data.q))
     run = Parallel(options.jobs)
-    errors = np.stack(
-        run(delayed(held_out_errors)(data.q, data.x, row) for row in rows)
-    )
+    errors = np.stack(run(delayed(held_out_errors)(data.q, data.x, row) for row in rows))
     print("| model | mean of four markers | largest load | tip | largest tip |")
     print("| --- | --- | --- | --- | --- |")
     for k, name in enumerate(("nominal", "calibrated", "calibrated + quadratic")):

@@ -60,9 +60,7 @@ def frames(path: trajectories.Trajectory) -> list[Image.Image]:
     figure, axes = plots.new_figure(*SIZE, 1, 2, subplot_kw={"projection": "3d"})
     figure.set_layout_engine("none")  # or the picture would tremble
     moving = []
-    for left, ax, (name, (q, tips)) in zip(
-        (0.0, 0.5), axes, followed(path).items(), strict=True
-    ):
+    for left, ax, (name, (q, tips)) in zip((0.0, 0.5), axes, followed(path).items(), strict=True):
         mean = 100 * np.linalg.norm(tips - path.x, axis=1).mean()
         color = plots.model_color(name)
         ax.set(**LIMITS)
@@ -74,9 +72,7 @@ def frames(path: trajectories.Trajectory) -> list[Image.Image]:
         title = f"{name}, mean error {mean:.1f} cm"
         figure.text(left + 0.25, 0.93, title, ha="center", fontsize=13, color=color)
         lines = []
-        for line in plots.BackboneDisplay.from_estimator(chain, q, tips=tips).lines(
-            tip=False
-        ):
+        for line in plots.BackboneDisplay.from_estimator(chain, q, tips=tips).lines(tip=False):
             look = line.look() | ({} if line.label == "backbone" else {"color": "0.7"})
             lines.append((line, ax.plot([], [], [], **look)[0]))
         ax.plot(*(100 * path.x.T), color="black", linewidth=1.5)
@@ -97,15 +93,11 @@ def frames(path: trajectories.Trajectory) -> list[Image.Image]:
 
 
 if __name__ == "__main__":
-    path = trajectories.figure_eight(
-        (0.0, 0.0, 0.70), (0.50, 0.25), duration=DURATION, dt=PERIOD
-    )
+    path = trajectories.figure_eight((0.0, 0.0, 0.70), (0.50, 0.25), duration=DURATION, dt=PERIOD)
     pictures = frames(path)
     # One of all, or the colours would flicker.
     palette = pictures[-1].quantize(N_COLORS)
-    first, *others = [
-        p.quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures
-    ]
+    first, *others = [p.quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures]
     shown = [round(1000 * PERIOD)] * len(others) + [1000]  # [ms]
     options = {"duration": shown, "loop": 0, "optimize": True}
     first.save(sys.argv[1], save_all=True, append_images=others, **options)

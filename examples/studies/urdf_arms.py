@@ -39,14 +39,9 @@ def package_files() -> list[Path]:
     return sorted(Path(str(file.locate())) for file in found if file.suffix == ".urdf")
 
 
-def joint_positions(
-    path: Path, q: dict[str, float]
-) -> dict[str, tuple[float, dict[str, float]]]:
+def joint_positions(path: Path, q: dict[str, float]) -> dict[str, tuple[float, dict[str, float]]]:
     """Return the position of every joint of one axis, and its derivatives by the actuators."""
-    joints = {
-        joint.get("name", ""): joint
-        for joint in ElementTree.parse(path).iterfind("joint")
-    }
+    joints = {joint.get("name", ""): joint for joint in ElementTree.parse(path).iterfind("joint")}
 
     def position(name: str) -> tuple[float, dict[str, float]]:
         mimic = joints[name].find("mimic") if name in joints else None
@@ -60,9 +55,7 @@ def joint_positions(
     return {name: position(name) for name in joints}
 
 
-def reference(
-    pin: Any, model: Any, path: Path, leaf: str, q: dict[str, float]
-) -> tuple:
+def reference(pin: Any, model: Any, path: Path, leaf: str, q: dict[str, float]) -> tuple:
     """Return pinocchio's pose of a link and its Jacobian, a column (6,) for every actuator."""
     configuration, columns = (
         pin.neutral(model),
@@ -107,15 +100,11 @@ def reference(
 def leaf_links(pin: Any, model: Any) -> list[str]:
     """Return the links of a model from which no joint leads on."""
     parents = {frame.parentFrame for frame in model.frames}
-    bodies = [
-        k for k, frame in enumerate(model.frames) if frame.type == pin.FrameType.BODY
-    ]
+    bodies = [k for k, frame in enumerate(model.frames) if frame.type == pin.FrameType.BODY]
     return [model.frames[k].name for k in bodies if k not in parents]
 
 
-def study(
-    paths: Sequence[Path], n: int = 10, random_state: int = 0
-) -> list[dict[str, Any]]:
+def study(paths: Sequence[Path], n: int = 10, random_state: int = 0) -> list[dict[str, Any]]:
     """Return what became of the leaf links of URDFs.
 
     Parameters
@@ -156,9 +145,7 @@ def study(
                 continue
             entry["read"] += 1
             rows = rng.uniform(-1.0, 1.0, (n, arm.n_actuators))
-            found = [
-                part.numpy() for part in arm.pose_and_jacobian(torch.from_numpy(rows))
-            ]
+            found = [part.numpy() for part in arm.pose_and_jacobian(torch.from_numpy(rows))]
             for row, *own in zip(rows, *found, strict=True):
                 q = dict(zip(arm.names, row, strict=True))
                 expected: list[NDArray] = [*reference(pin, model, path, leaf, q)]
@@ -173,9 +160,7 @@ def urdf_report(entries: list[dict[str, Any]]) -> Report:
     report = Report("Leaf links of URDFs", {})
     report.record["files"] = entries
     total = {key: sum(entry[key] for entry in entries) for key in ("leaves", "read")}
-    largest = {
-        key: max(entry[key] for entry in entries) for key in ("pose", "jacobian")
-    }
+    largest = {key: max(entry[key] for entry in entries) for key in ("pose", "jacobian")}
     report.text(
         f"Of {total['leaves']} leaf links in {len(entries)} files that pinocchio reads, "
         f"{total['read']} are read. Largest difference of a pose: {largest['pose']:.2g}, of a "
@@ -201,9 +186,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run the study and write the report."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", required=True, help="folder of the report")
-    parser.add_argument(
-        "--rows", type=int, default=10, help="of every leaf link; default: 10"
-    )
+    parser.add_argument("--rows", type=int, default=10, help="of every leaf link; default: 10")
     parser.add_argument("--seed", type=int, default=0, help="of the draws; default: 0")
     given = parser.parse_args(arguments)
     try:

@@ -62,15 +62,11 @@ class Actuation:
     def __repr__(self) -> str:
         return f"{type(self).__name__}()"
 
-    def apply(
-        self, q: Any, state: Any = None, dt: ArrayLike | None = None
-    ) -> tuple[Any, Any]:
+    def apply(self, q: Any, state: Any = None, dt: ArrayLike | None = None) -> tuple[Any, Any]:
         """Return the effective changes of commands (T, n), and the state at their end."""
         return q, q[:0]
 
-    def command(
-        self, y: Any, state: Any = None, dt: ArrayLike | None = None
-    ) -> tuple[Any, Any]:
+    def command(self, y: Any, state: Any = None, dt: ArrayLike | None = None) -> tuple[Any, Any]:
         """Return the commands of effective changes (T, n), and the state at their end."""
         return y, y[:0]
 

@@ -45,9 +45,7 @@ def as_tensor(
         return copied(real_array(value, name), device or "cpu")
     if value.is_complex() or value.layout != torch.strided or value.is_meta:
         got = f"{value.dtype} with layout {value.layout} on {value.device}"
-        raise ValueError(
-            f"`{name}` must be a dense tensor that holds real numbers, got {got}."
-        )
+        raise ValueError(f"`{name}` must be a dense tensor that holds real numbers, got {got}.")
     value = value.detach()
     return value if value.dtype == torch.float32 else value.double()
 
@@ -58,13 +56,9 @@ def real_array(value: Numbers | Transform, name: str) -> NDArray:
     if isinstance(value, (Tensor, Transform)):
         return as_tensor(value, name).numpy(force=True)
     if np.ma.is_masked(value):
-        raise ValueError(
-            f"`{name}` has masked entries; drop these rows, or fill them with NaN."
-        )
+        raise ValueError(f"`{name}` has masked entries; drop these rows, or fill them with NaN.")
     if hasattr(value, "toarray"):
-        raise TypeError(
-            f"`{name}` must be dense, got a sparse matrix; use `.toarray()`."
-        )
+        raise TypeError(f"`{name}` must be dense, got a sparse matrix; use `.toarray()`.")
     try:
         array = np.asarray(value)
         if array.dtype.kind in "biufO":
@@ -115,9 +109,7 @@ def random_generator(
 def one_of(value: object, name: str, known: Collection[str], hint: str = "") -> str:
     """Return a caller's choice from the known names."""
     if not isinstance(value, str) or value not in known:
-        raise ValueError(
-            f"`{name}` must be one of {[*known]}, got {value!r:.80}{hint}."
-        )
+        raise ValueError(f"`{name}` must be one of {[*known]}, got {value!r:.80}{hint}.")
     return value
 
 
@@ -257,9 +249,7 @@ def rows_of(a: Tensor, lead: tuple[int, ...], trailing: int = 1) -> Tensor:
     return a.expand(*lead, *shape).reshape(math.prod(lead), *shape)
 
 
-def give_back(
-    results: Iterable[Tensor], lead: tuple[int, ...], as_numpy: bool
-) -> list[Any]:
+def give_back(results: Iterable[Tensor], lead: tuple[int, ...], as_numpy: bool) -> list[Any]:
     """Return rows (N, ...) in the caller's batch shape and array type."""
     arrays = []
     for rows in results:

@@ -14,9 +14,7 @@ _EPOCH = 1e9, 4e9  # [s] since 1970: the years 2001 to 2096
 _LONG_STEP = 1000.0  # [s]; nobody records rows so far apart
 _USUAL_STEP = 2.0  # [s]
 _LONG_RUN = 48.0 * 3600.0  # [s]
-_LONGER_STEP = (
-    2.0  # [s], of a recording that is no time series of seconds if it takes days
-)
+_LONGER_STEP = 2.0  # [s], of a recording that is no time series of seconds if it takes days
 _EQUAL = 0.9  # part of the steps that are one: frames are counted
 
 

@@ -92,15 +92,11 @@ class _Kept(Generic[Tensors]):
         For tensors without memory, as in functional transforms.
     """
 
-    def __init__(
-        self, entries: dict[str, Tensor | None], settings: tuple[object, ...]
-    ) -> None:
+    def __init__(self, entries: dict[str, Tensor | None], settings: tuple[object, ...]) -> None:
         self.settings = settings
         self.values: Tensors | None = None
         self._absent = [name for name, entry in entries.items() if entry is None]
-        present = [
-            (name, entry) for name, entry in entries.items() if entry is not None
-        ]
+        present = [(name, entry) for name, entry in entries.items() if entry is not None]
         self._elsewhere = [a for _, a in present if a.device.type != "cpu"]
         self._content = self._read_elsewhere()
         self._entries = []
@@ -124,8 +120,7 @@ class _Kept(Generic[Tensors]):
         learns = torch.is_grad_enabled()
         for name, entry, place, stride, read, content in self._entries:
             if (
-                (buffers[name] if name in buffers else getattr(module, name))
-                is not entry
+                (buffers[name] if name in buffers else getattr(module, name)) is not entry
                 or (learns and entry.requires_grad)
                 or entry.data_ptr() != place
                 or entry.stride() != stride

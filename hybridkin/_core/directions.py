@@ -103,9 +103,7 @@ def few_terms(directions: NDArray) -> NDArray:
     def shortest(entry: NDArray) -> NDArray:
         fixed = np.pad(entry, (0, P))[None]
         zeros = np.zeros(2 * P)
-        solution = scipy.optimize.linprog(
-            cost, above, zeros, fixed, [1.0], bounds=(None, None)
-        )
+        solution = scipy.optimize.linprog(cost, above, zeros, fixed, [1.0], bounds=(None, None))
         coefficients = entry  # the nearest vector, if there is no solution
         if solution.x is not None:
             coefficients = solution.x[:K]

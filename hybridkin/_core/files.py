@@ -99,9 +99,7 @@ def check_outputs(
 def _check_kind(path: Path) -> None:
     """Raise if a path is taken by what is no file: a folder, a device or a pipe."""
     if path.exists() and not path.is_file():
-        raise ValueError(
-            f"`path` must name a file, got {path}, which is not one; add a file name."
-        )
+        raise ValueError(f"`path` must name a file, got {path}, which is not one; add a file name.")
 
 
 def _is_marked(path: Path) -> bool:

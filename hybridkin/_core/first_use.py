@@ -7,9 +7,7 @@ from importlib import import_module
 from typing import Any
 
 
-def on_first_use(
-    package: str, names_of: Mapping[str, Sequence[str]]
-) -> Callable[[str], Any]:
+def on_first_use(package: str, names_of: Mapping[str, Sequence[str]]) -> Callable[[str], Any]:
     """Return the `__getattr__` of a package.
 
     Parameters

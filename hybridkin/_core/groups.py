@@ -99,9 +99,7 @@ class Groups:
             return self
         return Groups(np.arange(len(self)) * _PARTS // len(self))
 
-    def folds(
-        self, most: int = 5, shuffle: bool = False
-    ) -> list[tuple[NDArray, NDArray]]:
+    def folds(self, most: int = 5, shuffle: bool = False) -> list[tuple[NDArray, NDArray]]:
         """Return training and held-out rows of at most `most` folds of whole groups.
 
         Single rows are always shuffled, groups of several rows only if `shuffle`.

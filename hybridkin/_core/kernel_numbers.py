@@ -65,40 +65,28 @@ IK_POSE = 32  # the task is a pose, and not a vector of coordinates
 IK_AXIS = 64  # the task is a position and the direction of an axis of the tip
 IK_HALF_TURN = 3.141592653589793  # [rad]
 IK_NO_AXIS = 1e-12  # a direction that is shorter is none
-HK_ASIDE = (
-    0.6  # a component of a unit vector below which a coordinate axis is not along it
-)
+HK_ASIDE = 0.6  # a component of a unit vector below which a coordinate axis is not along it
 IK_HEALTHY = 0.02  # sigma_min / sigma_max above which no damping is needed
 IK_CHANGES = 400  # of the active constraints of a step; a handful is usual
 IK_SWEEPS = 30  # of Jacobi's method for eigenvalues; six are usual
 IK_PROXIMAL = 2  # rounds that remove the effect of the least damping
 IK_NORMALS = 6  # most normals of the plane of a log
-IK_BALANCE = (
-    30.0  # weight of a motion that leaves the plane, relative to that of the tip
-)
+IK_BALANCE = 30.0  # weight of a motion that leaves the plane, relative to that of the tip
 IK_CORRECTIONS = 3  # corrections of a step whose tip must move as promised
 IK_SLACK = 0.02  # a tendon that moves the tip less, relative to the most, is slack
-IK_SLIP = (
-    1e-4  # motion of the tip that does not count, relative to that of all actuators
-)
-IK_LEAST_PULL = (
-    0.01  # shares of the way by which slack tendons are pulled in: from 1 to this
-)
+IK_SLIP = 1e-4  # motion of the tip that does not count, relative to that of all actuators
+IK_LEAST_PULL = 0.01  # shares of the way by which slack tendons are pulled in: from 1 to this
 IK_PULL_RATIO = 0.125  # ratio of one share to the one before
 
 # Rest at the point nearest to a target out of reach, eq. (21).
 IK_NO_FALL = 1e-12  # of a squared error: smaller falls are rounding
 IK_NO_WAY = 1e-7  # of the ranges: what shorter steps show is rounding
-IK_CURVED = (
-    1e-6  # of |J|^2: least lambda^2, and least curvature along a step that counts
-)
+IK_CURVED = 1e-6  # of |J|^2: least lambda^2, and least curvature along a step that counts
 IK_MOST_CURVED = 1e4  # of |J|^2: largest lambda^2
 IK_EASED = 0.7  # factor on the curvature after a step that kept its promise
 IK_EASED_WAY = 1e-4  # of the ranges: shorter steps ease it only
 IK_STRAIGHT = 0.1  # where they show less than this share of it
-IK_JUMP = (
-    0.5  # of an error: a step says nothing about a target that moved more since then
-)
+IK_JUMP = 0.5  # of an error: a step says nothing about a target that moved more since then
 # What is remembered of the last step: the curvature, the squared length of the step, its largest
 # share of a range; then the motion of the tip that J promised, and the error that it was made for.
 IK_BENT, IK_WAY_SQ, IK_SHARE, IK_PROMISED = 0, 1, 2, 3
@@ -137,9 +125,7 @@ IK_FROM_REST = 16
 IK_LEADS = 32  # commands lead what the actuators do, by their hysteresis
 
 # Readings of the tip, and their state: one array.
-IK_FRACTION = (
-    0.2  # of an innovation that the offset takes; stable up to seven periods late, as
-)
+IK_FRACTION = 0.2  # of an innovation that the offset takes; stable up to seven periods late, as
 # the bound is 2 sin(pi / (4 d + 2)) for d periods that nobody knows of; .35 for four
 IK_RING = 64  # tips of the model that are remembered
 IK_RECENT = 8  # periods that a reading may be late without anybody knowing
@@ -160,37 +146,27 @@ IK_DOUBTS = 7
 HK_MAX_CREEPS = 16  # time constants of an operator
 HK_CREEP_ROUNDING = 16.0  # of a command, in units of the precision
 IK_STAGES, IK_STATE_ROWS = 4, 5  # entries of a step: stages, and rows of their state
-IK_AT_REST_SHARE = (
-    1e-6  # a command that moves this much farther than its actuator stays
-)
+IK_AT_REST_SHARE = 1e-6  # a command that moves this much farther than its actuator stays
 
 # The search for configurations.
 IK_LOWERS, IK_TO_DOMAIN, IK_TO_POSTURE = 1, 2, 4  # modes
 IK_REACHED, IK_AT_REST, IK_HELD = 1, 2, 4  # results
 IK_LAST_DAMPING = 1e8  # no descent even with this damping: the point is stationary
-IK_STATIONARY = (
-    1e-4  # sine of the angle between the error and the directions left by limits
-)
+IK_STATIONARY = 1e-4  # sine of the angle between the error and the directions left by limits
 IK_SLOW_STEPS = 8  # consecutive iterations that gain less than IK_SLOW of the tolerance
 IK_SLOW = 0.01
 IK_NULL_STEPS = 30  # iterations of a descent in the null space
-IK_NULL_SLIP = (
-    0.3  # largest error after such a step, per motion of the tip without projection
-)
+IK_NULL_SLIP = 0.3  # largest error after such a step, per motion of the tip without projection
 IK_NULL_GAIN = 1e-8  # smallest gain of such a step, per square of the remaining step
 IK_INSIDE = 0.98  # domain distance that points outside the domain are moved to
 
 
 def c_header() -> str:
     """Return the numbers as a C header, `kinds.h`."""
-    numbers: dict[str, float] = {
-        f"HK_{kind.upper()}": 1 + i for i, kind in enumerate(KINDS)
-    }
+    numbers: dict[str, float] = {f"HK_{kind.upper()}": 1 + i for i, kind in enumerate(KINDS)}
     numbers |= {f"HK_STAGE_{name.upper()}": 1 + i for i, name in enumerate(STAGES)}
     numbers |= {f"HK_{name.upper()}": i for i, name in enumerate(ACTIVATIONS)}
-    numbers |= {
-        name: n for name, n in globals().items() if name.startswith(("HK_", "IK_"))
-    }
+    numbers |= {name: n for name, n in globals().items() if name.startswith(("HK_", "IK_"))}
     lines = [
         "/* Written by hybridkin/_core/kernel_numbers.py, which says what each number is. */",
         "",
@@ -221,6 +197,4 @@ def write_headers(folder: str | Path) -> None:
 def checksum(sources: Path) -> int:
     """Return a checksum of the C sources in a folder and of the shared numbers."""
     files = sorted(sources.glob("*.[ch]"))
-    return crc32(
-        b"".join([c_header().encode(), *(path.read_bytes() for path in files)])
-    )
+    return crc32(b"".join([c_header().encode(), *(path.read_bytes() for path in files)]))

@@ -245,9 +245,7 @@ class ForwardModel(PortableModule):
         """Return a warning if the actuators of q (..., n) contradict each other."""
         return []
 
-    def tip_messages(
-        self, q: Tensor, x: Tensor, name: str, calibrated: bool = False
-    ) -> list[str]:
+    def tip_messages(self, q: Tensor, x: Tensor, name: str, calibrated: bool = False) -> list[str]:
         """Return a warning if tips x (N, m), measured at rows q (N, n), span too far for metres.
 
         If the model is calibrated, its own tips are counted with them. Missing markers are NaN.
@@ -528,9 +526,7 @@ class Shifted(Wrapped):
         Shift of the zeros [unit of q].
     """
 
-    layout = Layout(
-        "shifted", {"shift": "n"}, parts=("model",), write_plan=_write_shifted
-    )
+    layout = Layout("shifted", {"shift": "n"}, parts=("model",), write_plan=_write_shifted)
 
     def __init__(self, model: ForwardModel, shift: Tensor) -> None:
         super().__init__(model)
@@ -551,9 +547,7 @@ class Shifted(Wrapped):
         return self.model.misses(x, largest + self.shift.abs().to(largest.device))
 
     def _inner(self, q: Tensor) -> Tensor:
-        check_vectors(
-            q, len(self.shift), "q", f"this robot has {len(self.shift)} actuators"
-        )
+        check_vectors(q, len(self.shift), "q", f"this robot has {len(self.shift)} actuators")
         return q + self.shift.to(q)
 
 
@@ -575,9 +569,7 @@ class Moved(Wrapped):
         T, the motion of the base in the measuring frame.
     """
 
-    layout = Layout(
-        "moved", {"motion": "44"}, parts=("model",), write_plan=_write_moved
-    )
+    layout = Layout("moved", {"motion": "44"}, parts=("model",), write_plan=_write_moved)
 
     def __init__(self, model: ForwardModel, motion: Tensor) -> None:
         super().__init__(model)
@@ -712,9 +704,7 @@ def as_forward_model(model: object) -> ForwardModel:
     if isinstance(model, (tuple, list)):
         if len(model) == 2 and callable(model[0]) and callable(model[1]):
             return FunctionModel(*model)
-        raise TypeError(
-            f"`model` must be two callables, q -> x and its Jacobian, got {model!r}."
-        )
+        raise TypeError(f"`model` must be two callables, q -> x and its Jacobian, got {model!r}.")
     if isinstance(model, Fitted):
         return as_forward_model(model.module_)
     if not callable(model):

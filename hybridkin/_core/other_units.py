@@ -74,7 +74,5 @@ def _refuse(name: str, what: str, ratio: float, than: str, turns: bool) -> None:
 def _span(tips: NDArray) -> float:
     """Return the largest side of the box around tips (N, m), NaN left out."""
     with np.errstate(all="ignore"):
-        sides = np.nanmax(tips, axis=0, initial=-np.inf) - np.nanmin(
-            tips, axis=0, initial=np.inf
-        )
+        sides = np.nanmax(tips, axis=0, initial=-np.inf) - np.nanmin(tips, axis=0, initial=np.inf)
     return float(np.max(sides, initial=0.0, where=np.isfinite(sides)))

@@ -71,9 +71,7 @@ class Plan:
         The arrays that it refers to, by the place in `code` of their distance from `data`.
     """
 
-    def __init__(
-        self, model: Stored | Callable[[Plan], int], shares: bool = False
-    ) -> None:
+    def __init__(self, model: Stored | Callable[[Plan], int], shares: bool = False) -> None:
         self._code = [0] * len(MOST)  # then the largest sizes
         self._data: list[NDArray] = []
         self._length = 0

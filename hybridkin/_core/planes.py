@@ -25,7 +25,8 @@ class PlaneOfQ(NamedTuple):
     @classmethod
     def whole(cls) -> PlaneOfQ:
         """Return the whole space, whatever n is."""
-        return cls(torch.zeros(0), torch.zeros(0, 0))
+        none = torch.zeros(0, 0, dtype=torch.float64, device="cpu")
+        return cls(none.flatten(), none)
 
     @property
     def n_normals(self) -> int:

@@ -60,19 +60,17 @@ class Reading:
 
 def with_fields_of(
     value: Callable[Fields, Reading],
-) -> Callable[
-    [Callable[[Source, Reading], Result]], Callable[Concatenate[Source, Fields], Result]
-]:
+) -> Callable[[Callable[[Source, Reading], Result]], Callable[Concatenate[Source, Fields], Result]]:
     """Return a decorator: a function of a source and a value gets its fields as arguments."""
-    own = inspect.signature(value)
+    of_value = inspect.signature(value)
     made: Callable[..., Reading] = value
 
     def decorator(
         function: Callable[[Source, Reading], Result],
     ) -> Callable[Concatenate[Source, Fields], Result]:
         source, _ = inspect.signature(function).parameters.values()
-        signature = own.replace(
-            parameters=[source, *own.parameters.values()],
+        signature = of_value.replace(
+            parameters=[source, *of_value.parameters.values()],
             return_annotation=inspect.signature(function).return_annotation,
         )
 
@@ -85,7 +83,8 @@ def with_fields_of(
             first = arguments.pop(source.name)
             return function(first, made(**arguments))
 
-        vars(with_fields)["__signature__"] = signature
+        described: Any = with_fields
+        described.__signature__ = signature
         return with_fields
 
     return decorator

@@ -53,9 +53,7 @@ def nearest_rotation(moments: Tensor) -> tuple[Tensor, Tensor]:
     return nearest, trace
 
 
-def rigid_motion(
-    points: Tensor, targets: Tensor, weights: Tensor | None = None
-) -> Tensor:
+def rigid_motion(points: Tensor, targets: Tensor, weights: Tensor | None = None) -> Tensor:
     """Return the motion (4, 4) that brings points (N, 3) nearest to their targets (N, 3).
 
     `weights` (N,) are those of the squared distances, by default equal.

@@ -172,9 +172,7 @@ class Stored:
         lengths = {}
         tensors = {}
         for name, letters in shapes.items():
-            array = self.array(
-                name, [lengths.get(letter, letter) for letter in letters]
-            )
+            array = self.array(name, [lengths.get(letter, letter) for letter in letters])
             lengths |= dict(zip(letters, array.shape, strict=True))
             tensors[name] = torch.tensor(array, device="cpu")
         return tensors

@@ -54,9 +54,7 @@ class TextForm:
     def __post_init__(self) -> None:
         delimiter = self.delimiter
         if delimiter is not None and not _is_character(delimiter):
-            raise ValueError(
-                f"`delimiter` must be one character or None, got {delimiter!r:.80}."
-            )
+            raise ValueError(f"`delimiter` must be one character or None, got {delimiter!r:.80}.")
         if self.decimal not in DECIMALS:
             raise ValueError(f'`decimal` must be "." or ",", got {self.decimal!r:.80}.')
         line = self.header_line
@@ -74,13 +72,9 @@ class TextForm:
             return self.delimiter
         candidates = [sign for sign in _DELIMITERS if sign != self.decimal]
         unquoted = [re.sub('"[^"]*("|$)', "", line) for line in _whole_lines(lines)]
-        for line, following in itertools.zip_longest(
-            unquoted, unquoted[1:], fillvalue=""
-        ):
+        for line, following in itertools.zip_longest(unquoted, unquoted[1:], fillvalue=""):
             counts = {sign: line.count(sign) for sign in candidates if sign in line}
-            as_often = [
-                sign for sign in counts if following.count(sign) == counts[sign]
-            ]
+            as_often = [sign for sign in counts if following.count(sign) == counts[sign]]
             if counts:
                 return max(as_often or counts, key=counts.__getitem__)
         first = "".join(lines[:1]).strip()

@@ -19,9 +19,7 @@ _MARKUP = re.compile(
     r"//|\][(\[]|(?<![^\W_])_|_(?![^\W_])|\w\.[^\W\d_]{2}"  # links, emphasis, names of hosts
 )
 _SPAN = re.compile(r"^([^`]*)`[^`]+`([^`]*)$")  # one word of code, as in `q`
-_LIST = re.compile(
-    r"\W*|\d+[.)]|\[.*"
-)  # what means a list, a line or a link at a start
+_LIST = re.compile(r"\W*|\d+[.)]|\[.*")  # what means a list, a line or a link at a start
 _FORMULA = re.compile(r"'*[=+\-@\t\r\n\uff1d\uff0b\uff0d\uff20]")
 
 

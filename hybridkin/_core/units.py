@@ -150,9 +150,7 @@ def span_message(
     )
 
 
-def motion_message(
-    name: str, tips: Tensor, predicted: Tensor, reach: float
-) -> str | None:
+def motion_message(name: str, tips: Tensor, predicted: Tensor, reach: float) -> str | None:
     """Return a warning if tips (N, 3) span 20 times what a model predicts, and two reaches."""
     usual = _span(predicted)
     spans = min(_SPANS, max(2.0, _MOVED * usual / reach))
@@ -165,9 +163,7 @@ def _span(tips: Tensor) -> float:
     return float(sides.detach().max())
 
 
-def length_message(
-    name: str, value: Tensor, limit: float, usual: Tensor | float
-) -> str | None:
+def length_message(name: str, value: Tensor, limit: float, usual: Tensor | float) -> str | None:
     """Return a warning if lengths are too large to be metres; `usual` are usual ones [m]."""
     if not (value > limit).any():
         return None

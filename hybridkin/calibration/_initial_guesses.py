@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from hybridkin._core.rotations import rigid_motion
-from hybridkin.calibration._least_squares import Rows
+from hybridkin.calibration._least_squares import TipRows
 from hybridkin.calibration.measured import points
 from hybridkin.chains.chain import Chain
 
@@ -23,9 +23,7 @@ _SCALES = (0.6, 1.0, 1.6)
 _TURNS = tuple(0.5 * math.pi * k for k in range(4))
 _SWEEPS = 2
 _MOST = 2  # guesses per handedness
-_HOPELESS = (
-    3.0  # times the least error of a guess, before any fit; worse ones are dropped
-)
+_HOPELESS = 3.0  # times the least error of a guess, before any fit; worse ones are dropped
 
 _Rings = tuple[tuple[bool, float], ...]  # for every ring: mirrored or not, and its turn
 
@@ -38,7 +36,7 @@ class Guess(NamedTuple):
     mirrored: bool = False
 
 
-def initial_guesses(chain: Chain, rows: Rows, names: tuple[str, ...]) -> list[Guess]:
+def initial_guesses(chain: Chain, rows: TipRows, names: tuple[str, ...]) -> list[Guess]:
     """Return the guesses to try, the given chain first.
 
     A free base is aligned with the tips. Free rings are turned and mirrored, one after the other.
@@ -63,13 +61,13 @@ def initial_guesses(chain: Chain, rows: Rows, names: tuple[str, ...]) -> list[Gu
     return guesses
 
 
-def aligned(chain: _Chain, rows: Rows) -> _Chain:
+def aligned(chain: _Chain, rows: TipRows) -> _Chain:
     """Return the chain at the base pose that aligns predicted and measured tips."""
     motion, _ = _alignment(chain, rows)
     return chain.with_geometry(base=motion @ chain.geometry()["base"])
 
 
-def _alignment(chain: Chain, rows: Rows) -> tuple[Tensor, float]:
+def _alignment(chain: Chain, rows: TipRows) -> tuple[Tensor, float]:
     """Return the motion of the base that aligns the tips, and their rms distance after it."""
     x = torch.from_numpy(points(rows.x.numpy())[rows.seen])
     tips = x + torch.from_numpy(rows.residual(chain)).to(x)
@@ -80,7 +78,7 @@ def _alignment(chain: Chain, rows: Rows) -> tuple[Tensor, float]:
 
 
 def _best_rings(
-    chain: Chain, rows: Rows, free_base: bool, scales: tuple[float, ...]
+    chain: Chain, rows: TipRows, free_base: bool, scales: tuple[float, ...]
 ) -> list[Guess]:
     """Return the best guesses of a search ring by ring, for several scales of the radii."""
     error_of = cache(partial(_error, chain, rows, free_base))
@@ -113,7 +111,7 @@ def _best_rings(
     return [*likely[False], *likely[True]]
 
 
-def _error(chain: Chain, rows: Rows, align: bool, rings: _Rings, scale: float) -> float:
+def _error(chain: Chain, rows: TipRows, align: bool, rings: _Rings, scale: float) -> float:
     """Return the root mean square tip distance with these rings and scaled radii."""
     changed = _scaled(_with_rings(chain, rings), scale)
     return _alignment(changed, rows)[1] if align else rows.rmse(changed)

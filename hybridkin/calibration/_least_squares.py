@@ -57,7 +57,7 @@ ROUGH = Accuracy(1e-5, 2)  # to compare initial guesses
 COMPARED = Accuracy(1e-4, 1)  # for errors of held-out rows, to compare sets
 
 
-class Rows(NamedTuple):
+class TipRows(NamedTuple):
     """Actuator vectors (N, n), measured tips and how often each row counts (N,).
 
     With K markers the tips are (N, 3 K), NaN if a marker is missing. Results have one entry for
@@ -68,9 +68,9 @@ class Rows(NamedTuple):
     x: Tensor
     weight: Tensor
 
-    def take(self, rows: NDArray | slice) -> Rows:
+    def take(self, rows: NDArray | slice) -> TipRows:
         """Return some of the rows."""
-        return Rows(self.q[rows], self.x[rows], self.weight[rows])
+        return TipRows(self.q[rows], self.x[rows], self.weight[rows])
 
     @property
     def seen(self) -> NDArray[np.bool_]:
@@ -138,7 +138,7 @@ class Fit:
     """Result of a fit."""
 
     problem: Problem
-    rows: Rows
+    rows: TipRows
     theta: NDArray
     noise: float  # standard deviation of one coordinate [m]
     rmse: float
@@ -156,7 +156,7 @@ class Fit:
 
 def solve(
     problem: Problem,
-    rows: Rows,
+    rows: TipRows,
     theta: NDArray,
     loss: str,
     accuracy: Accuracy = EXACT,

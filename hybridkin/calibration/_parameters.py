@@ -132,9 +132,7 @@ class Pose(Parameter):
 
     def entry_at(self, theta: Tensor) -> Tensor:
         turned = rotation(theta[:3])[0] @ self.start[:3, :3]
-        position = self.start[:3, 3] + theta[3:] * torch.from_numpy(self.units[3:]).to(
-            theta
-        )
+        position = self.start[:3, 3] + theta[3:] * torch.from_numpy(self.units[3:]).to(theta)
         pose = torch.cat([turned, position[:, None]], dim=1)
         return torch.cat([pose, self.start[3:]], dim=0)
 
@@ -206,9 +204,7 @@ class Problem:
     high: NDArray
 
     @classmethod
-    def of(
-        cls, chain: Chain, names: tuple[str, ...], prior: float = GEOMETRY
-    ) -> Problem:
+    def of(cls, chain: Chain, names: tuple[str, ...], prior: float = GEOMETRY) -> Problem:
         """Return the problem for these names; the priors have the same standard deviation."""
         parameters = tuple(parameter(chain, name) for name in names)
         lows = [np.empty(0)]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hybridkin._core.model import ZeroModel
 from hybridkin.calibration._initial_guesses import Guess, initial_guesses
-from hybridkin.calibration._least_squares import ROUGH, Accuracy, Fit, Rows, solve
+from hybridkin.calibration._least_squares import ROUGH, Accuracy, Fit, TipRows, solve
 from hybridkin.calibration._parameters import Problem
 from hybridkin.calibration.natural_scales import GEOMETRY
 from hybridkin.chains.chain import Chain
@@ -37,7 +37,7 @@ class Start(NamedTuple):
         """Number of free numbers."""
         return self.theta.size
 
-    def fitted(self, rows: Rows, loss: str, accuracy: Accuracy) -> Chain:
+    def fitted(self, rows: TipRows, loss: str, accuracy: Accuracy) -> Chain:
         """Return the chain of a fit to rows; the chain itself if nothing is free."""
         if not self.n_free:
             return self.problem.chain
@@ -51,7 +51,7 @@ NO_START = Start.fixed(_NO_CHAIN)
 
 def search(
     chain: Chain,
-    rows: Rows,
+    rows: TipRows,
     names: tuple[str, ...],
     loss: str,
     prior: float = GEOMETRY,

@@ -33,9 +33,7 @@ class _Term(NamedTuple):
     leads: bool  # whether it is named first
 
 
-def sentences(
-    fit: Fit, directions: NDArray, covariance: NDArray, n_rows: float
-) -> tuple[str, ...]:
+def sentences(fit: Fit, directions: NDArray, covariance: NDArray, n_rows: float) -> tuple[str, ...]:
     """Return a sentence for each direction that hardly moves the tips, in few parameters.
 
     `directions` (K, P) are orthonormal changes in units of the prior; `covariance` (P, P) is that
@@ -51,9 +49,7 @@ def sentences(
         # The first parameter with a fair part is named first and changes by one step.
         lead = leading_part(np.abs(direction))
         direction = direction / (direction[lead] * to_steps[lead])
-        change = np.round(
-            direction * to_steps, _DIGITS
-        )  # equal changes are equal numbers
+        change = np.round(direction * to_steps, _DIGITS)  # equal changes are equal numbers
         tips = float(np.linalg.norm(columns @ direction))
         effect = "does not move the tips"
         if tips >= _STILL:

@@ -24,7 +24,7 @@ from hybridkin._core.arrays import (
 from hybridkin._core.distinct import distinct_rows, targets_that_count
 from hybridkin._core.groups import Groups
 from hybridkin._core.portable import Portable
-from hybridkin.calibration._least_squares import HELD_OUT, LOSSES, Fit, Rows, solve
+from hybridkin.calibration._least_squares import HELD_OUT, LOSSES, Fit, TipRows, solve
 from hybridkin.calibration._search import NO_START, Start, search
 from hybridkin.calibration._unidentified import sentences
 from hybridkin.calibration.measured import evenly_spaced, points, with_missing_markers
@@ -101,9 +101,7 @@ class CalibrationResult(Portable):
     messages: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
-        lines = [
-            f"CalibrationResult(rmse={self.rmse:.3e} m, converged={self.converged})"
-        ]
+        lines = [f"CalibrationResult(rmse={self.rmse:.3e} m, converged={self.converged})"]
         for name, value in self.values.items():
             lines.append(f"  {name}: {_shown(value)}")
             lines.append(f"    std. error {_shown(self.std_errors[name])}")
@@ -252,7 +250,7 @@ def fit_geometry(
     motions = Groups.of(groups, len(q))
     weights = _check_weights(sample_weight, q)
     first, counts, _ = distinct_rows(q, x, weights, motions.apart)
-    rows = Rows(q[first], x[first], torch.from_numpy(counts).to(q))
+    rows = TipRows(q[first], x[first], torch.from_numpy(counts).to(q))
     if not start.n_free:
         start = search(chain, rows, names, loss, prior)
     best = solve(start.problem, rows, start.theta, loss)
@@ -281,12 +279,12 @@ def refitted(start: Start, q: Tensor, x: Tensor, weights: Tensor) -> Chain:
     spaced ones determine the few parameters.
     """
     like = start.problem.chain.geometry()["base"]
-    rows = Rows(q.to(like), x.to(like), weights.to(like))
+    rows = TipRows(q.to(like), x.to(like), weights.to(like))
     rows = rows.take(evenly_spaced(len(q), _ENOUGH))
     return start.fitted(rows, "linear", HELD_OUT)
 
 
-def _few(fit: Fit, rows: Rows) -> list[str]:
+def _few(fit: Fit, rows: TipRows) -> list[str]:
     """Return a warning if there are fewer rows than free parameters: `rmse` is then too small."""
     n_rows = len(rows.q)
     n_free = fit.theta.size
@@ -298,7 +296,7 @@ def _few(fit: Fit, rows: Rows) -> list[str]:
     ]
 
 
-def _unexplained(fit: Fit, rows: Rows) -> list[str]:
+def _unexplained(fit: Fit, rows: TipRows) -> list[str]:
     """Return a warning if the median residual is large, which a few outliers cannot cause."""
     residual = np.median(np.linalg.norm(rows.residual(fit.chain()), axis=1))
     centred = points((rows.x - rows.x.nanmedian(dim=0).values).numpy())[rows.seen]
@@ -349,7 +347,7 @@ def _unphysical(fit: Fit) -> tuple[tuple[str, ...], list[str]]:
 
 def _result(
     fit: Fit,
-    rows: Rows,
+    rows: TipRows,
     cv_rmse: float | None,
     unphysical: tuple[str, ...],
     returns_tensors: bool,
@@ -394,7 +392,7 @@ def _result(
     )
 
 
-def _cross_validate(best: Fit, rows: Rows, motions: Groups, loss: str) -> float:
+def _cross_validate(best: Fit, rows: TipRows, motions: Groups, loss: str) -> float:
     squares = 0.0
     for train, test in motions.folds():
         fit = solve(best.problem, rows.take(train), best.theta, loss, HELD_OUT)
@@ -424,9 +422,7 @@ def _check_parameters(chain: Chain, parameters: Sequence[str]) -> tuple[str, ...
     return names
 
 
-def check_data(
-    chain: Chain, q: Numbers, x: Numbers
-) -> tuple[Tensor, Tensor, list[str]]:
+def check_data(chain: Chain, q: Numbers, x: Numbers) -> tuple[Tensor, Tensor, list[str]]:
     """Return the data as tensors in the dtype of the chain, and warnings about their units."""
     dtype = chain.geometry()["base"].dtype
     q = as_tensor(q, "q").to("cpu", dtype)

@@ -17,7 +17,7 @@ from hybridkin._core.distinct import distinct_rows, targets_that_count
 from hybridkin._core.groups import Groups
 from hybridkin._core.model import ForwardModel
 from hybridkin._core.simplest import simplest_within
-from hybridkin.calibration._least_squares import COMPARED, LOSSES, ROUGH, Rows, solve
+from hybridkin.calibration._least_squares import COMPARED, LOSSES, ROUGH, TipRows, solve
 from hybridkin.calibration._search import NO_START, Start, search, widened
 from hybridkin.calibration.calibrate import (
     CalibrationResult,
@@ -39,9 +39,7 @@ _FEW = 40  # with fewer rows `io` is not used
 # rows per parameter; with fewer rows a set must be clearly better
 _ROWS = 7
 _CLEARLY = 0.7
-_WORSE = (
-    1.1  # times the smallest held-out error: sets above are not taken, whatever `io`
-)
+_WORSE = 1.1  # times the smallest held-out error: sets above are not taken, whatever `io`
 # Also from few rows.
 _USUAL = (
     "nothing",
@@ -58,7 +56,7 @@ _RIVAL = "elastic tendons: "  # prefix of sets that replace those of a plain cha
 _STIFF = ("bending_stiffness", "axial_stiffness")
 
 
-class Errors(NamedTuple):
+class SetErrors(NamedTuple):
     """Mean tip distances of a set of parameters [m]; NaN if they were not needed."""
 
     cv: float  # held-out motions, or rows
@@ -85,7 +83,7 @@ class GeometryChoice:
         Start of their fit. Default: it is searched.
     name : str
         Name of the set in `errors`.
-    errors : dict of str to Errors
+    errors : dict of str to SetErrors
         Errors of all sets that were tried; empty if there was no choice.
     messages : tuple of str
         Warnings about the log.
@@ -101,7 +99,7 @@ class GeometryChoice:
     parameters: tuple[str, ...]
     start: Start = NO_START
     name: str = ""
-    errors: Mapping[str, Errors] = field(default_factory=dict)
+    errors: Mapping[str, SetErrors] = field(default_factory=dict)
     messages: tuple[str, ...] = ()
     rivals: tuple[GeometryChoice, ...] = ()
     starts: Starts = ()
@@ -115,9 +113,7 @@ class GeometryChoice:
         """Return an iterator over the parameters to calibrate."""
         return iter(self.parameters)
 
-    def calibrate(
-        self, q: Numbers, x: Numbers, *, loss: str = "linear"
-    ) -> CalibrationResult:
+    def calibrate(self, q: Numbers, x: Numbers, *, loss: str = "linear") -> CalibrationResult:
         """Return the calibration of the chosen parameters, which must not be empty.
 
         Parameters
@@ -247,15 +243,16 @@ def choose_geometry(
     if weights is None:
         weights = np.ones(len(q))
     weights = as_tensor(weights, "weights").to(q)
+    given = tuple(parameters or ())
     first, counts, _ = distinct_rows(q, x, weights, motions.apart)
     motions = motions.take(first)
     order = np.argsort(motions.labels, kind="stable")
     chosen = np.sort(order[evenly_spaced(len(first), _MOST)])
-    rows = Rows(q[first], x[first], torch.from_numpy(counts).to(q)).take(chosen)
+    rows = TipRows(q[first], x[first], torch.from_numpy(counts).to(q)).take(chosen)
     motions = motions.take(chosen)
     with torch.no_grad():
-        candidates = _candidates(chain, q, parameters)
-        messages = () if parameters is not None else unmoved(chain, q)
+        candidates = _candidates(chain, q, given)
+        messages = () if given else unmoved(chain, q)
     if len(starts) < len(candidates):
         starts = _starts(candidates, rows, loss)
     starts = starts[: len(candidates)]
@@ -264,16 +261,16 @@ def choose_geometry(
     errors = {}
     if len(candidates) > 1:
         splits = _splits(motions)
-        outer = None
+        outer = []
         if outside and len(chosen) >= _FEW:
-            outer = _Split(*inner_and_outer(rows.q.numpy()))
+            outer = [_Split(*inner_and_outer(rows.q.numpy()))]
         for candidate, start in zip(candidates, starts, strict=True):
             cv = _mean_distance(start, rows, splits, loss)
             io = np.nan
-            if outer is not None:
-                io = _mean_distance(start, rows, [outer], loss)
-            errors[candidate.name] = Errors(cv, io)
-        n_inner = len((outer or splits[-1]).fitted)
+            if outer:
+                io = _mean_distance(start, rows, outer, loss)
+            errors[candidate.name] = SetErrors(cv, io)
+        n_inner = len([*splits, *outer][-1].fitted)
         table = np.maximum([*errors.values()], _EXACT * float(chain.reach))
         best = _best(table, candidates, starts, len(chosen), n_inner)
         near = np.flatnonzero(~(table > _WORSE * table[best]).any(axis=1)).tolist()
@@ -301,7 +298,7 @@ def _best(
     n_rows: int,
     n_inner: int,
 ) -> int:
-    """Return the index of the chosen one of K sets, with `Errors` (K, 2), smaller sets first."""
+    """Return the index of the chosen one of K sets, with `SetErrors` (K, 2), smaller sets first."""
     n_free = np.array([start.n_free for start in starts])
     usual = np.array([candidate.name in _USUAL for candidate in candidates])
     cv, io = errors.T
@@ -319,26 +316,20 @@ def _best(
     return simplest_within(np.where(good, scores, np.inf), _EQUAL)
 
 
-def _candidates(
-    chain: Chain, q: Tensor, parameters: Sequence[str] | None
-) -> list[_Candidate]:
-    """Return the sets to choose from, the smaller ones first."""
-    sets = chain.parameter_sets
-    if parameters is not None:
-        sets = [tuple(parameters)]
+def _candidates(chain: Chain, q: Tensor, given: tuple[str, ...]) -> list[_Candidate]:
+    """Return the sets to choose from, the smaller ones first; or of given parameters one."""
+    sets = [given] if given else chain.parameter_sets
     candidates = [_Candidate(_name(names), chain, names) for names in sets]
     for elastic in chain.rivals(q):
         elastic_sets = [names for names in elastic.parameter_sets if len(names) > 1]
-        if parameters is not None:
+        if given:
             elastic_sets = [_elastic_parameters(chain, elastic, sets[0])]
         for names in elastic_sets:
             candidates.append(_Candidate(_RIVAL + _name(names), elastic, names))
     return candidates
 
 
-def _elastic_parameters(
-    chain: Chain, elastic: Chain, names: tuple[str, ...]
-) -> tuple[str, ...]:
+def _elastic_parameters(chain: Chain, elastic: Chain, names: tuple[str, ...]) -> tuple[str, ...]:
     """Return the parameters of elastic tendons in place of those of a plain chain.
 
     Lengths and radii of a plain chain compensate for slack; elastic tendons keep them.
@@ -357,7 +348,7 @@ def _name(names: tuple[str, ...]) -> str:
     return " + ".join(words) or "nothing"
 
 
-def _starts(candidates: Sequence[_Candidate], rows: Rows, loss: str) -> list[Start]:
+def _starts(candidates: Sequence[_Candidate], rows: TipRows, loss: str) -> list[Start]:
     """Return the start of the fit of every set; initial guesses are searched if rings become free.
 
     Other sets start from the previous one; elastic tendons also from a plain chain with the same
@@ -390,7 +381,7 @@ def _starts(candidates: Sequence[_Candidate], rows: Rows, loss: str) -> list[Sta
     return starts
 
 
-def _refitted(starts: list[Start], rows: Rows, loss: str) -> Start:
+def _refitted(starts: list[Start], rows: TipRows, loss: str) -> Start:
     """Return the start with the smallest error of a rough fit; the first one if nearly equal."""
     fits = [solve(start.problem, rows, start.theta, loss, ROUGH) for start in starts]
     best = simplest_within([fit.rmse for fit in fits], _ALIKE)
@@ -405,7 +396,7 @@ def _splits(motions: Groups) -> list[_Split]:
 
 def _mean_distance(
     start: Start,
-    rows: Rows,
+    rows: TipRows,
     splits: Sequence[_Split],
     loss: str,
 ) -> float:
@@ -447,9 +438,7 @@ def unmoved(model: ForwardModel | None, q: Tensor) -> tuple[str, ...]:
     )
 
 
-def split_by_effect(
-    model: ForwardModel, q: Tensor, directions: NDArray
-) -> tuple[NDArray, NDArray]:
+def split_by_effect(model: ForwardModel, q: Tensor, directions: NDArray) -> tuple[NDArray, NDArray]:
     """Return combinations (k, a) and (k, k - a) of directions of q (n, k).
 
     Along the first ones the tip of the model moves at some of the rows q (N, n), along the others

@@ -63,9 +63,7 @@ def without_fixed(path: Sequence[Joint]) -> tuple[list[Joint], NDArray]:
             moving.append(joint._replace(origin=pending))
             pending = np.eye(4)
     if len(moving) > _MOST:
-        raise ValueError(
-            f"an arm must have at most {_MOST} moving joints, got {len(moving)}."
-        )
+        raise ValueError(f"an arm must have at most {_MOST} moving joints, got {len(moving)}.")
     return moving, pending
 
 
@@ -91,9 +89,7 @@ def source_of(text_or_path: str | PathLike[str]) -> str | Path:
             f"{str(path)!r:.200}."
         )
     if path.stat().st_size > _BYTES:
-        raise ValueError(
-            f"`text_or_path` must be at most {_BYTES} bytes long, {path} is longer."
-        )
+        raise ValueError(f"`text_or_path` must be at most {_BYTES} bytes long, {path} is longer.")
     return path
 
 
@@ -102,9 +98,7 @@ def check_link(link: str, links: Collection[str], argument: str) -> None:
     if link not in links:
         close = difflib.get_close_matches(link, links, n=1)
         hint = f"did you mean {close[0]!r}? It has" if close else "it has"
-        raise ValueError(
-            f"`{argument}` {link!r} is not in the robot; {hint} {[*links]!s:.1000}."
-        )
+        raise ValueError(f"`{argument}` {link!r} is not in the robot; {hint} {[*links]!s:.1000}.")
 
 
 def chain_path(chain: Chain) -> list[Joint]:

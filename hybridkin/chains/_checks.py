@@ -38,15 +38,11 @@ def float_dtype(dtype: object) -> torch.dtype:
     raise ValueError(f"`dtype` must be torch.float64 or torch.float32, got {dtype!r}.")
 
 
-def lengths_of(
-    value: Numbers, name: str, dtype: torch.dtype, size: int | None = None
-) -> Tensor:
+def lengths_of(value: Numbers, name: str, dtype: torch.dtype, size: int | None = None) -> Tensor:
     """Return one positive length per segment, shape (S,)."""
     lengths = numeric(value, name, dtype, need="n", length=size)
     if not len(lengths) or not (lengths > 0).all():
-        raise ValueError(
-            f"`{name}` must be positive [m] on every segment, got {lengths.tolist()}."
-        )
+        raise ValueError(f"`{name}` must be positive [m] on every segment, got {lengths.tolist()}.")
     _check_size(lengths, name)
     return lengths
 
@@ -61,9 +57,7 @@ def _check_size(numbers: Tensor, name: str) -> None:
         )
 
 
-def filled(
-    value: Numbers, name: str, dtype: torch.dtype, shape: tuple[int, ...]
-) -> Tensor:
+def filled(value: Numbers, name: str, dtype: torch.dtype, shape: tuple[int, ...]) -> Tensor:
     """Return one number for all, or an array of the shape (also a list of lists), as a tensor."""
     if len(shape) == 1 and _is_nested(value):
         value = torch.cat([numeric(part, name).flatten() for part in value])
@@ -177,9 +171,7 @@ def joint_limits(n: int, *given: Numbers | None) -> dict[str, Tensor]:
     return limits
 
 
-def actuator_counts(
-    n_actuators: int | Sequence[int], n_segments: int
-) -> tuple[int, ...]:
+def actuator_counts(n_actuators: int | Sequence[int], n_segments: int) -> tuple[int, ...]:
     """Return the number of actuators of every segment."""
     numbers = np.asarray(n_actuators)
     if numbers.dtype.kind not in "iu" or numbers.shape not in ((), (n_segments,)):
@@ -189,9 +181,7 @@ def actuator_counts(
         )
     counts = tuple(np.broadcast_to(numbers, n_segments).tolist())
     if min(counts) < 1:
-        raise ValueError(
-            f"`n_actuators` must be at least 1 on every segment, got {counts}."
-        )
+        raise ValueError(f"`n_actuators` must be at least 1 on every segment, got {counts}.")
     return counts
 
 
@@ -200,9 +190,7 @@ def _is_nested(value: object) -> TypeGuard[Sequence[Numbers]]:
     return any(isinstance(part, (list, tuple)) or np.ndim(part) > 0 for part in parts)
 
 
-def flat_angles(
-    angles: Numbers | None, counts: tuple[int, ...], dtype: torch.dtype
-) -> Tensor:
+def flat_angles(angles: Numbers | None, counts: tuple[int, ...], dtype: torch.dtype) -> Tensor:
     """Return the angles of all actuators, segment by segment, shape (n,)."""
     if angles is None:
         by_segment = [2.0 * math.pi * np.arange(n) / n for n in counts]
@@ -237,9 +225,7 @@ def pose(value: Numbers | Transform | None, name: str, dtype: torch.dtype) -> Te
     if isinstance(value, Transform) and len(matrix) == 1:
         matrix = matrix[0]
     if matrix.shape != (4, 4):
-        raise ValueError(
-            f"`{name}` must be one pose of shape (4, 4), got {tuple(matrix.shape)}."
-        )
+        raise ValueError(f"`{name}` must be one pose of shape (4, 4), got {tuple(matrix.shape)}.")
     rotation = matrix[:3, :3]
     not_orthonormal = rotation.mT @ rotation - identity(3, matrix)
     if not_orthonormal.abs().max() > 1e-4 or torch.linalg.det(rotation) < 0:

@@ -14,9 +14,7 @@ from hybridkin.chains.calibratable import Scale
 _FACTORS = ("bending_stiffness", "axial_stiffness", "weight")
 _FACTOR = 1e4  # by which these can grow or shrink in a calibration
 
-COMPRESSED = (
-    f"compressed: in {{rows}} an arc is below {HK_LEAST_LENGTH:g} of its rest length"
-)
+COMPRESSED = f"compressed: in {{rows}} an arc is below {HK_LEAST_LENGTH:g} of its rest length"
 
 
 class ElasticBody(ArcChain):

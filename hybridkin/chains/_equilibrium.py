@@ -19,9 +19,7 @@ from hybridkin._core.kernel_numbers import HK_LEAST_LENGTH
 from hybridkin.chains._arcs import segments_of
 from hybridkin.chains._gravity import WorkOfGravity
 
-_MOST_STEPS = (
-    1000  # a body that falls to one side and is pulled to another turns slowly
-)
+_MOST_STEPS = 1000  # a body that falls to one side and is pulled to another turns slowly
 _TOLERANCE = 1e-10  # imbalance relative to the loads
 _SIDE = 2e-6  # relative load that decides to which side a body falls; 16 roundings of float32
 _FLAT = 1e-9  # relative curvature of the energy below which a shape is not stable
@@ -182,9 +180,7 @@ def shapes_of_least_energy(statics: Statics, forces: Tensor, start: Tensor) -> F
         step = _downhill(live)
         at_rest = (size <= live.tol) & step.is_stable
         stuck = live.take(step.is_stuck)
-        why = torch.where(
-            _is_short(statics, stuck), Outcome.COMPRESSED, Outcome.BUCKLED
-        )
+        why = torch.where(_is_short(statics, stuck), Outcome.COMPRESSED, Outcome.BUCKLED)
         found.outcome[stuck.row] = why
         if at_rest.any():
             _record(found, statics, live.take(at_rest))

@@ -127,9 +127,7 @@ def _rotations(segments: Segments) -> tuple[Tensor, Tensor]:
     return torch.stack([base, *ends[:-1]], dim=2), torch.stack(ends, dim=2)
 
 
-def _second_derivatives(
-    tail: Tensor, segments: Segments, down: Tensor
-) -> tuple[Tensor, Tensor]:
+def _second_derivatives(tail: Tensor, segments: Segments, down: Tensor) -> tuple[Tensor, Tensor]:
     """Return second derivatives of d . p, the point p of an end frame along a direction d.
 
     Those by l and b_i are (2, ...), those by b_i and b_j (2, 2, ...); the tail v = (v_xy, v_z) and
@@ -157,10 +155,7 @@ def _second_derivatives(
     along = (beta * g2 + dz * f2) * e + (beta * f2 - dz * f1) * vz
     eye = identity(2, b).reshape(2, 2, *[1] * square.ndim)
     by_bending = (
-        one_sided
-        + one_sided.transpose(0, 1)
-        + along * _outer(b, b)
-        + (p1 * e + q1 * vz) * eye
+        one_sided + one_sided.transpose(0, 1) + along * _outer(b, b) + (p1 * e + q1 * vz) * eye
     )
     return P, by_bending
 

@@ -35,9 +35,7 @@ def joint_coefficients(z: Tensor, slides: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(slides, z, z.sin()), z.cos()
 
 
-def carried_tip(
-    u1: Tensor, u2: Tensor, motions: Tensor, end: Tensor, base: Tensor
-) -> Tensor:
+def carried_tip(u1: Tensor, u2: Tensor, motions: Tensor, end: Tensor, base: Tensor) -> Tensor:
     """Return the tip (3, N) of a point (4,) in the last moving frame.
 
     Carrying one point from the last joint to the base is many times faster than `moving_frames`.

@@ -51,9 +51,7 @@ def mjcf_path(
         else:
             model = mujoco.MjModel.from_xml_string(source)
     except (ValueError, RuntimeError, MemoryError) as error:
-        raise ValueError(
-            f"`text_or_path` must be a valid MJCF: {error!s:.400}."
-        ) from error
+        raise ValueError(f"`text_or_path` must be a valid MJCF: {error!s:.400}.") from error
     bodies = {model.body(i).name: i for i in range(model.nbody)}
     sites = {model.site(i).name: i for i in range(model.nsite)}
     check_link(end_link, [*bodies, *sites], "end_link")
@@ -73,9 +71,7 @@ def mjcf_path(
         root = bodies[root_link]
     carrying = _carrying(model, root, body)
     if carrying is None:
-        raise ValueError(
-            f"`root_link` must lead to {end_link!r}, but {root_link!r} does not."
-        )
+        raise ValueError(f"`root_link` must lead to {end_link!r}, but {root_link!r} does not.")
     _warn_of_loops(model, carrying)
     couplings = _Couplings(model)
     path: list[Joint] = []
@@ -97,9 +93,7 @@ def mjcf_path(
         else:
             name = model.joint(driver).name or f"joint_{len(path) + 1}"
             limits = _limits(model, driver)
-            path.append(
-                Joint(origin, kind, axis, driver, name, limits, coupling.factor)
-            )
+            path.append(Joint(origin, kind, axis, driver, name, limits, coupling.factor))
         before = placed
     _check_tendons(model, {j: couplings.of(j).driver for j in joints})
     path.append(Joint(np.linalg.solve(before, _pose(end.xpos, end.xmat))))

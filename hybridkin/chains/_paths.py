@@ -13,9 +13,7 @@ from hybridkin._core.arrays import identity, one_of
 _DETERMINED = 1e-6  # smallest relative reading that determines a direction of bending
 
 
-def path_starts(
-    routing: str, counts: Sequence[int], extensible: Sequence[bool]
-) -> tuple[int, ...]:
+def path_starts(routing: str, counts: Sequence[int], extensible: Sequence[bool]) -> tuple[int, ...]:
     """Return the first segment that the actuators of each segment run through.
 
     Actuators carried by a rigid stage start after it.
@@ -94,9 +92,7 @@ def bend_extremes(angles: Tensor, extensible: bool) -> tuple[float, float]:
     return most, least
 
 
-def bend_counts(
-    angles: Sequence[Tensor], extensible: Sequence[bool]
-) -> tuple[int, ...]:
+def bend_counts(angles: Sequence[Tensor], extensible: Sequence[bool]) -> tuple[int, ...]:
     """Return the number of directions in which each segment bends: 2, or 1 in a plane.
 
     It is 0 for an extensible segment with a single actuator.
@@ -118,9 +114,7 @@ def bend_counts(
     return tuple(bends)
 
 
-def free_arcs(
-    angles: Sequence[Tensor], extensible: Sequence[bool], bends: Sequence[int]
-) -> Tensor:
+def free_arcs(angles: Sequence[Tensor], extensible: Sequence[bool], bends: Sequence[int]) -> Tensor:
     """Return the projector (3 S, 3 S) on the arcs that the actuators of each segment determine.
 
     These are its length if it is extensible, and `bends` components of its bending: both, none, or

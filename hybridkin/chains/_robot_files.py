@@ -69,9 +69,7 @@ def _is_text(value: object) -> bool:
 
 
 def _many(test: _Test, size: int = 0) -> _Test:
-    return lambda v: (
-        type(v) is list and len(v) == (size or len(v)) > 0 and all(map(test, v))
-    )
+    return lambda v: type(v) is list and len(v) == (size or len(v)) > 0 and all(map(test, v))
 
 
 def _one_or_many(test: _Test) -> _Test:
@@ -224,9 +222,7 @@ def chain_of(tables: Mapping[str, Any]) -> ArcChain:
             f"[[segment]] must describe at most {_MOST} segments in all, got "
             f"{len(segments)}; check `repeat`."
         )
-    arguments: dict[str, Any] = {
-        key: [segment[key] for segment in segments] for key in segments[0]
-    }
+    arguments: dict[str, Any] = {key: [segment[key] for segment in segments] for key in segments[0]}
     for key in ("gains", *_STIFFNESS):
         if key in arguments:
             arguments[key] = _all_or_none(arguments[key], key)
@@ -245,9 +241,7 @@ def chain_of(tables: Mapping[str, Any]) -> ArcChain:
         arguments["routing"] = tables["routing"]
     if "gravity" in base:
         if model != _FORCES:
-            raise ValueError(
-                f'`gravity` in [base] belongs to model = "{_FORCES}"; remove it.'
-            )
+            raise ValueError(f'`gravity` in [base] belongs to model = "{_FORCES}"; remove it.')
         arguments["gravity"] = base["gravity"]
     return _CHAINS[model](**arguments)
 
@@ -280,9 +274,7 @@ def _all_or_none(values: list[Any], key: str) -> list[Any] | None:
     return values
 
 
-def _segment(
-    table: Mapping[str, Any], where: str, model: str, unit: str
-) -> dict[str, Any]:
+def _segment(table: Mapping[str, Any], where: str, model: str, unit: str) -> dict[str, Any]:
     """Return the constructor arguments of one segment; None for optional ones."""
     stage = table.get("stage")
     if stage is not None and not {*table} <= {"stage", "offset", "zeros", "gain"}:
@@ -290,15 +282,11 @@ def _segment(
             f"`stage` in {where} can only be combined with `offset`, `zeros` and `gain`."
         )
     if "radius" not in table and stage is None:
-        raise ValueError(
-            f"`radius` is missing in {where}; give the actuator circle's radius [m]."
-        )
+        raise ValueError(f"`radius` is missing in {where}; give the actuator circle's radius [m].")
     if "angles_deg" in table:
         angles = np.radians(np.array(table["angles_deg"], dtype=float))
         if beside := {"angle_deg", "actuators", "clockwise"} & {*table}:
-            raise ValueError(
-                f"`{min(beside)}` cannot be combined with `angles_deg` in {where}."
-            )
+            raise ValueError(f"`{min(beside)}` cannot be combined with `angles_deg` in {where}.")
     else:
         n = table.get("actuators", 3 if stage is None else 1)
         step = (-2.0 if table.get("clockwise", False) else 2.0) * math.pi / n
@@ -328,9 +316,7 @@ def _segment(
     return arguments | {"actuator_zeros": zeros}
 
 
-def _gains(
-    table: Mapping[str, Any], where: str, n: int, unit: str
-) -> np.ndarray | None:
+def _gains(table: Mapping[str, Any], where: str, n: int, unit: str) -> np.ndarray | None:
     """Return metres per unit of q (n,), for angles per radian; None if q is in metres."""
     gains = each(table, "gain", where, n)
     spools = each(table, "spool_radius", where, n)
@@ -359,7 +345,5 @@ def each(table: Mapping[str, Any], key: str, where: str, size: int) -> np.ndarra
     """Return `size` numbers, given as a list or as one number for all; zeros by default."""
     value = np.array(table.get(key, 0.0), dtype=float)
     if value.shape not in ((), (size,)):
-        raise ValueError(
-            f"`{key}` in {where} must hold {size} numbers, got {table[key]!r}."
-        )
+        raise ValueError(f"`{key}` in {where} must hold {size} numbers, got {table[key]!r}.")
     return np.broadcast_to(value, size).copy()

@@ -120,9 +120,7 @@ def find_in_table(rows: Tensor, table: Tensor) -> Tensor:
     def stretches(codes: Tensor, x: Tensor, columns: Tensor = columns) -> Tensor:
         # The map of each row times x, without a copy of the maps.
         at = codes[:, None] * (n + 1) + places
-        return nn.functional.embedding_bag(
-            at, columns, per_sample_weights=x, mode="sum"
-        )
+        return nn.functional.embedding_bag(at, columns, per_sample_weights=x, mode="sum")
 
     def sizes(codes: Tensor, x: Tensor) -> Tensor:
         return stretches(codes, x.abs(), columns.abs())
@@ -151,9 +149,7 @@ def find_by_solving(rows: Tensor, *elasticity: Tensor) -> Tensor:
 _Stretches = Callable[[Tensor, Tensor], Tensor]
 
 
-def _pivoted(
-    stretches: _Stretches, sizes: _Stretches, full: Tensor, x: Tensor
-) -> Tensor:
+def _pivoted(stretches: _Stretches, sizes: _Stretches, full: Tensor, x: Tensor) -> Tensor:
     """Return the codes (N,) of the taut tendons by block principal pivoting.
 
     Parameters
@@ -205,9 +201,7 @@ class WithoutDerivative(torch.autograd.Function):
         return find(rows, *parts)
 
     @staticmethod
-    def setup_context(
-        ctx: FunctionCtx, inputs: tuple[object, ...], output: Tensor
-    ) -> None:
+    def setup_context(ctx: FunctionCtx, inputs: tuple[object, ...], output: Tensor) -> None:
         ctx.mark_non_differentiable(output)
 
     @staticmethod
@@ -219,9 +213,7 @@ class WithoutDerivative(torch.autograd.Function):
         """Return no derivative."""
 
     @staticmethod
-    def vmap(
-        info: VmapInfo, in_dims: tuple[int | None, ...], *args: Any
-    ) -> tuple[Tensor, int]:
+    def vmap(info: VmapInfo, in_dims: tuple[int | None, ...], *args: Any) -> tuple[Tensor, int]:
         find, *tensors = args
         results = []
         for k in range(info.batch_size):

@@ -54,25 +54,19 @@ class Urdf:
         if root_link is not None:
             check_link(root_link, links, "root_link")
         joints = self.robot.findall("joint")
-        self._by_name = _distinct(
-            "joint", (joint.get("name", "") for joint in joints), joints
-        )
+        self._by_name = _distinct("joint", (joint.get("name", "") for joint in joints), joints)
         children = [_attribute(joint, "child", "link") for joint in joints]
         by_child = _distinct("<child>", children, joints)
         self.path: list[tuple[etree._Element, list[Joint]]] = []
         link = end_link
         while link != root_link and link in by_child:
             if len(self.path) == len(joints):
-                raise ValueError(
-                    f"the links of a URDF must be a tree, got a cycle to {link!r}."
-                )
+                raise ValueError(f"the links of a URDF must be a tree, got a cycle to {link!r}.")
             joint = by_child[link]
             self.path.append((joint, self._joints(joint)))
             link = _attribute(joint, "parent", "link")
         if root_link not in (None, link):
-            raise ValueError(
-                f"`root_link` must lead to {end_link!r}, but {root_link!r} does not."
-            )
+            raise ValueError(f"`root_link` must lead to {end_link!r}, but {root_link!r} does not.")
         self.path.reverse()
         self.joints = [joint for _, joints in self.path for joint in joints]
 
@@ -88,9 +82,7 @@ class Urdf:
         before = np.eye(4)
         for element, (joint, *free) in self.path:
             if free:
-                raise ValueError(
-                    f"joint {free[0].name!r} is free; use a `root_link` after it."
-                )
+                raise ValueError(f"joint {free[0].name!r} is free; use a `root_link` after it.")
             if joint.kind == "fixed":
                 before = before @ joint.origin
                 continue
@@ -177,9 +169,7 @@ def _distinct(
     by_name: dict[str, etree._Element] = {}
     for name, joint in zip(names, joints, strict=True):
         if name in by_name:
-            raise ValueError(
-                f"every {what} of a URDF must occur once, got {name!r} repeatedly."
-            )
+            raise ValueError(f"every {what} of a URDF must occur once, got {name!r} repeatedly.")
         by_name[name] = joint
     return by_name
 
@@ -219,9 +209,7 @@ def _limits(joint: etree._Element) -> JointLimits:
     # URDF 1.2; a joint that brakes less than it accelerates must keep to the smaller one.
     acceleration = _numbers(joint, "limit", "acceleration", "0")[0] or math.inf
     deceleration = _numbers(joint, "limit", "deceleration", "0")[0] or math.inf
-    limits = JointLimits(
-        speed=speed or math.inf, acceleration=min(acceleration, deceleration)
-    )
+    limits = JointLimits(speed=speed or math.inf, acceleration=min(acceleration, deceleration))
     if joint.get("type") == "continuous":
         return limits
     if not _has(joint, "limit"):

@@ -261,9 +261,7 @@ class ArcChain(MarkedChain):
         """Set the structure of the chain, and return the `arc_geometry` of the arguments."""
         counts, self.extensible, geometry = arc_geometry(**arguments)
         if any(self.extensible) and not without_lengths:
-            raise ValueError(
-                "`lengths` must hold the backbone length of every segment, got None."
-            )
+            raise ValueError("`lengths` must hold the backbone length of every segment, got None.")
         self.actuators_per_segment = counts
         self.starts = path_starts(routing, counts, self.extensible)
         self.n_segments = len(counts)
@@ -351,9 +349,7 @@ class ArcChain(MarkedChain):
         (J,) = self.by_rows(partial(self._along_geometry, tangents=changes), q)
         return J
 
-    def _along_geometry(
-        self, rows: Tensor, tangents: Mapping[str, Tensor]
-    ) -> tuple[Tensor]:
+    def _along_geometry(self, rows: Tensor, tangents: Mapping[str, Tensor]) -> tuple[Tensor]:
         """Return the derivative (N, 3 K, P) of x along P changes of the geometry."""
         arcs, change = self._arcs_and_change(rows, tangents)
         arcs = self.up_to_markers(arcs)
@@ -559,9 +555,7 @@ class ArcChain(MarkedChain):
         return changes
 
     def _readings(self) -> Tensor:
-        return reading_matrix(
-            self.radii, self.angles, self.actuators_per_segment, self.starts
-        )
+        return reading_matrix(self.radii, self.angles, self.actuators_per_segment, self.starts)
 
     def _changes_of_bends(self, changes: Mapping[str, Tensor]) -> Tensor:
         """Return the changes (P, n, 2 S) of the readings of the bendings."""
@@ -669,9 +663,7 @@ class ArcChain(MarkedChain):
         parts = parts.reshape(*q.shape[:-1], *parts.shape[1:])
         return parts[..., 0], parts[..., 1:]
 
-    def _poses(
-        self, length: Tensor, bending: Tensor, offsets: Tensor, q: Tensor
-    ) -> Tensor:
+    def _poses(self, length: Tensor, bending: Tensor, offsets: Tensor, q: Tensor) -> Tensor:
         """Return the poses of the base and after all arcs, turned by the stage."""
         steps = transforms(length, bending, offsets.to(length))
         base = self.base.to(length).expand(*length.shape[:-1], 4, 4)
@@ -687,9 +679,7 @@ class ArcChain(MarkedChain):
         points = tip(self._segments(arcs), self._beside(arcs))
         return self._in_measuring_frame(points)
 
-    def _x_and_columns(
-        self, arcs: Tensor, rigid: bool = False
-    ) -> tuple[Tensor, Tensor]:
+    def _x_and_columns(self, arcs: Tensor, rigid: bool = False) -> tuple[Tensor, Tensor]:
         """Return the markers (3, K, N) in the base frame at arcs up to them, and derivatives."""
         return tip_and_columns(self._segments(arcs), self._beside(arcs), rigid=rigid)
 

@@ -41,9 +41,7 @@ class Body(NamedTuple):
         return cls(points, [], [], np.empty((len(points), 0, _CORNERS, 3)), True)
 
 
-def actuator_path(
-    frames: NDArray, passed: slice, radius: float, angle: float
-) -> NDArray:
+def actuator_path(frames: NDArray, passed: slice, radius: float, angle: float) -> NDArray:
     """Return points (K, P, 3) of an actuator at its place in the frames (K, S, P, 4, 4)."""
     place = radius * np.array([np.cos(angle), np.sin(angle), 0.0])
     points = frames[:, passed, :, :3, 3] + frames[:, passed, :, :3, :3] @ place

@@ -331,9 +331,7 @@ class Chain(PoseModel):
         message = span_message(name, finite, self.size, _FAR)
         return [] if message is None else [message]
 
-    def tip_messages(
-        self, q: Tensor, x: Tensor, name: str, calibrated: bool = False
-    ) -> list[str]:
+    def tip_messages(self, q: Tensor, x: Tensor, name: str, calibrated: bool = False) -> list[str]:
         """Return a warning if measured tips span far more than those of the chain.
 
         Tips x (N, m) are measured at rows q (N, n), missing ones NaN. Only if the chain is

@@ -56,9 +56,7 @@ _SHAPING = (
     "actuator_zeros",
     "gains",
 )
-_NEARLY = (
-    0.5  # relative reading across the plane of planar actuators, after a calibration
-)
+_NEARLY = 0.5  # relative reading across the plane of planar actuators, after a calibration
 _CONTRADICTED = 0.3  # share of the readings that the arcs explain, in one segment
 _NOTICED = 0.1  # share of the radius: the reading of a bend of 0.1 rad
 
@@ -395,9 +393,7 @@ class ConstantCurvatureChain(LengthDrivenChain):
             return []
         fixed_length = ~torch.tensor(self.extensible, device=q.device)
         with torch.no_grad():
-            (wrong,) = in_blocks(
-                lambda q: (self.contradictory(q) & fixed_length,), rows
-            )
+            (wrong,) = in_blocks(lambda q: (self.contradictory(q) & fixed_length,), rows)
             if not wrong.any():
                 return []
             residual = self.consistency(rows) * wrong
@@ -459,10 +455,7 @@ class ConstantCurvatureChain(LengthDrivenChain):
 
     def extra_repr(self) -> str:
         """Return the summary shown by repr()."""
-        kinds = [
-            "extensible" if stretches else "inextensible"
-            for stretches in self.extensible
-        ]
+        kinds = ["extensible" if stretches else "inextensible" for stretches in self.extensible]
         if self.n_stages:
             kinds[0] = f"{self.stage} stage"
         return f"{' and '.join(dict.fromkeys(kinds))}, {super().extra_repr()}"
@@ -507,10 +500,7 @@ class ConstantCurvatureChain(LengthDrivenChain):
     def _by_segment(self, q: Tensor) -> Tensor:
         """Return the RMS (..., S) of q (..., n) over the actuators of each segment."""
         parts = q.split(self.actuators_per_segment, dim=-1)
-        rms = [
-            torch.linalg.vector_norm(part, dim=-1) / part.shape[-1] ** 0.5
-            for part in parts
-        ]
+        rms = [torch.linalg.vector_norm(part, dim=-1) / part.shape[-1] ** 0.5 for part in parts]
         return torch.stack(rms, dim=-1)
 
     def _arcs_and_slope(self, rows: Tensor) -> tuple[Tensor, Tensor]:
@@ -549,9 +539,7 @@ class ConstantCurvatureChain(LengthDrivenChain):
         M = matrix / gains
         F = self._free_arcs().to(like)
         B = self._readings().to(like)
-        dB = (
-            nn.functional.pad(self._changes_of_bends(changes), (self.n_segments, 0)) @ F
-        )
+        dB = nn.functional.pad(self._changes_of_bends(changes), (self.n_segments, 0)) @ F
         dM = torch.zeros_like(dB).mT
         if 1 in self.bends:  # planes turn with their actuators
             dF = self._slope_of(ConstantCurvatureChain._free_arcs, tangents)
@@ -593,9 +581,7 @@ class ConstantCurvatureChain(LengthDrivenChain):
     def _are_nearly_planar(self) -> bool:
         """Return whether the angles of planar segments are near a plane."""
         by_segment = self.angles.split(self.actuators_per_segment)
-        for angles, stretches, n_bends in zip(
-            by_segment, self.extensible, self.bends, strict=True
-        ):
+        for angles, stretches, n_bends in zip(by_segment, self.extensible, self.bends, strict=True):
             if n_bends == 1:
                 most, least = bend_extremes(angles, stretches)
                 if not least < _NEARLY * most:

@@ -91,9 +91,7 @@ def _write_plan(plan: Plan, stored: Stored) -> int:
 
     equal_count = counts[0] if len({*counts}) == 1 else 0
     numbers = [frame, np.hstack(segments), tendons, guess]
-    return plan.node(
-        "elastic", len(x), 3, numbers, n_arcs, n_segments, equal_count, *counts
-    )
+    return plan.node("elastic", len(x), 3, numbers, n_arcs, n_segments, equal_count, *counts)
 
 
 class ElasticTendonChain(ElasticBody, LengthDrivenChain):
@@ -377,15 +375,11 @@ class ElasticTendonChain(ElasticBody, LengthDrivenChain):
         if self.n_actuators <= _TABLE:
             table = self._all_responses(rows)
             stretch = table.stretch.detach()
-            codes = _slack.WithoutDerivative.apply(
-                _slack.find_in_table, rows.detach(), stretch
-            )
+            codes = _slack.WithoutDerivative.apply(_slack.find_in_table, rows.detach(), stretch)
             return codes, codes, table
         elasticity = self._elasticity().to(rows)
         fixed = (part.detach() for part in elasticity)
-        codes = _slack.WithoutDerivative.apply(
-            _slack.find_by_solving, rows.detach(), *fixed
-        )
+        codes = _slack.WithoutDerivative.apply(_slack.find_by_solving, rows.detach(), *fixed)
         taut = _slack.as_mask(codes, self.n_actuators)
         places = torch.arange(len(rows), device=rows.device)
         return codes, places, _slack.responses_of(taut, elasticity)
@@ -469,9 +463,7 @@ class ElasticTendonChain(ElasticBody, LengthDrivenChain):
             by_pull = (by_force @ fixed.readings.mT) * taut[:, None]
             by_stiffness = by_force * (shape - fixed.rest)[:, None]
             by_rest = -by_force * fixed.stiffness
-            S = (
-                self.n_segments
-            )  # before it are the lengths, whose readings do not change
+            S = self.n_segments  # before it are the lengths, whose readings do not change
             by_readings = pull[:, None, :, None] * by_force[:, :, None, S:]
             by_readings = by_readings + by_pull[..., None] * shape[:, None, None, S:]
 

@@ -9,10 +9,12 @@ from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
+from typing_extensions import Self
 
 from hybridkin._core.arrays import Numbers, Transform, whole
 from hybridkin._core.blocks import in_blocks
 from hybridkin._core.frames import Marker
+from hybridkin._core.model import is_at_rest
 from hybridkin._core.named_rows import first_row
 from hybridkin._core.stored import Layout, Restore, Stored
 from hybridkin.chains._checks import filled, float_dtype, numeric, stiffnesses
@@ -218,9 +220,7 @@ class ForceTendonChain(ElasticBody):
         S = self.n_segments
         weights = filled(weight, "weight", dtype, (S,))
         if not (weights >= 0.0).all():
-            raise ValueError(
-                f"`weight` must not be negative [N/m], got {weights.tolist()}."
-            )
+            raise ValueError(f"`weight` must not be negative [N/m], got {weights.tolist()}.")
         tapers = filled(taper, "taper", dtype, (S,))
         if not ((tapers >= 0.0) & (tapers < 1.0)).all():
             raise ValueError(f"`taper` must lie in [0, 1), got {tapers.tolist()}.")
@@ -336,6 +336,17 @@ class ForceTendonChain(ElasticBody):
         k = self.arcs_per_segment
         middles = torch.arange(k, dtype=torch.float64, device=taper.device) + 0.5
         return taper.double()[..., None] * middles / k
+
+    def moved(self, motion: Tensor) -> Self:
+        """Return the chain after a motion (4, 4) of its base, with which gravity turns.
+
+        It is the same robot in another measuring frame, as for every model.
+        """
+        moved = super().moved(motion)
+        if not is_at_rest(motion):
+            down = torch.tensor(self.gravity, dtype=torch.float64)
+            moved.gravity = tuple((motion[:3, :3].to(down) @ down).tolist())
+        return moved
 
     def _statics(self) -> Statics:
         """Return the energy of shapes, in float64."""
@@ -469,9 +480,7 @@ class ForceTendonChain(ElasticBody):
         along = float(statics.down[2])
         pose = "stands on its base" if along < 0.0 else "hangs from its base"
         length = float(self.lengths.sum())
-        ratio = (
-            float(statics.weights.sum()) * length**2 / float(self.bending_stiffness[0])
-        )
+        ratio = float(statics.weights.sum()) * length**2 / float(self.bending_stiffness[0])
         axial = float(self.axial_stiffness.min())
         return (
             f"The body {pose} (gravity along its axis: {along:.3g}) with sum(W) L^2 / EI = "

@@ -122,9 +122,7 @@ class MarkedChain(Chain):
         if not places:
             raise ValueError(f"{need}, got none.")
         if self.n_stages and any(x or y for _, x, y, _ in places):
-            raise ValueError(
-                "`markers` must lie on the backbone of a robot on a rotation stage."
-            )
+            raise ValueError("`markers` must lie on the backbone of a robot on a rotation stage.")
         return self._marked(places)
 
     @property

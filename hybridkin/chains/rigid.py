@@ -385,9 +385,7 @@ class RigidChain(Chain):
         return cls._of_joints(path, options)
 
     @classmethod
-    def from_chain(
-        cls, chain: KinematicsChain, **options: Unpack[Options]
-    ) -> RigidChain:
+    def from_chain(cls, chain: KinematicsChain, **options: Unpack[Options]) -> RigidChain:
         """Return the arm of a pytorch_kinematics chain without branches.
 
         Parameters
@@ -579,9 +577,7 @@ class RigidChain(Chain):
         Tensor of shape (..., 3)
             Tip position in the measuring frame [m].
         """
-        (x,) = self.by_rows(
-            lambda rows: (self.from_coordinates(self._joints(rows)),), q
-        )
+        (x,) = self.by_rows(lambda rows: (self.from_coordinates(self._joints(rows)),), q)
         return x
 
     def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
@@ -589,9 +585,7 @@ class RigidChain(Chain):
 
         In closed form, in [m/rad] for revolute joints and [-] for prismatic ones.
         """
-        x, J = self.by_rows(
-            lambda rows: self.from_coordinates_and_jacobian(self._joints(rows)), q
-        )
+        x, J = self.by_rows(lambda rows: self.from_coordinates_and_jacobian(self._joints(rows)), q)
         return x, J @ self.couplings.to(q)
 
     def pose_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
@@ -672,9 +666,7 @@ class RigidChain(Chain):
         slides = self.slides.to(q.device)
         turned = degrees_message(name, joints[:, ~slides], factor)
         reach = float(self.reach.detach())
-        slid = length_message(
-            name, joints[:, slides], factor * _FAR, 0.5 * min(reach, 1.0)
-        )
+        slid = length_message(name, joints[:, slides], factor * _FAR, 0.5 * min(reach, 1.0))
         return [message for message in (turned, slid) if message is not None]
 
     def extra_repr(self) -> str:
@@ -701,9 +693,7 @@ def _with_positions(poses: Tensor, positions: Tensor) -> Tensor:
     return torch.cat([poses[..., :3], column[..., None]], dim=-1)
 
 
-def _strings(
-    strings: Sequence[str] | None, name: str, default: Sequence[str]
-) -> tuple[str, ...]:
+def _strings(strings: Sequence[str] | None, name: str, default: Sequence[str]) -> tuple[str, ...]:
     """Return a caller's strings, as many as the default has."""
     if strings is None:
         return tuple(default)

@@ -331,9 +331,7 @@ def read_description(path: str | Path) -> RobotDescription:
     """
     path = as_path(path)
     if not path.is_file():
-        raise FileNotFoundError(
-            f"`path` must be a robot description, got {path}: no such file."
-        )
+        raise FileNotFoundError(f"`path` must be a robot description, got {path}: no such file.")
     try:
         return replace(_description(read_tables(path), path.stem), path=path)
     except ValueError as error:
@@ -378,9 +376,7 @@ def _calibrated(names: list[str] | str, chain: ArcChain) -> tuple[str, ...] | st
 
 def _log_format(table: Mapping[str, Any], chain: ArcChain | None) -> LogFormat:
     if not {"q", "x"} <= {*table}:
-        raise ValueError(
-            "`q` or `x` is missing in [log]; name the columns of actuators and tip."
-        )
+        raise ValueError("`q` or `x` is missing in [log]; name the columns of actuators and tip.")
     if chain is not None and len(table["q"]) != chain.n_actuators:
         raise ValueError(
             f"`q` in [log] must name {chain.n_actuators} columns, one for each actuator of the "

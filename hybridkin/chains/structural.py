@@ -199,9 +199,7 @@ class StructuralChain(ForwardModel):
         def largest(entries: Tensor) -> float:
             return float(entries.flatten(1).norm(dim=1).max())
 
-        turn = 2.0 * torch.asin(
-            (self.motion[:3, :3] - identity(3, self.motion)).norm() / 8**0.5
-        )
+        turn = 2.0 * torch.asin((self.motion[:3, :3] - identity(3, self.motion)).norm() / 8**0.5)
         origin = self.chain.origin.to(self.motion)
         move = self.motion[:3, :3] @ origin + self.motion[:3, 3] - origin
         sizes = {
@@ -213,9 +211,7 @@ class StructuralChain(ForwardModel):
             "base turn": (degrees(float(turn)), "deg"),
             "base move": (1e3 * float(move.norm()), "mm"),
         }
-        return ", ".join(
-            f"{name} {size:.2g} {unit}" for name, (size, unit) in sizes.items()
-        )
+        return ", ".join(f"{name} {size:.2g} {unit}" for name, (size, unit) in sizes.items())
 
     @property
     def robot(self) -> ForwardModel:
@@ -293,9 +289,7 @@ class StructuralChain(ForwardModel):
             raise ValueError(f"`chain` {need}, got {type(model.chain).__name__}")
         lengths = model.lengths.tolist()
         if len(lengths) != n_arcs or min(lengths) < 0.0 or max(lengths) == 0.0:
-            need = (
-                f"must hold the lengths of {n_arcs} arcs, zero or more and not all zero"
-            )
+            need = f"must hold the lengths of {n_arcs} arcs, zero or more and not all zero"
             raise ValueError(f"`lengths` {need}, got {lengths}")
         pose(model.motion, "motion", model.motion.dtype)
         return model

@@ -21,9 +21,7 @@ class _FrameColumns(Sequence[Any]):
     """The columns of a data frame as arrays."""
 
     def __init__(self, frame: Any) -> None:
-        names = getattr(
-            frame, "column_names", None
-        )  # of pyarrow, whose columns are data
+        names = getattr(frame, "column_names", None)  # of pyarrow, whose columns are data
         if names is None:
             names = getattr(frame, "columns", None)
         if names is None or not hasattr(frame, "__getitem__"):

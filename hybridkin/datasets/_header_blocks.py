@@ -129,9 +129,7 @@ class Motive(HeaderBlock):
         names = _distinct(names, kinds)
         stated = _settings(rows[0].cells).get("length units", "").lower()
         unit = _LENGTHS.get(stated, "")
-        positions = [
-            name for name, is_place in zip(names, plain, strict=True) if is_place
-        ]
+        positions = [name for name, is_place in zip(names, plain, strict=True) if is_place]
         return Header(
             rows[place].line,
             names,

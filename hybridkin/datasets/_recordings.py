@@ -51,9 +51,7 @@ _SOURCES = {
 }
 
 
-def load_ftdcr(
-    data_home: str | os.PathLike[str] | None = None, *, subset: str = "train"
-) -> Bunch:
+def load_ftdcr(data_home: str | os.PathLike[str] | None = None, *, subset: str = "train") -> Bunch:
     """Return motion-capture data of a real robot with three segments and nine tendons.
 
     Nominal: segments of 60, 62.5 and 64 mm, tendon circle 4.5 mm. Tendons of distal segments run

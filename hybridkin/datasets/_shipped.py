@@ -101,9 +101,7 @@ def paper_split(
     """
     part = getattr(data, "part", data)
     if part is None:
-        raise ValueError(
-            "`data` has no parts of the paper's protocol; give data of `load_trunk`."
-        )
+        raise ValueError("`data` has no parts of the paper's protocol; give data of `load_trunk`.")
     part = shaped(part, "data", ["n_samples"])
     random_rows = np.flatnonzero(part == 3)
     n_test = whole(n_test, "n_test", 1, len(random_rows))

@@ -67,9 +67,7 @@ class Table(NamedTuple):
         count = self.header.count(name)
         source = str(self.source)
         if count > 1:
-            raise ValueError(
-                f"Column {name!r} occurs {count} times in {source!r}; rename it."
-            )
+            raise ValueError(f"Column {name!r} occurs {count} times in {source!r}; rename it.")
         if count:
             return self.columns[self.header.index(name)]
         close = [other for other in self.header if other.lower() == name.lower()]
@@ -99,13 +97,9 @@ class Table(NamedTuple):
                 return values.astype(float)
         except (TypeError, ValueError, OverflowError):
             pass
-        raise ValueError(
-            f"Column {name!r} of {str(self.source)!r} must hold numbers, got {kind}."
-        )
+        raise ValueError(f"Column {name!r} of {str(self.source)!r} must hold numbers, got {kind}.")
 
-    def _numbers_of_text(
-        self, name: str, cells: Sequence[str], lines: NDArray
-    ) -> NDArray:
+    def _numbers_of_text(self, name: str, cells: Sequence[str], lines: NDArray) -> NDArray:
         """Return the numbers in cells (N,) of text, NaN for missing ones."""
         if self.decimal == ".":
             try:
@@ -140,9 +134,7 @@ class Table(NamedTuple):
         """Return columns as numbers (N, k), those of times in seconds."""
         columns = {name: self.numbers(name, name in times) for name in names}
         if len(columns) < len(names):
-            raise ValueError(
-                f"`q`, `x` and `time` must name a column once, got {names}."
-            )
+            raise ValueError(f"`q`, `x` and `time` must name a column once, got {names}.")
         sizes = {name: len(column) for name, column in columns.items()}
         if len({*sizes.values()}) > 1:
             raise ValueError(

@@ -78,9 +78,7 @@ def _given_header(path: Path, rows: Sequence[Row], line: int) -> Header:
 class _Rows:
     """The rows below a header, which must fit its columns."""
 
-    def __init__(
-        self, path: Path, rows: list[Row], header: Header, delimiter: str
-    ) -> None:
+    def __init__(self, path: Path, rows: list[Row], header: Header, delimiter: str) -> None:
         self.path = path
         self.header = header
         self.delimiter = delimiter
@@ -128,10 +126,7 @@ class _Rows:
             n_cells -= 1
         advice = "name every column once, and write an empty cell for a missing value"
         if n_cells == n_named - 1:
-            advice = (
-                "delete the name without a column, or write an empty cell for a missing "
-                "value"
-            )
+            advice = "delete the name without a column, or write an empty cell for a missing value"
         if n_cells == n_named + 1:
             advice = (
                 "if the rows begin with an index without a name, save the table without it "
@@ -149,9 +144,7 @@ class _Rows:
         )
 
 
-def _times(
-    names: Sequence[str], columns: Sequence[Sequence[str]], rate: float
-) -> list[str]:
+def _times(names: Sequence[str], columns: Sequence[Sequence[str]], rate: float) -> list[str]:
     """Return the times [s] of frames, without their numbers those of successive rows."""
     frames: Sequence[str] = [str(k) for k in range(len(columns[0]))]
     if "Frame" in names:

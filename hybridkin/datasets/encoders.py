@@ -35,9 +35,7 @@ _BRIEF = 3  # most rows of a glitch
 _BETTER = 0.9  # largest error of a rough model after a mend, relative to that before
 _NEEDED = 1.02  # least error without the mend of one column, relative to that with it
 _POSTURES = 5  # least number of different rows for each feature of that model
-_SUDDEN = (
-    0.1  # largest step without the fault, relative to the period, where that is proof
-)
+_SUDDEN = 0.1  # largest step without the fault, relative to the period, where that is proof
 _AROUND = 5  # rows before and after a change over which a calm tip is proof
 _CALM = 3.0  # largest step of the tip at a glitch, relative to the 90 % quantile of its steps
 _ROWS = 4000  # of the rough model
@@ -163,9 +161,7 @@ def encoder_faults(
     glitches = []
     for column, of_column in enumerate(untouched):
         candidates = [*_glitches(mended, column, of_column, calm)]
-        glitches += _best(
-            [_error_in_rows(mended, x, f) for f in candidates], candidates
-        )
+        glitches += _best([_error_in_rows(mended, x, f) for f in candidates], candidates)
     for fault in glitches:
         mended = fault.mended(mended)
     lost = []
@@ -211,23 +207,16 @@ def _in_order(q: NDArray, column: int, period: float) -> Iterator[EncoderFault]:
         yield EncoderFault(column, WRAP, period, turns - int(np.median(turns)))
 
 
-def _lost_turns(
-    q: NDArray, column: int, periods: tuple[float, ...]
-) -> Iterator[EncoderFault]:
+def _lost_turns(q: NDArray, column: int, periods: tuple[float, ...]) -> Iterator[EncoderFault]:
     """Yield the turns that a column lost at few rows, for every period that is possible."""
     steps = np.diff(q[:, column])
     for period in periods:
         changes = np.rint(steps / period).astype(int)
         left = np.abs(steps - period * changes)
-        usual = (
-            np.quantile(left[changes == 0], 0.99) if (changes == 0).any() else np.inf
-        )
+        usual = np.quantile(left[changes == 0], 0.99) if (changes == 0).any() else np.inf
         rows = np.flatnonzero(changes)
         moves = np.count_nonzero(steps) - len(rows)
-        if (
-            not 0 < len(rows) <= min(_MOST_LOSSES, moves / _MOVES)
-            or usual > _SMALL * period
-        ):
+        if not 0 < len(rows) <= min(_MOST_LOSSES, moves / _MOVES) or usual > _SMALL * period:
             continue
         if left[rows].max() > max(2.0 * usual, 1e-9 * period):
             continue

@@ -84,10 +84,10 @@ class Log:
     runs: NDArray | None = None
 
     def __post_init__(self) -> None:
+        columns = self._columns
         for name in ("q", "x", "time"):
-            column = getattr(self, name)
-            if column is not None:
-                object.__setattr__(self, name, real_array(column, name))
+            if name in columns:
+                object.__setattr__(self, name, real_array(columns[name], name))
         q = np.shape(self.q)
         x = np.shape(self.x)
         rows_fit = len(q) == len(x) == 2 and q[0] == x[0] > 0
@@ -97,12 +97,21 @@ class Log:
                 f"got {q} and {x}."
             )
         for name in ("groups", "runs"):
-            column = getattr(self, name)
+            if name in columns:
+                object.__setattr__(self, name, labels(columns[name], q[0], name))
+        for name in ("time", "line"):
+            if name in columns:
+                check_shape(np.asarray(columns[name]), name, [q[0]], "one for each row")
+
+    @property
+    def _columns(self) -> dict[str, NDArray]:
+        """The columns that it has, by name."""
+        columns = {}
+        for name in ("q", "x", "groups", "runs", "time", "line"):
+            column = vars(self)[name]
             if column is not None:
-                object.__setattr__(self, name, labels(column, q[0], name))
-        for name, column in (("time", self.time), ("line", self.line)):
-            if column is not None:
-                check_shape(np.asarray(column), name, [q[0]], "one for each row")
+                columns[name] = column
+        return columns
 
     def __repr__(self) -> str:
         """Return a summary of a few lines."""
@@ -123,9 +132,7 @@ class Log:
         ]
         if self.time is not None:
             duration = duration_in_words(float(np.ptp(self.time)))
-            lines.append(
-                f"time from {self.time[0]:.6g} to {self.time[-1]:.6g} s: {duration}"
-            )
+            lines.append(f"time from {self.time[0]:.6g} to {self.time[-1]:.6g} s: {duration}")
         return "\n  ".join(lines)
 
     @staticmethod
@@ -162,11 +169,9 @@ class Log:
 
     def rows(self, chosen: NDArray | slice) -> Self:
         """Return a log of some of the rows."""
-        columns = {}
-        for name in ("q", "x", "groups", "runs", "time", "line"):
-            column = getattr(self, name)
-            if column is not None:
-                columns[name] = column[chosen]
+        columns = self._columns
+        for name, column in columns.items():
+            columns[name] = column[chosen]
         return replace(self, **columns)
 
     def column_names(self, which: str) -> list[str]:
@@ -436,7 +441,5 @@ def _checked_factor(n: int, q_unit: str, x_unit: str, q_sign: ArrayLike) -> NDAr
     one_of(x_unit, "x_unit", METRES)
     sign = real_array(q_sign, "q_sign")
     if sign.shape not in ((), (n,)) or not np.isin(sign, (-1, 1)).all():
-        raise ValueError(
-            f"`q_sign` must be 1 or -1, or one per column of `q`, got {q_sign!r}."
-        )
+        raise ValueError(f"`q_sign` must be 1 or -1, or one per column of `q`, got {q_sign!r}.")
     return sign * UNITS[q_unit]

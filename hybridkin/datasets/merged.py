@@ -43,9 +43,7 @@ _WINDOWS = 30  # of the fine search, at most
 _DEGREES = (1, 2, 3)  # of the polynomials that explain tips
 _EXACT = 1e-3  # what a right lag can leave unexplained; a wrong one only where a motion repeats
 _RIDGE = 1e-9  # relative to the mean square of a feature
-_PARTS = (
-    3  # of a log, each explained by the others; short ones agree with anything smooth
-)
+_PARTS = 3  # of a log, each explained by the others; short ones agree with anything smooth
 _EXPLAINED = 0.8  # least share of the motion that the commands explain at the lag
 _RIVAL = 1.5  # least ratio of what the second best lag leaves to what the best leaves
 
@@ -189,9 +187,7 @@ def _columns_as_written(
         motions = table.labels("groups", groups, len(values))[timed]
     time_of_rows = values[timed, -1]
     values = values[timed, :-1]
-    return TimedColumns(
-        values, time_of_rows, tuple(columns), "1", motions, str(table.source)
-    )
+    return TimedColumns(values, time_of_rows, tuple(columns), "1", motions, str(table.source))
 
 
 class Merged(NamedTuple):
@@ -375,9 +371,7 @@ def _longest_gap(motors: TimedColumns, tolerance: float | None, hold: bool) -> f
     return tolerance
 
 
-def _covered(
-    motors: TimedColumns, time: NDArray, longest: float
-) -> tuple[NDArray, NDArray]:
+def _covered(motors: TimedColumns, time: NDArray, longest: float) -> tuple[NDArray, NDArray]:
     """Return which times lie between two motor rows of a motion, and their runs."""
     is_gap = np.diff(motors.time) > longest
     if motors.groups is not None:
@@ -414,9 +408,7 @@ def _estimated_lag(motors: TimedColumns, camera: TimedColumns, hold: bool) -> fl
     return _polished(motors, camera, lag, width, hold)
 
 
-def _coarse_lags(
-    motors: TimedColumns, camera: TimedColumns
-) -> list[tuple[float, float]]:
+def _coarse_lags(motors: TimedColumns, camera: TimedColumns) -> list[tuple[float, float]]:
     """Return lags [s] at which motors and camera move at the same times, and their accuracy.
 
     The correlation of the speeds of both over every overlap of at least half the shorter recording.
@@ -427,8 +419,7 @@ def _coarse_lags(
     x_speed = _speed(_tip(camera.values), camera.time, step)
     score, shift = _correlation(x_speed, q_speed)
     peaks = np.flatnonzero(
-        (score >= np.append(score[1:], -np.inf))
-        & (score > np.append(-np.inf, score[:-1]))
+        (score >= np.append(score[1:], -np.inf)) & (score > np.append(-np.inf, score[:-1]))
     )
     peaks = peaks[score[peaks] >= _SURE * score[peaks].max()]
     best = peaks[np.argsort(-score[peaks])[:_CANDIDATES]]

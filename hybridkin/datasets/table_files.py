@@ -18,9 +18,7 @@ LOG_SUFFIXES = (".csv", ".tsv", ".txt", ".npz", ".parquet", ".pq")
 def read_table(path: Path, form: TextForm) -> Table:
     """Return the table in a file; `form` is that of a text file."""
     if not path.is_file():
-        raise FileNotFoundError(
-            f"`path` must be a log file, there is none at {str(path)!r}."
-        )
+        raise FileNotFoundError(f"`path` must be a log file, there is none at {str(path)!r}.")
     if path.suffix.lower() == ".npz":
         return _read_npz(path)
     if path.suffix.lower() in (".parquet", ".pq"):
@@ -55,9 +53,7 @@ def _read_parquet(path: Path) -> Table:
             "save the log as CSV or npz."
         ) from error
     except Exception as error:  # pyarrow and pandas have many kinds of them
-        raise ValueError(
-            f"{str(path)!r} is not a parquet file: {error!s:.200}."
-        ) from error
+        raise ValueError(f"{str(path)!r} is not a parquet file: {error!s:.200}.") from error
     return frame_table(frame, path)
 
 

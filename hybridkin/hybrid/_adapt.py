@@ -86,8 +86,8 @@ def likeliest_change(
     noise: float,
     scale: NDArray,
     parameters: Sequence[str],
-) -> tuple[Change, str | None]:
-    """Return the most probable change, given new rows, and a warning or None.
+) -> tuple[Change, list[str]]:
+    """Return the most probable change, given new rows, and warnings.
 
     The change theta = (rotation, translation, shift) is in natural units: a rotation about the base
     in radians, a translation of the base in reaches of the robot, a shift of an actuator zero in
@@ -111,7 +111,7 @@ def likeliest_change(
     ----------
     MacKay, Bayesian interpolation, Neural Computation 4 (1992), for the evidence.
     """
-    problem = _Problem(fitted, rows, scale)
+    problem = _ChangeProblem(fitted, rows, scale)
     try:
         with np.errstate(over="raise", invalid="raise"):
             theta, residual = _least_cost(problem, rows.groups, noise, parameters)
@@ -124,7 +124,7 @@ def likeliest_change(
 
 
 def _least_cost(
-    problem: _Problem, groups: Groups, noise: float, parameters: Sequence[str]
+    problem: _ChangeProblem, groups: Groups, noise: float, parameters: Sequence[str]
 ) -> tuple[NDArray, NDArray]:
     """Return the most probable change theta, and the residual after it, relative to the noise."""
     theta = std = np.zeros(6 + len(problem.scale))
@@ -146,24 +146,20 @@ def _least_cost(
     return theta, residual
 
 
-def _misfit(rms: float, noise: float) -> str | None:
+def _misfit(rms: float, noise: float) -> list[str]:
     """Return a warning if the errors are far larger than those of the fit; `rms` is the ratio."""
     if rms <= _LARGE:
-        return None
-    return (
+        return []
+    return [
         f"`y` differs from the adapted model by {1e3 * 3**0.5 * rms * noise:.3g} mm (rms); the "
         f"held-out error of the fit is {1e3 * 3**0.5 * noise:.3g} mm. The robot has changed in a "
         "way that `parameters` do not cover, for example by a payload. Record a new log and `fit`."
-    )
+    ]
 
 
 def check_parameters(parameters: Sequence[str], in_space: bool) -> None:
     """Raise if `parameters` are not allowed; `in_space`: outputs are tips in space or poses."""
-    if (
-        isinstance(parameters, str)
-        or not parameters
-        or not {*parameters} <= {*PARAMETERS}
-    ):
+    if isinstance(parameters, str) or not parameters or not {*parameters} <= {*PARAMETERS}:
         raise ValueError(
             f"`parameters` must be one or both of {PARAMETERS} in a list, got {parameters!r}."
         )
@@ -174,7 +170,7 @@ def check_parameters(parameters: Sequence[str], in_space: bool) -> None:
         )
 
 
-class _Problem:
+class _ChangeProblem:
     """The new rows, and the model as a function of the change of the robot."""
 
     def __init__(self, fitted: Hybrid, rows: Rows, scale: NDArray) -> None:

@@ -61,9 +61,7 @@ class Drift(NamedTuple):
         none = np.zeros((n_outputs, n, n)), np.zeros((n, n_outputs)), np.zeros(())
         return cls(center.numpy(), scale.numpy(), *none)
 
-    def learned(
-        self, q: NDArray, residual: NDArray, weights: NDArray, decay: float
-    ) -> Drift:
+    def learned(self, q: NDArray, residual: NDArray, weights: NDArray, decay: float) -> Drift:
         """Return the statistics after rows q (N, n) in order of time.
 
         Each row multiplies the weights of all earlier rows by `decay`, once per repetition. The
@@ -80,9 +78,7 @@ class Drift(NamedTuple):
             decayed = (1.0 - decay**weights) / (1.0 - decay)
         weighed = (decayed * decay**later)[:, None] * phi
         remaining = decay ** weights.sum()
-        gram = remaining * self.gram + np.einsum(
-            "nk,ni,nj->kij", measured, weighed, phi
-        )
+        gram = remaining * self.gram + np.einsum("nk,ni,nj->kij", measured, weighed, phi)
         moment = remaining * self.moment + weighed.T @ residual
         squares = remaining * self.squares + weighed[:, 0] @ (residual**2).sum(1)
         return self._replace(gram=gram, moment=moment, squares=squares)
@@ -117,10 +113,12 @@ class Drift(NamedTuple):
         evidence -= 2.0 * SWITCH * (_ALPHAS < inf)  # offset and slope
         return float(_ALPHAS[evidence.max(0).argmax()])
 
-    def correction(self) -> AffineModule | None:
-        """Return the correction as a torch module q (..., n) -> (..., m), None if it is zero."""
-        if self.alpha == inf:
-            return None
+    def __bool__(self) -> bool:
+        """Return whether there is a correction."""
+        return self.alpha < inf
+
+    def correction(self) -> AffineModule:
+        """Return the correction as a torch module q (..., n) -> (..., m)."""
         largest = self.gram.trace(axis1=1, axis2=2).max()
         least = np.finfo(float).eps * largest + np.finfo(float).tiny
         system = self.gram + max(self.alpha, least) * np.eye(len(self.moment))

@@ -155,9 +155,7 @@ class FeatureModel(TipModel):
         See `fit_readout`.
     """
 
-    def __init__(
-        self, coupling: str, alphas: Pair | None = None, noise_ratio: float = inf
-    ) -> None:
+    def __init__(self, coupling: str, alphas: Pair | None = None, noise_ratio: float = inf) -> None:
         self.coupling = coupling
         self.alphas = alphas
         self.noise_ratio = noise_ratio
@@ -318,9 +316,7 @@ class HiddenLayer(FeatureModel):
     def features(self, q: Tensor, mechanical: ForwardModel) -> Features:
         """Return the features for training rows q (N, n)."""
         layer = draw_layer(self.layer, q.numpy(), np.ones(len(q)))
-        return HiddenFeatures.of_range(
-            q, layer.input_weights, layer.input_bias, layer.activation
-        )
+        return HiddenFeatures.of_range(q, layer.input_weights, layer.input_bias, layer.activation)
 
 
 class RegressorModel(TipModel, Generic[_Regressor]):
@@ -405,9 +401,7 @@ class NetworkModel(RegressorModel[ELMRegressor]):
 
     holds_out = True
 
-    def _noise(
-        self, regressor: ELMRegressor, module: ForwardModel, rows: Rows
-    ) -> float:
+    def _noise(self, regressor: ELMRegressor, module: ForwardModel, rows: Rows) -> float:
         """Return the spread of leave-one-out errors."""
         rows = rows.thinned(_MOST)
         network = regressor.module_
@@ -451,9 +445,7 @@ class NetworkModelCV(RegressorModel[ELMRegressorCV]):
         )
         return NetworkModelCV(network)
 
-    def _noise(
-        self, regressor: ELMRegressorCV, module: ForwardModel, rows: Rows
-    ) -> float:
+    def _noise(self, regressor: ELMRegressorCV, module: ForwardModel, rows: Rows) -> float:
         """Return the spread of the errors of rows that were held out."""
         return _spread(regressor.left_out_errors_.reshape(len(rows), -1), rows.counts)
 

@@ -103,9 +103,7 @@ class QuadraticFeatures(Features):
     layout = Layout("quadratic_features", {"center": "n", "scale": "n"})
 
     def _bent(self, u: Tensor) -> tuple[Tensor, ...]:
-        i, j = torch.triu_indices(
-            len(self.center), len(self.center), 1, device=u.device
-        )
+        i, j = torch.triu_indices(len(self.center), len(self.center), 1, device=u.device)
         return u[..., i] * u[..., j], 1.5 * u.square() - 0.5
 
     def _bent_readout(self, u: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
@@ -205,9 +203,7 @@ class PoseFeatures(Features):
         return in_blocks(self._rows_bent, u, _POSE_BLOCK)
 
     def _bent_readout(self, u: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-        value, slope = in_blocks(
-            partial(self._rows_readout, weights=weights), u, _POSE_BLOCK
-        )
+        value, slope = in_blocks(partial(self._rows_readout, weights=weights), u, _POSE_BLOCK)
         return value, slope
 
     def _rows_bent(self, u: Tensor) -> tuple[Tensor]:
@@ -232,9 +228,7 @@ class PoseFeatures(Features):
             turning = _turning(force)
             turns.append((turning @ part).unflatten(0, (C, 3)))
             if len(turns) < len(vectors):
-                pulls.append(
-                    pulls[-1] - (turning[:, 9:] @ part[:9]).unflatten(0, (C, 3))
-                )
+                pulls.append(pulls[-1] - (turning[:, 9:] @ part[:9]).unflatten(0, (C, 3)))
         work = []
         for k in reversed(range(len(turns))):
             if k + 1 < len(turns):
@@ -272,12 +266,7 @@ def _turning(forces: Tensor) -> Tensor:
     fx, fy, fz = forces.unflatten(1, (-1, 3)).unbind(2)
     zero = torch.zeros_like(fx)
     rows = [zero, fz, -fy, -fz, zero, fx, fy, -fx, zero]  # derivative of y x f by y
-    return (
-        torch.stack(rows, -1)
-        .unflatten(-1, (3, 3))
-        .permute(0, 2, 1, 3)
-        .reshape(3 * len(fx), -1)
-    )
+    return torch.stack(rows, -1).unflatten(-1, (3, 3)).permute(0, 2, 1, 3).reshape(3 * len(fx), -1)
 
 
 def _write_readout(plan: Plan, stored: Stored) -> int:
@@ -312,9 +301,7 @@ def _write_readout(plan: Plan, stored: Stored) -> int:
         return plan.node("readout", n, m, numbers, HK_QUADRATIC_FEATURES)
     if features.kind == "pose_features":
         chain = write_whole_chain(plan, features.part("chain"))
-        return plan.node(
-            "readout", n, m, [center, 1.0 / scale, *readout], HK_POSE_FEATURES, chain
-        )
+        return plan.node("readout", n, m, [center, 1.0 / scale, *readout], HK_POSE_FEATURES, chain)
     raise NoKernel(f"a readout of {features.kind!r} has no kernel")
 
 
@@ -329,9 +316,7 @@ class Readout(ForwardModel):
         W [unit of the outputs].
     """
 
-    layout = Layout(
-        "readout", {"weights": "cp"}, parts=("features",), write_plan=_write_readout
-    )
+    layout = Layout("readout", {"weights": "cp"}, parts=("features",), write_plan=_write_readout)
 
     def __init__(self, features: Features, weights: Tensor) -> None:
         super().__init__()

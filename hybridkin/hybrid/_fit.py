@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from hybridkin._core.progress import Progress, quiet
 from hybridkin.calibration.choice import unmoved
 from hybridkin.calibration.measured import points
 from hybridkin.hybrid._guards import GroupDistance, Plane, fit_guard
@@ -25,7 +26,7 @@ _NEVER = 1e-9  # part of an actuator in the moved directions, if it never moves
 _COUNTS = 1e12  # largest ratio of weights; a smaller weight is lost in a float64 sum
 
 
-def fit_hybrid(spec: Spec, rows: Rows) -> FittedHybrid:
+def fit_hybrid(spec: Spec, rows: Rows, progress: Progress = quiet) -> FittedHybrid:
     """Return the hybrid: the calibrated mechanical model and the error model of its residual.
 
     A pure function: it does not change its arguments and issues no warning.
@@ -36,11 +37,13 @@ def fit_hybrid(spec: Spec, rows: Rows) -> FittedHybrid:
         The settings.
     rows : Rows
         Different rows.
+    progress : callable, optional
+        See `ErrorModel.reporting`.
     """
     spec = spec.calibrated(rows)
     residual = residuals(spec.mechanical, rows.q, rows.y, spec.output)
     rows = replace(rows, residual=residual)
-    error = spec.error_model.fit(rows, spec)
+    error = spec.error_model.reporting(progress).fit(rows, spec)
     return FittedHybrid(spec, error, module_of(spec, rows, error))
 
 
@@ -70,9 +73,7 @@ def _module(rows: Rows, spec: Spec, weighted: Weighted) -> HybridModule | WithPo
             alone = HybridModule(spec.mechanical, [correction], weights.new_ones(1))
             with torch.no_grad():
                 values = alone.error_part(rows.q)
-            guard = fit_guard(
-                spec.guard, values, correction.module, rows.q, rows.counts
-            )
+            guard = fit_guard(spec.guard, values, correction.module, rows.q, rows.counts)
         corrections.append(type(correction)(correction.module, guard))
     directions = rows.directions
     tested = plane = None

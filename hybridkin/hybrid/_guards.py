@@ -83,9 +83,7 @@ class Guard(PortableModule):
         relative = self._relative(correction)
         return correction * (self._kept(relative)[0] / relative)
 
-    def shortened_with_jacobian(
-        self, correction: Tensor, J: Tensor
-    ) -> tuple[Tensor, Tensor]:
+    def shortened_with_jacobian(self, correction: Tensor, J: Tensor) -> tuple[Tensor, Tensor]:
         """Return the `shortened` corrections (N, m), and their Jacobians (N, m, n)."""
         long = self.is_long(correction).nonzero()[:, 0]
         if not len(long):
@@ -99,9 +97,7 @@ class Guard(PortableModule):
         along = (too_long / too_long.norm(dim=-1, keepdim=True))[..., None]
         change = (slope - factor)[..., None] * along @ (along.mT @ J_own)
         J_own = factor[..., None] * J_own + change
-        return correction.index_copy(0, long, factor * too_long), J.index_copy(
-            0, long, J_own
-        )
+        return correction.index_copy(0, long, factor * too_long), J.index_copy(0, long, J_own)
 
     def is_long(self, correction: Tensor) -> Tensor:
         """Return which corrections (..., m) are longer than `largest`, shape (...)."""
@@ -109,9 +105,7 @@ class Guard(PortableModule):
 
     def _relative(self, correction: Tensor) -> Tensor:
         # Lengths up to `largest` count as one. They are not shortened, and the root stays smooth.
-        unit = self.largest.to(correction).clamp(
-            min=torch.finfo(correction.dtype).tiny ** 0.25
-        )
+        unit = self.largest.to(correction).clamp(min=torch.finfo(correction.dtype).tiny ** 0.25)
         squares = (correction / unit).square().sum(-1, keepdim=True)
         return squares.clamp(min=1.0).sqrt()
 
@@ -287,9 +281,7 @@ class QuadraticLeverage(LeverageModule):
         phi = self(q)
         upper = self.factor.to(q).mT
         # One solve for all rows, not one for each.
-        white = torch.linalg.solve_triangular(
-            upper, torch.atleast_2d(phi), upper=True, left=False
-        )
+        white = torch.linalg.solve_triangular(upper, torch.atleast_2d(phi), upper=True, left=False)
         return white.square().sum(-1).view(phi.shape[:-1])
 
 
@@ -395,9 +387,7 @@ class GroupDistance(PortableModule):
             apart = torch.minimum(apart, far.amin(1))
         # All training rows are within the gap of a picked row, so distances differ by at most it.
         # If every motion was repeated, the clamp keeps the domain from being empty.
-        return cls(
-            q[rows], axes, (apart.quantile(_TESTED) + gap.max().sqrt()).clamp(min=_STEP)
-        )
+        return cls(q[rows], axes, (apart.quantile(_TESTED) + gap.max().sqrt()).clamp(min=_STEP))
 
     @classmethod
     def of_log(
@@ -427,10 +417,7 @@ class GroupDistance(PortableModule):
         axes = [tested.axes, still * (tested.farthest / _STEP)]
         if plane is not None:
             half_ranges = (scale * plane.normals).norm(dim=0)
-            off = (
-                half_ranges * _OFF
-                + _AS_LOGGED * plane.distances(q).square().mean(0).sqrt()
-            )
+            off = half_ranges * _OFF + _AS_LOGGED * plane.distances(q).square().mean(0).sqrt()
             axes.append(plane.normals * (tested.farthest / off))
         return cls(tested.rows, torch.cat(axes, 1), tested.farthest)
 

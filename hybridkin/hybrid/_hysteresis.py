@@ -162,7 +162,7 @@ def choose_hysteresis(spec: Spec, rows: Rows) -> Hysteresis:
             rows.counts,
             groups,
             rows.runs,
-            np.zeros(len(rows)) if rows.time is None else rows.time,
+            rows.time,
         )
     )
 
@@ -171,10 +171,9 @@ def continued(hysteresis: Hysteresis, rows: Rows, past: Past) -> tuple[NDArray, 
     """Return the motion of the actuators (N, n), which go on from the past, and the new past."""
     moved = np.empty_like(rows.X)
     runs = rows.runs
-    times = np.zeros(len(rows)) if rows.time is None else rows.time
     for run in dict.fromkeys(runs.tolist()):
         rows_of_run = np.flatnonzero(runs == run)
-        in_run = times[rows_of_run]
+        in_run = rows.time[rows_of_run]
         last = past.within(run, in_run[0])
         if last.time > in_run[0]:
             raise ValueError(
@@ -182,10 +181,8 @@ def continued(hysteresis: Hysteresis, rows: Rows, past: Past) -> tuple[NDArray, 
                 f"{last.time:g} s; give a new run another name."
             )
         steps = None
-        if rows.time is not None:
+        if rows.timed:
             steps = np.diff(in_run, prepend=last.time)
-        moved[rows_of_run], state = hysteresis.apply(
-            rows.X[rows_of_run], last.state, steps
-        )
+        moved[rows_of_run], state = hysteresis.apply(rows.X[rows_of_run], last.state, steps)
         past = Past(run, float(in_run[-1]), state)
     return moved, past

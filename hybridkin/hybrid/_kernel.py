@@ -40,9 +40,7 @@ def folds_of(groups: Groups) -> list[tuple[NDArray, NDArray]]:
     return groups.folds(most, shuffle=True)
 
 
-def tuned_kernel(
-    X: NDArray, error: NDArray, weights: NDArray, groups: Groups
-) -> KernelRidge:
+def tuned_kernel(X: NDArray, error: NDArray, weights: NDArray, groups: Groups) -> KernelRidge:
     """Return Gaussian kernel ridge with the width and the penalty of least held-out error.
 
     The search starts on a coarse grid and moves to the best neighbour until none is better. It

@@ -41,20 +41,20 @@ class Products:
     def __init__(self, phi: Tensor) -> None:
         self.phi = phi.numpy(force=True)
         self._rows = max(_BLOCK // _pairs(phi.shape[1]), 1)
-        self._kept = [*self._blocks()] if len(phi) <= self._rows else None
+        self._kept: list[tuple[slice, NDArray]] = []
+        if len(phi) <= self._rows:
+            self._kept = [*self._blocks()]
 
     def __iter__(self) -> Iterator[tuple[slice, NDArray]]:
         """Yield blocks of n rows, and their products (K (K + 1) / 2, n)."""
-        return self._blocks() if self._kept is None else iter(self._kept)
+        return iter(self._kept or self._blocks())
 
     def _blocks(self) -> Iterator[tuple[slice, NDArray]]:
         for rows in gen_batches(len(self.phi), self._rows):
             columns = self.phi[rows].T.copy()
             block = np.empty((_pairs(len(columns)), columns.shape[1]))
             for k, column in enumerate(columns):
-                np.multiply(
-                    columns[: k + 1], column, out=block[_pairs(k) : _pairs(k + 1)]
-                )
+                np.multiply(columns[: k + 1], column, out=block[_pairs(k) : _pairs(k + 1)])
             yield rows, block
 
 

@@ -96,9 +96,7 @@ class TipCorrection(PortableModule):
         """Return c(q) at rows q (N, n), shape (N, m) [m]."""
         return self.module(q)
 
-    def value_and_jacobian(
-        self, q: Tensor, inside: Inside | None
-    ) -> tuple[Tensor, Tensor]:
+    def value_and_jacobian(self, q: Tensor, inside: Inside | None) -> tuple[Tensor, Tensor]:
         """Return c(q) (N, m) and dc/dq (N, m, n) at rows q (N, n)."""
         return self.module.forward_and_jacobian(q)
 
@@ -144,9 +142,7 @@ class InnerCorrection(TipCorrection):
         moved = inside.mechanical.from_coordinates(inside.z + self.module(q))
         return moved - inside.x
 
-    def value_and_jacobian(
-        self, q: Tensor, inside: Inside | None
-    ) -> tuple[Tensor, Tensor]:
+    def value_and_jacobian(self, q: Tensor, inside: Inside | None) -> tuple[Tensor, Tensor]:
         """Return c(q) (N, m) and dc/dq (N, m, n) at rows q (N, n)."""
         assert inside is not None
         delta, turn = self.module.forward_and_jacobian(q)
@@ -211,9 +207,7 @@ def _write_plan(plan: Plan, stored: Stored) -> int:
     drift = place_of("drift")
     tested = place_of("tested")
     if base >= 0 and plan.kind(base) not in CHAINS:
-        raise NoKernel(
-            f"the mechanical part {stored.part('mechanical').kind!r} is not a chain"
-        )
+        raise NoKernel(f"the mechanical part {stored.part('mechanical').kind!r} is not a chain")
     entries = []
     acts_inside = []
     for correction in stored.part("corrections").parts.values():
@@ -223,9 +217,7 @@ def _write_plan(plan: Plan, stored: Stored) -> int:
     left = 1.0 - weights[acts_inside].sum()  # weight of f beside inner corrections
     numbers = [weights, [left * (abs(left) > _ROUNDING), any(acts_inside)]]
     n, m = plan.lengths(base if base >= 0 else entries[1])
-    return plan.node(
-        "hybrid", n, m, numbers, base, drift, tested, len(weights), *entries
-    )
+    return plan.node("hybrid", n, m, numbers, base, drift, tested, len(weights), *entries)
 
 
 def _places_of(plan: Plan, correction: Stored) -> tuple[int, int]:
@@ -295,8 +287,7 @@ class HybridModule(Hybrid):
         total = float(weights.sum())
         if not (total <= 1.0 + _ROUNDING and bool((weights >= 0.0).all())):
             raise ValueError(
-                "`weights` must be zero or more and sum to at most 1, got "
-                f"{weights.tolist()}."
+                f"`weights` must be zero or more and sum to at most 1, got {weights.tolist()}."
             )
         if len(weights) != len(corrections):
             raise ValueError(
@@ -419,9 +410,7 @@ class HybridModule(Hybrid):
             return (self.mechanical(q) + learned,)
         return (learned,)
 
-    def _learned(
-        self, q: Tensor, inside: Inside | None = None
-    ) -> tuple[Tensor, Tensor]:
+    def _learned(self, q: Tensor, inside: Inside | None = None) -> tuple[Tensor, Tensor]:
         """Return the sum of corrections and drift at rows q, (N, m) [m], and t(q), (N, 1).
 
         The sum is zero (N, 1) without any.
@@ -469,9 +458,7 @@ class HybridModule(Hybrid):
                 )
         if self.drift is not None:
             whole = q.new_ones(())
-            total = _plus(
-                total, whole, *trust.times(*self.drift.forward_and_jacobian(q))
-            )
+            total = _plus(total, whole, *trust.times(*self.drift.forward_and_jacobian(q)))
         assert total is not None, "a hybrid needs a mechanical model or a correction"
         return total
 

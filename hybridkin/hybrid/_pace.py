@@ -66,9 +66,7 @@ class Pace(NamedTuple):
     shown: NDArray[np.bool_]
 
 
-def each_pace(
-    q: NDArray, runs: NDArray, time: NDArray, time_constants: NDArray
-) -> Iterator[Pace]:
+def each_pace(q: NDArray, runs: NDArray, time: NDArray, time_constants: NDArray) -> Iterator[Pace]:
     """Yield the pace of commands for each time constant.
 
     Parameters
@@ -138,6 +136,4 @@ def pace_range(paces: list[Pace], measured: Rows) -> PaceRange:
 
 def _relative(pace: NDArray, high: NDArray) -> NDArray:
     """Return the largest ratio (...) of paces (..., n) to others; none to zero."""
-    return np.where(high > 0.0, pace / np.where(high > 0.0, high, 1.0), 0.0).max(
-        axis=-1
-    )
+    return np.where(high > 0.0, pace / np.where(high > 0.0, high, 1.0), 0.0).max(axis=-1)

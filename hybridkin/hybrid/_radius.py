@@ -44,9 +44,7 @@ class Radius(NamedTuple):
         return f"not known: {covered} need at least {self.least_groups} groups in the domain"
 
 
-def covering_distance(
-    values: NDArray, groups: NDArray, weights: NDArray, coverage: float
-) -> float:
+def covering_distance(values: NDArray, groups: NDArray, weights: NDArray, coverage: float) -> float:
     """Return the smallest value that covers the share; infinity if no value does.
 
     Each of the K groups, numbered from 0 (N,), has the mass 1 / (K + 1), divided among its values

@@ -40,16 +40,10 @@ class ReadoutFit(NamedTuple):
 
     readout: Readout
     alphas: Pair  # of the linear and of the other features; infinity: features not used
-    residual: (
-        NDArray  # (N, m) [m], of every row from a fit without that row, or its group
-    )
+    residual: NDArray  # (N, m) [m], of every row from a fit without that row, or its group
     scores: dict[Pair, float]  # mean squared held-out distance [m^2], by alphas
-    gradient: (
-        float  # of the objective at the optimum, relative to that without a correction
-    )
-    noise_ratio: float = (
-        inf  # variance of tips over that of actuators; infinity: tips only
-    )
+    gradient: float  # of the objective at the optimum, relative to that without a correction
+    noise_ratio: float = inf  # variance of tips over that of actuators; infinity: tips only
     rmse: float = nan  # weighted root mean square length of `residual` [m]
 
 
@@ -112,7 +106,7 @@ def fit_readout(
     x = torch.from_numpy(rows.tips.astype(np.float64))
     weight = torch.from_numpy(rows.counts.astype(np.float64))
     with torch.no_grad():
-        problem = _Problem(
+        problem = _ReadoutProblem(
             mechanical, features, rows.q, x, weight, rows.groups, coupling == "serial"
         )
         if alphas is None:
@@ -128,7 +122,7 @@ def fit_readout(
     return fit._replace(residual=rows.as_given(fit.residual), rmse=rmse)
 
 
-def _chosen_with_noise(problem: _Problem) -> ReadoutFit:
+def _chosen_with_noise(problem: _ReadoutProblem) -> ReadoutFit:
     """Return the fit with chosen penalties, in metres or in units of the actuators' noise."""
     fit = _chosen(problem, None, problem.nothing)
     noise_ratio = problem.likeliest_ratio(torch.from_numpy(fit.residual))
@@ -141,7 +135,7 @@ def _chosen_with_noise(problem: _Problem) -> ReadoutFit:
 
 
 def _chosen(
-    problem: _Problem,
+    problem: _ReadoutProblem,
     alphas: Pair | None,
     weights: Tensor,
     rounds: int = 2,
@@ -164,7 +158,7 @@ def _chosen(
 
 
 def _fit_with_penalties(
-    problem: _Problem, alphas: Pair, weights: Tensor, held_out: bool = True
+    problem: _ReadoutProblem, alphas: Pair, weights: Tensor, held_out: bool = True
 ) -> ReadoutFit:
     """Return the fit with given penalties, from a start; its residuals are those of held-out rows.
 
@@ -180,7 +174,7 @@ def _fit_with_penalties(
     return ReadoutFit(readout, alphas, left_out.numpy(force=True), {}, gradient, ratio)
 
 
-class _Problem:
+class _ReadoutProblem:
     """The rows of a fit, in scaled coordinates and a basis of the features with data."""
 
     def __init__(
@@ -217,7 +211,7 @@ class _Problem:
         self.products = _linearised.Products(self.phi)
         self.nothing = phi.new_zeros(len(self.units), self.phi.shape[1])
 
-    def in_noise(self, ratio: float) -> _Problem:
+    def in_noise(self, ratio: float) -> _ReadoutProblem:
         """Return the problem for noise of covariance dx/dq dx/dq' + ratio, up to a factor."""
         if ratio == inf:
             return self
@@ -236,11 +230,7 @@ class _Problem:
         """Return the ratio with the largest likelihood of residuals (N, m) [m] as normal noise."""
         spread, axes = self._principal_noise
         squares = (axes.mT @ residual[..., None])[..., 0].square()
-        weights = (
-            self.root.square()
-            * self.seen.all(1, keepdim=True)
-            * torch.ones_like(squares)
-        )
+        weights = self.root.square() * self.seen.all(1, keepdim=True) * torch.ones_like(squares)
         total = weights.sum()
         mean = (weights * spread).sum() / weights.sum()
 
@@ -273,9 +263,7 @@ class _Problem:
     def penalty(self, alphas: Pair) -> Tensor:
         """Return the penalty of every feature (K,)."""
         n = self.features.n_linear
-        return self.phi.new_tensor(
-            [alphas[0]] * n + [alphas[1]] * (self.phi.shape[1] - n)
-        )
+        return self.phi.new_tensor([alphas[0]] * n + [alphas[1]] * (self.phi.shape[1] - n))
 
     def linearised(self, readout: Tensor) -> Linearised:
         """Return the ridge problem linearised about a readout (C, K); the last one is cached."""
@@ -308,10 +296,7 @@ class _Problem:
         readout = torch.where(taking_part, readout, 0.0)
         weight = torch.where(taking_part, penalty, 0.0)
         value, slope = self._value_and_slope(readout, weight, taking_part)
-        scale = (
-            float(self._value_and_slope(self.nothing, weight, taking_part)[1].norm())
-            or 1.0
-        )
+        scale = float(self._value_and_slope(self.nothing, weight, taking_part)[1].norm()) or 1.0
         pairs: list[tuple[Tensor, Tensor]] = []
         factor: tuple[Tensor, Tensor] | None = None
         step_size = 1.0
@@ -327,9 +312,7 @@ class _Problem:
             step = -_linearised.quasi_newton(slope, pairs, factor)
             step_size = 1.0
             descent = float((slope * step).sum())
-            while (
-                step_size > 1e-6
-            ):  # a full step may overshoot, as the tip is nonlinear
+            while step_size > 1e-6:  # a full step may overshoot, as the tip is nonlinear
                 tried = readout + step_size * step
                 new, new_slope = self._value_and_slope(tried, weight, taking_part)
                 if new <= (1.0 + 1e-14) * value + 1e-4 * step_size * descent:
@@ -365,9 +348,7 @@ class _Problem:
         """Return residuals (N, m) [m] and Jacobians (N, m, C) at z, zero for missing markers."""
         tip, J = self._tips(z)
         seen = self.seen
-        return torch.where(seen, self.x - tip, 0.0), torch.where(
-            seen[..., None], J, 0.0
-        )
+        return torch.where(seen, self.x - tip, 0.0), torch.where(seen[..., None], J, 0.0)
 
     def _whitened(self, values: Tensor) -> Tensor:
         """Return values (N, m) or (N, m, C) in units of noise, times the roots of the weights."""

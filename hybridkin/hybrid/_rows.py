@@ -30,7 +30,8 @@ class Rows:
     place: NDArray  # (M,), the row here of each of the M given rows; -1: none
     # Shaped like y: measured minus mechanical model [m], in a fit; y without such a model
     residual: NDArray
-    time: NDArray | None = None  # (N,) [s]
+    time: NDArray  # (N,) [s]; zeros without times
+    timed: bool  # whether the rows have times
     commanded: Directions | None = None  # of the commands, with hysteresis before X
 
     @classmethod
@@ -65,7 +66,12 @@ class Rows:
         if runs is None:
             runs = motions.motions
         counts = np.asarray(weights)
-        return cls(X, y, counts, motions, runs, np.arange(n_rows), y, time)
+        times = np.zeros(n_rows)
+        if time is not None:
+            times = time
+        place = np.arange(n_rows)
+        timed = time is not None
+        return cls(X, y, counts, motions, runs, place, y, times, timed)
 
     def __len__(self) -> int:
         return len(self.X)
@@ -79,6 +85,11 @@ class Rows:
     def tips(self) -> NDArray:
         """Measured tips as a matrix (N, m) [m]."""
         return self.y.reshape(len(self.y), -1)
+
+    @property
+    def clock(self) -> NDArray | None:
+        """The times (N,) [s] for a hysteresis, which raises if it needs some and gets None."""
+        return self.time if self.timed else None
 
     @property
     def groups_or_runs(self) -> NDArray:
@@ -109,7 +120,7 @@ class Rows:
             counts=self.counts[rows],
             groups=self.groups.take(rows),
             runs=self.runs[rows],
-            time=None if self.time is None else self.time[rows],
+            time=self.time[rows],
             place=np.arange(len(X)),
             residual=self.residual[rows],
         )
@@ -151,14 +162,12 @@ class Rows:
 
         What the actuators do does not change: rows at other times, and of other runs, stay apart.
         """
-        columns = [self.y, _numbered(self.runs)]
-        if self.time is not None:
-            columns.append(self.time)
+        columns = self.y, _numbered(self.runs), self.time
         return self._merged(np.column_stack(columns), follow=True)
 
     def effective(self, hysteresis: Hysteresis) -> Self:
         """Return the rows with what the actuators do in place of the commands."""
-        moved = hysteresis.apply_by_group(self.X, self.runs, self.time)
+        moved = hysteresis.apply_by_group(self.X, self.runs, self.clock)
         return replace(self, X=moved)
 
     def _merged(self, columns: NDArray, follow: bool = False) -> Self:
@@ -192,6 +201,4 @@ def _numbered(names: NDArray) -> NDArray:
 
 def rare_marker(k: int) -> ValueError:
     """Return the error for a marker that too few rows hold."""
-    return ValueError(
-        f"`y` must hold marker {k} in at least 2 rows; remove that marker."
-    )
+    return ValueError(f"`y` must hold marker {k} in at least 2 rows; remove that marker.")

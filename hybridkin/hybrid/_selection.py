@@ -16,6 +16,7 @@ from sklearn.linear_model import LinearRegression
 from typing_extensions import Self
 
 from hybridkin._core.model import ForwardModel
+from hybridkin._core.progress import Progress, quiet
 from hybridkin._core.turns import TURNS
 from hybridkin.calibration.choice import GeometryChoice
 from hybridkin.calibration.measured import distance, inner_and_outer
@@ -69,22 +70,27 @@ class Auto(ErrorModel):
     ----------
     random_state : int, RandomState or None
         Seed of the network.
+    progress : callable, optional
+        Called with the number of candidates that are fitted, and of all of them.
     """
 
     chooses = True
     needs_mechanical = False
 
-    def __init__(self, random_state: Seed) -> None:
+    def __init__(self, random_state: Seed, progress: Progress = quiet) -> None:
         self.random_state = random_state
+        self._progress = progress
 
     @classmethod
     def of(cls, coupling: str, random_state: Seed) -> Self:
         """Return the error model for these settings of a HybridForwardModel."""
         return cls(random_state)
 
-    def refinement(
-        self, spec: Spec, geometry: GeometryChoice, rows: Rows
-    ) -> Refinement:
+    def reporting(self, progress: Progress) -> ErrorModel:
+        """Return this model for a fit that tells how many of its candidates are fitted."""
+        return type(self)(self.random_state, progress)
+
+    def refinement(self, spec: Spec, geometry: GeometryChoice, rows: Rows) -> Refinement:
         """Return the errors of the structure, if they lower the errors on held-out rows."""
         if spec.output == "pose":
             return UNREFINED
@@ -97,7 +103,7 @@ class Auto(ErrorModel):
     def fit(self, rows: Rows, spec: Spec) -> FittedError:
         """Return the candidates fitted to all rows, which fixes their penalties."""
         spec, rows = _refined(spec, rows)
-        return _side_by_side(self._candidates(spec, len(rows)), rows, spec)
+        return _side_by_side(self._candidates(spec, len(rows)), rows, spec, self._progress)
 
     def _candidates(self, spec: Spec, n_rows: int) -> dict[str, ErrorModel]:
         """Return the error models by name; of equal candidates the first, simplest one wins."""
@@ -143,9 +149,7 @@ class Candidates(ErrorModel):
         self.models = models
         self.refined = refined
 
-    def refinement(
-        self, spec: Spec, geometry: GeometryChoice, rows: Rows
-    ) -> Refinement:
+    def refinement(self, spec: Spec, geometry: GeometryChoice, rows: Rows) -> Refinement:
         """Return the refinement that was chosen with the candidates."""
         return self.refined
 
@@ -170,7 +174,10 @@ def _refined(spec: Spec, rows: Rows) -> tuple[Spec, Rows]:
 
 
 def _side_by_side(
-    models: Mapping[str, ErrorModel], rows: Rows, spec: Spec
+    models: Mapping[str, ErrorModel],
+    rows: Rows,
+    spec: Spec,
+    progress: Progress = quiet,
 ) -> FittedError:
     """Return the fits of all candidates, with penalties chosen on folds of the rows."""
     by_fold = _by_fold(rows, fold_of_rows(folds_of(rows.groups)))
@@ -181,6 +188,7 @@ def _side_by_side(
         module = module_of(spec, rows, error)
         fits[name] = FittedHybrid(replace(spec, error_model=model), error, module)
         near[name] = model.starting_at(error.settled)
+        progress(len(fits), len(models))
     return replace(
         fits[next(iter(fits))].error,
         settled=Candidates(near, spec.refinement),
@@ -281,9 +289,7 @@ def decided(fitted: FittedHybrid, rows: Rows, table: CrossFit) -> FittedHybrid:
     return FittedHybrid(spec, blend, module_of(spec, rows, blend))
 
 
-def expected_with_new_choices(
-    fitted: FittedHybrid, rows: Rows, table: CrossFit
-) -> float:
+def expected_with_new_choices(fitted: FittedHybrid, rows: Rows, table: CrossFit) -> float:
     """Return the mean distance to expect if penalties are chosen without the held-out rows [m].
 
     Of few rows or motions, penalties that suit the held-out rows would make it too small. The ratio

@@ -18,6 +18,7 @@ from typing_extensions import Self
 from hybridkin._core.arrays import countable
 from hybridkin._core.groups import Groups
 from hybridkin._core.model import ForwardModel
+from hybridkin._core.progress import Progress
 from hybridkin.calibration.calibrate import CalibrationResult, fit_geometry, refitted
 from hybridkin.calibration.choice import (
     NOT_CHOSEN,
@@ -65,9 +66,11 @@ class ErrorModel(ABC):
         model.tells_errors = False
         return model
 
-    def refinement(
-        self, spec: Spec, geometry: GeometryChoice, rows: Rows
-    ) -> Refinement:
+    def reporting(self, progress: Progress) -> ErrorModel:
+        """Return this model for a fit that tells how many of its candidates are fitted."""
+        return self
+
+    def refinement(self, spec: Spec, geometry: GeometryChoice, rows: Rows) -> Refinement:
         """Return how the calibrated model is refined before this model learns its residual."""
         return UNREFINED
 
@@ -309,10 +312,7 @@ class Spec:
             tips = [None] * (rows.tips.shape[1] // 3)
         if len(tips) == 1:
             return [(rows, self)]
-        return [
-            (rows.marker(k), replace(self, mechanical=tip))
-            for k, tip in enumerate(tips)
-        ]
+        return [(rows.marker(k), replace(self, mechanical=tip)) for k, tip in enumerate(tips)]
 
 
 class FittedHybrid(NamedTuple):
@@ -334,9 +334,7 @@ class FittedHybrid(NamedTuple):
             return self.module(torch.from_numpy(X.astype(np.float64))).numpy()
 
 
-def residuals(
-    mechanical: ForwardModel | None, q: Tensor, y: NDArray, output: str
-) -> NDArray:
+def residuals(mechanical: ForwardModel | None, q: Tensor, y: NDArray, output: str) -> NDArray:
     """Return the residual, measured minus mechanical model, in the form that is learned [m]."""
     if mechanical is None:
         return y

@@ -199,9 +199,7 @@ class StructureDesign:
         weights = self.blocks.weights(self.factor * theta[6:])
         return StructuralChain(self.chain, self.lengths, *weights, self.motion(theta))
 
-    def slopes(
-        self, tips: Tensor, by_arcs: Tensor, fields: Tensor, base: Tensor
-    ) -> Tensor:
+    def slopes(self, tips: Tensor, by_arcs: Tensor, fields: Tensor, base: Tensor) -> Tensor:
         """Return the derivative (N, m, P) of tips (N, K, 3) by theta [m].
 
         `by_arcs` (N, K, 3, C) are the derivatives by the arcs, and `base` (6,) the entries of theta
@@ -215,7 +213,7 @@ class StructureDesign:
         return torch.cat([by_base, by_arcs.flatten(1, 2) @ fields], dim=2)
 
 
-class _Problem:
+class _StructureProblem:
     """The rows of a fit, and the fit of theta."""
 
     def __init__(self, design: StructureDesign, rows: Rows) -> None:
@@ -261,9 +259,7 @@ class _Problem:
             A = self.slopes(theta, *at).flatten(0, 1)
             system = A.mT @ A + identity(len(theta), A)
             slope = A.mT @ rest.flatten() - theta
-            step = torch.cholesky_solve(slope[:, None], torch.linalg.cholesky(system))[
-                :, 0
-            ]
+            step = torch.cholesky_solve(slope[:, None], torch.linalg.cholesky(system))[:, 0]
             cost = _cost(rest, theta)
             part = 1.0
             while part > _SHORTEST:  # a full step may overshoot
@@ -322,7 +318,7 @@ def fit_structure(
     with torch.no_grad():
         design = StructureDesign(chain, rows.q, factor, scales)
         try:
-            problem = _Problem(design, rows)
+            problem = _StructureProblem(design, rows)
             theta, rest, A = problem.minimum()
         except torch.linalg.LinAlgError as error:  # pyright: ignore
             raise too_far() from error
@@ -331,9 +327,7 @@ def fit_structure(
         covariance = torch.cholesky_inverse(torch.linalg.cholesky(system))
         residual = torch.full_like(rest, torch.nan)
         if left_out:
-            residual = problem.in_metres(
-                _left_out(A, rest, theta, covariance, system, rows.groups)
-            )
+            residual = problem.in_metres(_left_out(A, rest, theta, covariance, system, rows.groups))
         model = design.model(theta)
     weights = rows.counts * points(problem.seen.numpy())[..., 0].sum(1)
     squares = residual.square().sum(1).numpy()

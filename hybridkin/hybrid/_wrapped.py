@@ -40,9 +40,7 @@ class Stacked(Hybrid):
         The hybrid of every marker, on the chain of that marker alone.
     """
 
-    layout = Layout(
-        "stacked", {}, parts=("mechanical", "tips"), write_plan=_write_stacked
-    )
+    layout = Layout("stacked", {}, parts=("mechanical", "tips"), write_plan=_write_stacked)
     computed = ("mechanical",)
 
     def __init__(self, mechanical: object, tips: Sequence[Hybrid]) -> None:
@@ -89,9 +87,7 @@ class Stacked(Hybrid):
     def misses(self, x: Tensor, largest: Tensor) -> Tensor:
         """Return the largest distance by which a marker's target is out of its reach (...) [m]."""
         targets = x.unflatten(-1, (-1, 3)).unbind(-2)
-        missed = [
-            tip.misses(x, largest) for tip, x in zip(self._tips(), targets, strict=True)
-        ]
+        missed = [tip.misses(x, largest) for tip, x in zip(self._tips(), targets, strict=True)]
         return torch.stack(missed).amax(0)
 
     @property
@@ -153,9 +149,7 @@ class Stacked(Hybrid):
 def _write_with_pose(plan: Plan, stored: Stored) -> int:
     chain = plan.node_of(stored.part("mechanical"))
     if plan.kind(chain) not in CHAINS:
-        raise NoKernel(
-            f"a {stored.part('mechanical').kind!r} has no kernel of its pose"
-        )
+        raise NoKernel(f"a {stored.part('mechanical').kind!r} has no kernel of its pose")
     learned = plan.node_of(stored.part("learned"))
     radians = stored.derived["radians"]
     return plan.node("with_pose", plan.lengths(chain)[0], 3, [radians], chain, learned)
@@ -177,9 +171,7 @@ class WithPose(Hybrid, PoseModel):
         and shorten the six numbers together.
     """
 
-    layout = Layout(
-        "with_pose", {}, parts=("mechanical", "learned"), write_plan=_write_with_pose
-    )
+    layout = Layout("with_pose", {}, parts=("mechanical", "learned"), write_plan=_write_with_pose)
     mechanical: ForwardModel  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def __init__(self, mechanical: ForwardModel, learned: HybridModule) -> None:

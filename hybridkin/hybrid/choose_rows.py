@@ -149,9 +149,7 @@ def choose_rows(
     rows = torch.cat([q, measured_rows, aim])
     places = torch.from_numpy(places)
     try:
-        chosen, error = _chosen(
-            robot, forward_model, rows, q[places], n, measured_rows, aim
-        )
+        chosen, error = _chosen(robot, forward_model, rows, q[places], n, measured_rows, aim)
     except torch.linalg.LinAlgError as failure:  # pyright: ignore
         raise ValueError(
             "`candidates`, `measured` or `target` hold numbers too large for the model; check "
@@ -183,9 +181,7 @@ def _few_rows_of(groups: NDArray) -> tuple[NDArray, NDArray]:
     names, of_row, counts = np.unique(groups, return_inverse=True, return_counts=True)
     order = np.argsort(of_row, kind="stable")
     ends = np.cumsum(counts)
-    return names, order[
-        np.rint(np.linspace(ends - counts, ends - 1, _ROWS).T).astype(int)
-    ]
+    return names, order[np.rint(np.linspace(ends - counts, ends - 1, _ROWS).T).astype(int)]
 
 
 def _actuators(robot: ForwardModel, value: ArrayLike, name: str) -> Tensor:
@@ -328,9 +324,7 @@ class _TipErrors(_Errors):
         most = max(_LARGEST // len(self.units) - n_linear, 0)
         basis = _linearised.basis(self.features(q), n_linear, most)
         linear, nonlinear = basis.tensor_split([n_linear], dim=1)
-        self.basis = self.size * torch.cat(
-            [_LINEAR * linear, _OTHER * nonlinear], dim=1
-        )
+        self.basis = self.size * torch.cat([_LINEAR * linear, _OTHER * nonlinear], dim=1)
         self.variance = (_NOISE * self.size) ** 2
 
     def parts(self, q: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -12,6 +12,7 @@ from joblib import Parallel, delayed, effective_n_jobs
 from numpy.typing import ArrayLike, NDArray
 
 from hybridkin._core.arrays import one_of, whole
+from hybridkin._core.progress import quiet
 from hybridkin._core.turns import one_thread
 from hybridkin.calibration.choice import Starts
 from hybridkin.datasets.logs import Log
@@ -27,10 +28,6 @@ SomeLog = TypeVar("SomeLog", bound=Log)
 _ROWS_PER_PROCESS = {True: 150, False: 1500}
 
 
-def _ignore(what: str, done: int, total: int) -> None:
-    pass
-
-
 def cross_fit(
     models: Models,
     log: SomeLog,
@@ -40,7 +37,7 @@ def cross_fit(
     sample_weight: ArrayLike | None = None,
     models_for: Callable[[SomeLog], Models] | None = None,
     n_jobs: int | None = 1,
-    progress: Callable[[str, int, int], None] = _ignore,
+    progress: Callable[[str, int, int], None] = quiet,
 ) -> CrossFit:
     """Fit models to a log, and predict each part of it by fits to the others.
 
@@ -96,14 +93,16 @@ def cross_fit(
     True
     """
     one_of(choices, "choices", ("anew", "settled"))
+    _check_models(models)
     weights = np.ones(len(log.q))
     if sample_weight is not None:
-        weights = np.asarray(sample_weight, dtype=float)
+        weights = _numbers_of_rows(sample_weight, len(log.q))
     weighted = _WeightedLog(log, weights)
     fits = {}
     for name, model in models.items():
-        progress(f"fitting {name} to all motions", 0, 1)
-        fits[name] = fit_once(*weighted.prepared(model))
+        of_fit = partial(progress, f"fitting {name} to all motions")
+        of_fit(0, 1)
+        fits[name] = fit_once(*weighted.prepared(model), of_fit)
     if choices == "settled":
         held_out = partial(_held_out_settled, fits)
     else:
@@ -173,13 +172,43 @@ class _WeightedLog(NamedTuple):
         return model.prepared(log.commands, log.x, weights, log.groups)
 
 
+def _check_models(models: object) -> None:
+    """Raise unless these are models by name."""
+    if not isinstance(models, Mapping) or not models:
+        raise TypeError(
+            f"`models` must be a dict of str to HybridForwardModel, got {models!r:.80}."
+        )
+
+
+def _numbers_of_rows(sample_weight: ArrayLike, n_rows: int) -> NDArray:
+    """Return how many times each of the rows counts."""
+    weights = np.asarray(sample_weight)
+    if weights.shape != (n_rows,) or weights.dtype.kind not in "biuf":
+        raise ValueError(
+            f"`sample_weight` must be {n_rows} numbers, one for each row, got "
+            f"{sample_weight!r:.80}."
+        )
+    if not (np.isfinite(weights).all() and (weights >= 0).all() and weights.any()):
+        raise ValueError("`sample_weight` must be finite, not negative, and positive for some row.")
+    return weights.astype(float)
+
+
 def _splits(folds: int | Sequence[Split], measured: Rows) -> list[Split]:
     """Return training and test rows of each fold; raise if a row is not tested once."""
     if isinstance(folds, int):
         most = whole(folds, "folds", 2, 1000)
         return measured.groups.folds(most)
-    splits = [(np.asarray(train), np.asarray(test)) for train, test in folds]
-    tested = np.sort(np.concatenate([test for _, test in splits]))
+    if not isinstance(folds, Sequence) or isinstance(folds, (str, bytes)):
+        raise TypeError(
+            f"`folds` must be a number, or a list of pairs (train, test), got {folds!r:.80}."
+        )
+    try:
+        splits = [(np.asarray(train), np.asarray(test)) for train, test in folds]
+        tested = np.sort(np.concatenate([test for _, test in splits]))
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"`folds` must be a list of pairs (train, test) of rows, got {folds!r:.80}."
+        ) from error
     if not np.array_equal(tested, np.arange(len(measured))):
         raise ValueError(
             f"`folds` must hold out each of the {len(measured)} rows that count once, got "

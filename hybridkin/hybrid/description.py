@@ -55,8 +55,7 @@ from hybridkin.native.export import usual_range
 # The setting `hysteresis` was a value, that of the fit; the last one is that of first files.
 _VALUES = ("value", "operator")
 _REGRESSORS = {
-    cls.__name__: cls
-    for cls in (ELMRegressor, ELMRegressorCV, KernelRidge, LinearRegression)
+    cls.__name__: cls for cls in (ELMRegressor, ELMRegressorCV, KernelRidge, LinearRegression)
 }
 
 
@@ -90,9 +89,7 @@ def stored_hybrid(model: HybridForwardModel) -> Stored:
     return Stored.of(
         "hybrid",
         {
-            **{
-                f"drift_{name}": array for name, array in model._drift._asdict().items()
-            },
+            **{f"drift_{name}": array for name, array in model._drift._asdict().items()},
             **model.change_._asdict(),
             "training_range": fit.training_range,
             "state_range": fit.state_range,
@@ -176,9 +173,7 @@ def hybrid_of(stored: Stored, training: object) -> HybridForwardModel:
     restore_columns(model, stored, n)
     module: Hybrid = restorer()(stored.part("module"))
     if isinstance(module, WithPose) != (model.output == "pose"):
-        raise ValueError(
-            f"`output` {model.output!r} does not fit {stored.part('module').kind!r}"
-        )
+        raise ValueError(f"`output` {model.output!r} does not fit {stored.part('module').kind!r}")
     center = stored.array("drift_center", (n,))
     q = torch.tensor(center[None], device="cpu")
     try:  # arrays that do not fit together fail here, not in use
@@ -264,9 +259,7 @@ def _restored_fit(
         numbers = stored.array("radius", (3,), finite=False).tolist()
         inside, coverage, n_rows = numbers
         if not (inside >= 0.0 and 0.0 < coverage < 1.0 and n_rows < inf):
-            raise ValueError(
-                "`radius` must hold a radius, a coverage and a number of rows"
-            )
+            raise ValueError("`radius` must hold a radius, a coverage and a number of rows")
         radius = Radius(inside, coverage, int(n_rows))
     comparison = None
     if isinstance(training, dict) and training.get("cv_results"):

@@ -193,7 +193,8 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         With `coverage`: the radius ``inside`` the domain [m], infinite with too few groups.
         `adapt` and `partial_fit` do not change it.
     description_ : ModelDescription
-        Robot, log and file of the model; of one from `open_model`, what these say.
+        Robot, log and file of the model; of one from `open_model`, what these say. `fit` makes a
+        new model, of which no file and no notes tell.
     training_range_ : TrainingRange
         ``low`` and ``high`` (n,), the least and the largest q of the fit [unit of q]; with
         `hysteresis` of the motion of the actuators. `adapt` moves it with the actuator zeros.
@@ -449,14 +450,14 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         measured = torch.from_numpy(rows.tips[:, : self._robot.n_outputs])
         for message in self._robot.far_messages(measured, "y"):  # wherever its base is
             warnings.warn(message, stacklevel=2)
-        self.change_, message = likeliest_change(
+        self.change_, messages = likeliest_change(
             self.fitted_module_,
             rows,
             self._fit.error.noise,
             self._drift.scale,
             parameters,
         )
-        if message is not None:
+        for message in messages:
             warnings.warn(message, stacklevel=2)
         self._drift = self._fit.no_drift
         self._past = NO_PAST
@@ -562,9 +563,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """Return the learned part w(q) eps(q), shaped like `predict` [m], rotations [rad]."""
         return self._evaluated(self._tip_errors, X, warn=False)[0]
 
-    def score(
-        self, X: object, y: ArrayLike, sample_weight: ArrayLike | None = None
-    ) -> float:
+    def score(self, X: object, y: ArrayLike, sample_weight: ArrayLike | None = None) -> float:
         """Return R^2 of `predict`, averaged over the columns of y, without missing markers.
 
         Of rows of weight 0, y is ignored; with `hysteresis` they move the actuators.
@@ -671,16 +670,12 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         rows = check_inputs(self, commands.q)
         if not self.hysteresis_ or not len(rows):
             return rows
-        return self.hysteresis_.apply_by_group(
-            rows, commands.run_of_rows, commands.time
-        )
+        return self.hysteresis_.apply_by_group(rows, commands.run_of_rows, commands.time)
 
     def error_weight(self, X: object) -> NDArray:
         """Return the weight w(q) in [0, 1] of the error model at each row, shape (N,)."""
         weight = as_forward_model(self.fitted_module_.error_weight)
-        return self._evaluated(
-            lambda q: evaluate(weight, q + self.change_.shift), X, warn=False
-        )[0]
+        return self._evaluated(lambda q: evaluate(weight, q + self.change_.shift), X, warn=False)[0]
 
     @property
     def hysteresis_(self) -> Hysteresis:
@@ -716,9 +711,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
     @property
     def _robot(self) -> ForwardModel:
         """The mechanical model; without one the module, which knows no robot either."""
-        return (
-            self.module_ if self.mechanical_model_ is None else self.mechanical_model_
-        )
+        return self.module_ if self.mechanical_model_ is None else self.mechanical_model_
 
     def _check_commands(self, rows: Rows) -> None:
         """Raise if actuator vectors have another unit than those of the fit."""
@@ -763,9 +756,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         rows = check_inputs(self, commands.q)
         low, high = states_of_log.shifted(-self.change_.shift)
         seen = np.ones(len(commands), dtype=bool)
-        states = self.hysteresis_.each_inner_state(
-            rows, commands.run_of_rows, commands.time
-        )
+        states = self.hysteresis_.each_inner_state(rows, commands.run_of_rows, commands.time)
         for k, state in enumerate(states):
             seen &= ((low[k] <= state) & (state <= high[k])).all(axis=1)
         if self._fit.pace is not None and commands.time is not None:
@@ -796,9 +787,8 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """Set the module and its mechanical model after the change and the drift of the robot."""
         hybrid = self.fitted_module_
         mechanical = hybrid.mechanical
-        drift = self._drift.correction()
-        if drift is not None:
-            hybrid = hybrid.with_drift(drift)
+        if self._drift:
+            hybrid = hybrid.with_drift(self._drift.correction())
         self.module_ = self.change_.after(hybrid)
         if mechanical is not None:
             mechanical = self.change_.after(mechanical.without_errors)
@@ -808,9 +798,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if not self.hysteresis_ and "feature_names_in_" not in vars(self):
             self._plain_rows = self._plausible_rows
 
-    def _tips(
-        self, q: NDArray, enough: float = 0.0, **results: bool
-    ) -> tuple[NDArray, ...]:
+    def _tips(self, q: NDArray, enough: float = 0.0, **results: bool) -> tuple[NDArray, ...]:
         """Return the tips of rows q (N, n), or other `results` of `evaluate`."""
         model = in_columns(self.module_, self.output)
         return evaluate(model, q, enough=enough, **results)
@@ -935,7 +923,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if not X.flags.writeable:
             X = X.copy()
         rows = Rows.of(X, y, weights, groups, commands.runs, commands.time)
-        if rows.time is not None and self.follows_order:
+        if rows.timed and self.follows_order:
             times = checked_times(rows.time, rows.runs)
             if reset:  # a fit may find creep, which depends on the unit of time
                 check_seconds(times, rows.runs)

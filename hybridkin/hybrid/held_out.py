@@ -15,7 +15,7 @@ from typing_extensions import Self
 
 from hybridkin._core.groups import Groups
 from hybridkin._core.simplest import simplest_within
-from hybridkin.calibration.choice import NOT_CHOSEN, Errors, GeometryChoice
+from hybridkin.calibration.choice import NOT_CHOSEN, GeometryChoice, SetErrors
 from hybridkin.calibration.measured import distance, distances
 from hybridkin.hybrid._guards import GroupDistance
 from hybridkin.hybrid._radius import Radius, covering_distance
@@ -142,9 +142,7 @@ class CrossFit:
     models: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
-    def of_models(
-        cls, tables: Mapping[str, CrossFit], models: Mapping[str, Any]
-    ) -> CrossFit:
+    def of_models(cls, tables: Mapping[str, CrossFit], models: Mapping[str, Any]) -> CrossFit:
         """Return the table of fitted models, from a table of the candidates of each."""
         chosen = [table.chosen for table in tables.values()]
         return replace(
@@ -250,9 +248,7 @@ class CrossFit:
         rows = self._all_rows
         tips = np.empty_like(rows.y)
         inside = np.empty(len(self.y), dtype=bool)
-        for fold, weights in zip(
-            np.unique(self.fold), self._picked_by_others, strict=True
-        ):
+        for fold, weights in zip(np.unique(self.fold), self._picked_by_others, strict=True):
             test = rows.fold == fold
             tips[test] = np.tensordot(weights, rows.tips[:, test], 1)
             of_fold = self.fold == fold
@@ -336,9 +332,7 @@ class CrossFit:
         n = len(self.y)
         all_distances = self._distances_of_all
         held_out_means = self._mean_distances
-        outer_means = np.average(
-            all_distances[:, n:], axis=1, weights=self.outer.counts
-        )
+        outer_means = np.average(all_distances[:, n:], axis=1, weights=self.outer.counts)
         by_fold = _means_by(self.fold, all_distances[:, :n], self.counts)
         chosen = "blend"
         if self.weights.max() == 1.0:
@@ -346,7 +340,7 @@ class CrossFit:
         parameters = geometry.name or "nothing"
         tried = geometry.errors
         if not tried:
-            errors = Errors(float(held_out_means[0]), float(outer_means[0]))
+            errors = SetErrors(float(held_out_means[0]), float(outer_means[0]))
             tried = {parameters: errors}
         return {
             "candidate": [*self.names, "blend"],

@@ -14,8 +14,9 @@ from torch import Tensor
 from typing_extensions import Self
 
 from hybridkin._core.groups import Groups
+from hybridkin._core.progress import Progress, quiet
 from hybridkin.calibration.calibrate import CalibrationResult
-from hybridkin.calibration.choice import NOT_CHOSEN, GeometryChoice, Starts
+from hybridkin.calibration.choice import Starts
 from hybridkin.hybrid._drift import Drift, too_far
 from hybridkin.hybrid._fit import few_rows, fit_hybrid, fit_messages
 from hybridkin.hybrid._module import Hybrid
@@ -68,8 +69,6 @@ class HybridFit:
         The drift before any measurement.
     calibration, hysteresis, radius
         The attributes of the model.
-    geometry : GeometryChoice
-        How the parameters to calibrate were chosen.
     messages : tuple of str
         Warnings, which were not issued.
     """
@@ -82,7 +81,6 @@ class HybridFit:
     training_range: TrainingRange
     no_drift: Drift
     calibration: CalibrationResult | None = None
-    geometry: GeometryChoice = NOT_CHOSEN
     hysteresis: Hysteresis = NO_HYSTERESIS
     state_range: TrainingRange | None = None
     pace: PaceRange | None = None
@@ -227,7 +225,6 @@ class FitOnce:
             training_range=TrainingRange.of(rows.X),
             no_drift=Drift.of_range(rows.q, rows.tips.shape[1]),
             calibration=fitted.spec.calibration,
-            geometry=self.spec.geometry,
             hysteresis=hysteresis,
             state_range=states,
             pace=pace,
@@ -236,8 +233,18 @@ class FitOnce:
         )
 
 
-def fit_once(spec: Spec, log: Rows) -> FitOnce:
-    """Return the hybrid of a log, after the choices of its geometry and its hysteresis."""
+def fit_once(spec: Spec, log: Rows, progress: Progress = quiet) -> FitOnce:
+    """Return the hybrid of a log, after the choices of its geometry and its hysteresis.
+
+    Parameters
+    ----------
+    spec : Spec
+        The settings.
+    log : Rows
+        The rows as they were measured.
+    progress : callable, optional
+        Called with the number of candidates of "auto" that are fitted, and of all of them.
+    """
     commands = log.distinct()
     chosen = spec.with_geometry_chosen(commands)
     hysteresis, messages = chosen.hysteresis.of(chosen, log.in_runs())
@@ -245,7 +252,7 @@ def fit_once(spec: Spec, log: Rows) -> FitOnce:
     if hysteresis:
         rows = log.effective(hysteresis).distinct()
         rows = replace(rows, commanded=commands.directions)
-    fitted = fit_hybrid(chosen, rows)
+    fitted = fit_hybrid(chosen, rows, progress)
     return FitOnce(chosen, log, rows, hysteresis, fitted, messages)
 
 
@@ -319,14 +326,14 @@ def _table_anew(spec: Spec, fit: FitOnce) -> CrossFit:
 def _states(hysteresis: Hysteresis, log: Rows) -> NDArray:
     """Return the inner states (K, R, n) of hysteresis after the rows that count."""
     states = [np.empty((len(log.counted), 0, log.X.shape[1]))]
-    for state in hysteresis.each_inner_state(log.X, log.runs, log.time):
+    for state in hysteresis.each_inner_state(log.X, log.runs, log.clock):
         states.append(state[log.counted, None])
     return np.concatenate(states, axis=1)
 
 
 def _pace(hysteresis: Hysteresis, log: Rows, measured: Rows) -> PaceRange | None:
     """Return the range of paces of the rows that count; None without creep."""
-    if log.time is None or not hysteresis.needs_time:
+    if not (log.timed and hysteresis.needs_time):
         return None
     paces = []
     times = hysteresis.time_constants

@@ -48,9 +48,7 @@ class BlockSize(NamedTuple):
 
     def __str__(self) -> str:
         label, unit, per_si = _WORDS[self.name]
-        return (
-            f"{label} {per_si * self.size:.2g} +- {per_si * self.std_error:.2g} {unit}"
-        )
+        return f"{label} {per_si * self.size:.2g} +- {per_si * self.std_error:.2g} {unit}"
 
 
 class StructureFit(NamedTuple):

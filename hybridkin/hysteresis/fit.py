@@ -198,9 +198,7 @@ class HysteresisProblem:
         by_slopes = self.changes[:, :n_slopes] + delayed
         return y, np.concatenate([by_slopes, by_shares], axis=1)
 
-    def _linearised(
-        self, weights: NDArray, correction: NDArray, prior: _Prior
-    ) -> _LeastSquares:
+    def _linearised(self, weights: NDArray, correction: NDArray, prior: _Prior) -> _LeastSquares:
         """Return the least squares of the next step, from weights and a correction W."""
         y, by_weights = self._effective(weights)
         inputs = np.column_stack([np.ones(len(y)), (y - self.center) / self.scale])
@@ -218,9 +216,7 @@ class HysteresisProblem:
         columns = np.empty((*residual.shape, len(unknowns) + 1))
         in_columns = columns[..., :n_correction].reshape(*by_z.shape, -1)
         np.multiply(by_z.numpy()[..., None], inputs[:, None, None], out=in_columns)
-        in_columns = columns[..., n_correction:-1].reshape(
-            *residual.shape, -1, y.shape[1]
-        )
+        in_columns = columns[..., n_correction:-1].reshape(*residual.shape, -1, y.shape[1])
         by_free = by_weights[:, None, prior.free]
         np.multiply(by_y.numpy()[:, :, None], by_free, out=in_columns)
         columns[..., -1] = residual + columns[..., :-1] @ unknowns

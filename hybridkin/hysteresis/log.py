@@ -15,9 +15,7 @@ from hybridkin.hysteresis.reversals import behind, reversals
 
 _MOST_COUNTED = 10_000  # rows whose errors are computed
 _MOST_FOLLOWED = 20_000  # rows that the stages follow, if few enough reverse
-_FINEST = (
-    6e-4  # reversals that are always followed, relative to the range of an actuator
-)
+_FINEST = 6e-4  # reversals that are always followed, relative to the range of an actuator
 _COARSEST = 1e-2  # smaller ones can be left out of long logs
 _RATIO = 4.0  # largest ratio of two time constants, if they are enough
 _FEWEST_TIMES = 4

@@ -11,9 +11,7 @@ from hybridkin._core.runs import BEGINS, RunOrder
 from hybridkin.hysteresis.follow import followed
 from hybridkin.hysteresis.stages.backlash import Backlash
 
-_SEEN = (
-    0.02  # smallest way back that is no jitter, relative to the range of an actuator
-)
+_SEEN = 0.02  # smallest way back that is no jitter, relative to the range of an actuator
 _MOST_REVERSALS = 1.0 / 3.0  # of the rows; postures at random have two thirds
 
 

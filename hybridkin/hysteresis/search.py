@@ -120,9 +120,7 @@ class Candidate:
     errors: NDArray
 
     @classmethod
-    def of(
-        cls, log: HysteresisLog, width: float, spreads: tuple[float, float]
-    ) -> Candidate:
+    def of(cls, log: HysteresisLog, width: float, spreads: tuple[float, float]) -> Candidate:
         """Return the candidate of the width of a backlash and of the spreads of the weights."""
         problem = HysteresisProblem(log, width, creep=spreads[1] > 0.0)
         fit = problem.fitted(*spreads)

@@ -102,9 +102,7 @@ class Hysteresis(Fixed, Actuation):
                 )
         sizes = {stage.n_actuators for stage in self.stages} - {0}
         if len(sizes) > 1:
-            raise ValueError(
-                f"`stages` must be for equally many actuators, got {sorted(sizes)}."
-            )
+            raise ValueError(f"`stages` must be for equally many actuators, got {sorted(sizes)}.")
         self.n_actuators = max(sizes, default=0)
         self.needs_time = any(stage.needs_time for stage in self.stages)
         widths = [np.zeros(()), *(stage.width for stage in self.stages)]
@@ -329,9 +327,7 @@ class Hysteresis(Fixed, Actuation):
         """
         return self._moved(y, "y", state, dt, lead=True)
 
-    def apply_by_group(
-        self, q: Any, groups: ArrayLike, time: ArrayLike | None = None
-    ) -> Any:
+    def apply_by_group(self, q: Any, groups: ArrayLike, time: ArrayLike | None = None) -> Any:
         """Return the effective changes of a log of several motions, each with a new state.
 
         Parameters
@@ -361,9 +357,7 @@ class Hysteresis(Fixed, Actuation):
         effective[motions.order] = _like(moved, rows, rows.dtype)
         return _like(effective, q, rows.dtype)
 
-    def inner_states(
-        self, q: NDArray, groups: ArrayLike, time: ArrayLike | None = None
-    ) -> NDArray:
+    def inner_states(self, q: NDArray, groups: ArrayLike, time: ArrayLike | None = None) -> NDArray:
         """Return what is inside of the stages after every row, beside their results (N, R, n).
 
         The arguments are those of `apply_by_group`. A single backlash has no such states.
@@ -410,14 +404,10 @@ class Hysteresis(Fixed, Actuation):
             stages.append(kind.from_stored(part))
         hysteresis = cls(stages)
         if hysteresis.n_actuators not in (0, n):
-            raise ValueError(
-                f"a hysteresis of {hysteresis.n_actuators} actuators does not fit {n}"
-            )
+            raise ValueError(f"a hysteresis of {hysteresis.n_actuators} actuators does not fit {n}")
         return hysteresis
 
-    def _motions(
-        self, q: NDArray, groups: ArrayLike, time: ArrayLike | None
-    ) -> _Motions:
+    def _motions(self, q: NDArray, groups: ArrayLike, time: ArrayLike | None) -> _Motions:
         """Return the motions of a log in a row; the arguments are those of `apply_by_group`."""
         check_shape(q, "q", ("N", "n"))
         names = labels(groups, len(q))

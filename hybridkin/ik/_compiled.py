@@ -146,9 +146,7 @@ class Core:
         self.n, self.m = self.plan.lengths(self.plan.root)
         self.width = math.prod(settings.task.shape)
         self._call = ThreadCall(self.plan, opened_library())
-        self.settings = dataclasses.replace(
-            settings, task=_CoreTask(settings.task, self, models)
-        )
+        self.settings = dataclasses.replace(settings, task=_CoreTask(settings.task, self, models))
         self._idle: list[Follower] = []  # one for every thread that has used `step`
         n_rows = self.plan.entry(self.plan.root, IK_STATE_ROWS)
         self.places = places = places_of(self.n, self.m, self.width, n_rows)
@@ -219,9 +217,7 @@ class Core:
         """Return the search for configurations that reach targets."""
         return _CoreSearch(self.settings, tol, max_iter, self)
 
-    def find(
-        self, mode: int, q: Tensor, target: Tensor, tol: Tolerance, max_iter: int
-    ) -> Found:
+    def find(self, mode: int, q: Tensor, target: Tensor, tol: Tolerance, max_iter: int) -> Found:
         """Return the result of `hk_ik_find` for starts q (N, n)."""
         n_rows = len(q)
         best = _plain(q).copy()
@@ -339,9 +335,7 @@ class Follower:
             _Input(places["feed"], state, (core.m,)),
             _Input(places["tip"], state, shape),
         ]
-        self._put_target, self._put_feed, self._put_tip = [
-            place.put for place in self._inputs
-        ]
+        self._put_target, self._put_feed, self._put_tip = [place.put for place in self._inputs]
         self._call = Call(core.plan, opened_library(), state.ctypes.data)  # ik_follower
         self._place = self._call.place
         self._follow = opened_library().hk_ik_tick

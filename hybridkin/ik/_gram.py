@@ -215,9 +215,7 @@ def _entries_3x3(J: Tensor) -> tuple[Tensor, ...]:
     )
 
 
-def _solve_3x3(
-    entries: tuple[Tensor, ...], v: Tensor, damping_sq: Tensor | float
-) -> Tensor:
+def _solve_3x3(entries: tuple[Tensor, ...], v: Tensor, damping_sq: Tensor | float) -> Tensor:
     """Solve a symmetric semidefinite 3 x 3 system plus damping by LDL^T without pivoting."""
     g11, g21, g31, g22, g32, g33 = entries
     v1, v2, v3 = v.unbind(-1)

@@ -83,7 +83,5 @@ def half_spaces(pair: Sequence[Numbers | Transform], task: Task) -> HalfSpaces:
     spaces = HalfSpaces(A / size[:, None], b / size)
     margin = spaces.margin(spaces.way_in(spaces.offsets[None]))
     if not (margin >= -1e-9).all():
-        raise ValueError(
-            "`tip_limits` must have a common point; these half-spaces have none."
-        )
+        raise ValueError("`tip_limits` must have a common point; these half-spaces have none.")
     return spaces

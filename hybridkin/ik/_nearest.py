@@ -44,9 +44,11 @@ class Polyhedron(NamedTuple):
 
     def rounding(self, x: Tensor) -> Tensor:
         """Return what rounding may leave of the excess of x, shape (N, 2 n + k)."""
+        # Steps are clipped to their bounds at last, but rows must hold as they are.
         largest = x.abs().amax(-1, keepdim=True)
-        ends = torch.cat([self.lower, self.upper, self.b], dim=-1)
-        return 8.0 * torch.finfo(x.dtype).eps * (largest + ends.abs())
+        bounds = torch.cat([self.lower, self.upper], dim=-1).abs() + largest
+        rows = apply_rows(self.A.abs(), x.abs()) + self.b.abs()
+        return 8.0 * torch.finfo(x.dtype).eps * torch.cat([bounds, rows], dim=-1)
 
     def normals(self, which: Tensor) -> Tensor:
         """Return the inward normals (N, n) of inequalities (N,), one for every row."""
@@ -91,9 +93,7 @@ class _Active(NamedTuple):
 
     def along(self, normal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the free part of normals (N, n), its square, and their multiples of the others."""
-        way = apply_rows(
-            self.free, apply_rows(self.free, normal)
-        )  # twice, for rounding
+        way = apply_rows(self.free, apply_rows(self.free, normal))  # twice, for rounding
         return way, way.square().sum(-1), apply_rows(self.inverse, normal)
 
     def with_one(
@@ -135,9 +135,7 @@ class _Active(NamedTuple):
     def pushing(self, way: Tensor, rows: Tensor) -> _Active:
         """Return the constraints with the forces of points `way` from the origin, in some rows."""
         force = apply_rows(self.inverse, way)
-        return self._replace(
-            force=torch.where(rows & (self.which >= 0), force, self.force)
-        )
+        return self._replace(force=torch.where(rows & (self.which >= 0), force, self.force))
 
     def where(self, kept: Tensor, others: _Active) -> _Active:
         """Return these constraints in the rows `kept`, else the other ones."""
@@ -223,8 +221,10 @@ class _Live(NamedTuple):
         The points to be near to, those on the equations alone, and at present.
     within : Polyhedron
         What they go into, with relaxed rows and the values of the round.
-    values, excess : Tensor of shape (N, m) and (N,)
-        The values of the equations of the first round, and the factor of their change.
+    values, first : Tensor of shape (N, m)
+        The values of the equations, as given and in the first round.
+    excess : Tensor of shape (N,)
+        The factor of the multipliers in later rounds.
     rounds : Tensor of shape (N,)
         Rounds left.
     equations, active : _Active
@@ -241,6 +241,7 @@ class _Live(NamedTuple):
     x: Tensor
     within: Polyhedron
     values: Tensor
+    first: Tensor
     excess: Tensor
     rounds: Tensor
     equations: _Active
@@ -276,6 +277,7 @@ class _Live(NamedTuple):
             x,
             within,
             values,
+            within.e,
             excess,
             rounds,
             active,
@@ -360,9 +362,7 @@ class _Live(NamedTuple):
         leaving = one_hot(slot, x.shape[-1]).bool() & drops[:, None]
         moved = self._replace(
             x=x + torch.where(movable, length, 0.0)[:, None] * way,
-            active=active.with_one(adds, way, shares, force, self.chosen).without(
-                leaving
-            ),
+            active=active.with_one(adds, way, shares, force, self.chosen).without(leaving),
             chosen=torch.where(adds, -1, self.chosen),
             force=torch.where(adds, 0.0, force),
         )
@@ -397,9 +397,7 @@ class _Live(NamedTuple):
         active = self.active.where(~stuck, self.equations)
         return self._replace(
             x=torch.where(anew, self.start, self.x),
-            within=self.within._replace(
-                b=b, e=torch.where(anew, self.values, self.within.e)
-            ),
+            within=self.within._replace(b=b, e=torch.where(anew, self.first, self.within.e)),
             rounds=torch.where(stuck & (self.excess > 0.0), IK_PROXIMAL, self.rounds),
             active=active,
             chosen=torch.where(stuck, -1, self.chosen),

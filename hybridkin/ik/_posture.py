@@ -79,8 +79,7 @@ class PostureFunction(NoPosture):
         wanted = self._function(q)
         if not isinstance(wanted, Tensor):
             raise TypeError(
-                "`q_pref` must map torch tensors to torch tensors, got "
-                f"{type(wanted).__name__}."
+                f"`q_pref` must map torch tensors to torch tensors, got {type(wanted).__name__}."
             )
         return self._on_plane(wanted.to(q))
 

@@ -55,9 +55,7 @@ class Rest(NamedTuple):
         none = torch.zeros_like(e[:, 0])
         return cls(none, none, none, torch.zeros_like(e), torch.zeros_like(e))
 
-    def seen(
-        self, settings: StepSettings, before: Tensor, e: Tensor, J: Tensor
-    ) -> Self:
+    def seen(self, settings: StepSettings, before: Tensor, e: Tensor, J: Tensor) -> Self:
         """Return this with the curvature that the last step has shown.
 
         It grows where more than half of the promised change of the squared error did not come true:
@@ -108,9 +106,7 @@ class Rest(NamedTuple):
         """Return the least lambda^2 (N,) of a step at errors (N, m)."""
         return (self.curvature * e.norm(dim=-1)).nan_to_num(0.0)
 
-    def after(
-        self, settings: StepSettings, dq: Tensor, promised: Tensor, e: Tensor
-    ) -> Self:
+    def after(self, settings: StepSettings, dq: Tensor, promised: Tensor, e: Tensor) -> Self:
         """Return this after steps dq (N, n), made for errors e (N, m).
 
         They promised motions of the tip (N, m).

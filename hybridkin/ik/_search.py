@@ -296,15 +296,11 @@ class Search:
         rows = torch.arange(len(q), device=q.device)
         damping = torch.full_like(state.error, _FIRST_DAMPING)
         none = torch.zeros_like(damping)
-        live = _Descent(
-            **vars(state), start=state.error, nu=damping, growth=2.0 + none, slow=none
-        )
+        live = _Descent(**vars(state), start=state.error, nu=damping, growth=2.0 + none, slow=none)
         for iteration in range(self.max_iter + 1):
             live.reached = self._within(live.e)
             live.stationary = (
-                self._blocked(live)
-                | (live.nu > IK_LAST_DAMPING)
-                | (live.slow >= IK_SLOW_STEPS)
+                self._blocked(live) | (live.nu > IK_LAST_DAMPING) | (live.slow >= IK_SLOW_STEPS)
             )
             live.n_iter = torch.full_like(live.n_iter, iteration)
             going = ~live.reached & ~live.stationary & (iteration < self.max_iter)
@@ -378,9 +374,7 @@ class Search:
             leaf = q.detach().requires_grad_(True)
             distance = self.settings.task.domain_distance(leaf)
             if distance.requires_grad:
-                (slope,) = torch.autograd.grad(
-                    distance.sum(), leaf, materialize_grads=True
-                )
+                (slope,) = torch.autograd.grad(distance.sum(), leaf, materialize_grads=True)
         beyond = (distance.detach() - IK_INSIDE).clamp_min(0.0)
         square = slope.square().sum(-1)
         length = beyond / torch.where(square > 0.0, square, 1.0)
@@ -452,9 +446,7 @@ class Search:
         better = (corrected.error < best.error) & self._within(corrected.e)
         ends.put(all_rows[better], corrected.take(better))
 
-    def _slide(
-        self, at: Point, wanted: Callable[[Tensor], Tensor], fraction: Tensor
-    ) -> _Slide:
+    def _slide(self, at: Point, wanted: Callable[[Tensor], Tensor], fraction: Tensor) -> _Slide:
         wish = wanted(at.q)
         free = null_step(self.settings, at.J, wish)
         return _Slide(at.q, at.x, at.J, at.e, at.target, wish, free, fraction)

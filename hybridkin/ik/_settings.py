@@ -83,9 +83,7 @@ def require(good: bool | Tensor, message: str) -> None:
         raise ValueError(message)
 
 
-def bound(
-    value: Array, name: str, *, finite: bool = False, positive: bool = False
-) -> Tensor:
+def bound(value: Array, name: str, *, finite: bool = False, positive: bool = False) -> Tensor:
     """Return a limit, a posture or weights as a float64 tensor of shape () or (n,)."""
     numbers = as_tensor(value, name).cpu().double().clone()
     good = ~numbers.isnan()
@@ -316,9 +314,7 @@ class StepSettings(Portable):
                 raise TypeError("a Stack with poses or axes has no kernel")
         posture = self.posture.numbers
         if n is None:
-            raise TypeError(
-                "the number of actuators is unknown; give one limit for each"
-            )
+            raise TypeError("the number of actuators is unknown; give one limit for each")
         model = plan.stack([model.stored() for model in self.task.steered])
         scale = np.repeat(self.task.units, self.task.parts)
         plan.limit("rows of a task", len(scale))
@@ -494,9 +490,7 @@ class StepSettings(Portable):
 
     # Conversion of a caller's arrays to tensors.
 
-    def configurations(
-        self, value: Array, name: str, like: Tensor | None = None
-    ) -> Tensor:
+    def configurations(self, value: Array, name: str, like: Tensor | None = None) -> Tensor:
         """Return q as a tensor (..., n), on the device and at least in the precision of `like`."""
         q = as_tensor(value, name, self.task.device if like is None else like.device)
         n = self.n_actuators or "n"

@@ -61,9 +61,7 @@ class Law(NamedTuple):
     settings: StepSettings
     least: Tensor
 
-    def step(
-        self, J: Tensor, v: Tensor, posture: Tensor, limits: StepLimits
-    ) -> StepRows:
+    def step(self, J: Tensor, v: Tensor, posture: Tensor, limits: StepLimits) -> StepRows:
         """Return the step for the task v and the posture step, within the limits."""
         return limited_step(self.settings, J, v, posture, limits, least=self.least)
 
@@ -276,9 +274,7 @@ def _norm(rows: Tensor) -> Tensor:
 def _braking(law: Law, J: Tensor, way: Tensor, change: Tensor) -> Tensor:
     """Return the largest change of the tip's motion per period, in multiples of `way` (N,)."""
     free = torch.full_like(J[:, 0], math.inf)
-    step = law.step(
-        J, way, torch.zeros_like(free), StepLimits.of_bounds(-free, free, free)
-    )
+    step = law.step(J, way, torch.zeros_like(free), StepLimits.of_bounds(-free, free, free))
     return (change / step.dq.abs()).amin(-1)
 
 

@@ -36,9 +36,7 @@ class StepLimits(NamedTuple):
         none = like.new_empty(*like.shape[:-1], 0)
         lower = lower.expand_as(like)
         upper = upper.expand_as(like)
-        return cls(
-            lower, upper, none[..., None].expand(*none.shape, like.shape[-1]), none
-        )
+        return cls(lower, upper, none[..., None].expand(*none.shape, like.shape[-1]), none)
 
     def clip(self, dq: Tensor) -> Tensor:
         """Return steps moved into the bounds."""
@@ -166,9 +164,7 @@ def damped_step(
     none = torch.full_like(v, math.inf)
     length = limits.A.norm(dim=-1)
     length = torch.where(length > 0.0, length, 1.0)
-    rows = torch.cat(
-        [limits.A / length[..., None], J.new_zeros(N, length.shape[1], m)], dim=-1
-    )
+    rows = torch.cat([limits.A / length[..., None], J.new_zeros(N, length.shape[1], m)], dim=-1)
     within = Polyhedron(
         torch.cat([J, slack], dim=-1),
         v,

@@ -48,9 +48,7 @@ def followed(
     target = path.points.to(start.dtype)
     command = as_array(start) if path.as_numpy else start
     tracker = Tracker(settings, command, path.tol, loop.readings, state)
-    columns = tracker.follow(
-        target, path.periods, loop.plant, loop.feedback, loop.progress
-    )
+    columns = tracker.follow(target, path.periods, loop.plant, loop.feedback, loop.progress)
     q, effective, x, measured, e, rejected, sigma_min, held, damped = columns
     judged = e
     if loop.feedback != "measured":

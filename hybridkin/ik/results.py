@@ -137,9 +137,7 @@ class Step(Generic[ArrayT]):
     def __repr__(self) -> str:
         """Return a one-line summary."""
         held = f"{int(as_array(self.saturated).sum())} saturated"
-        return (
-            f"Step(dq of shape {tuple(self.dq.shape)}, {held}, {_errors(self.error)})"
-        )
+        return f"Step(dq of shape {tuple(self.dq.shape)}, {held}, {_errors(self.error)})"
 
 
 @dataclass(frozen=True, repr=False)

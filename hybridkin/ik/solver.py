@@ -262,9 +262,7 @@ class InverseKinematics:
         if core is not None and dq is None:
             result = core.step(q, x_target, dx, x_measured)
             if result is not None:
-                step = object.__new__(
-                    Step
-                )  # its constructor takes longer than the step
+                step = object.__new__(Step)  # its constructor takes longer than the step
                 vars(step)["_row"] = result
                 settings = self._settings
                 row, places = result
@@ -281,9 +279,7 @@ class InverseKinematics:
             self._warn_of_units(q, x_target, x_measured)
         return step
 
-    def _warn_of_units(
-        self, q: Array, x_target: Array, x_measured: Array | None
-    ) -> None:
+    def _warn_of_units(self, q: Array, x_target: Array, x_measured: Array | None) -> None:
         """Warn where arguments of a step whose error is too large have another unit."""
         settings = self._settings
         messages = settings.posture_messages(settings.configurations(q, "q"), "q")
@@ -528,9 +524,7 @@ class InverseKinematics:
         """Return the number of configurations per target."""
         if n_solutions is None:
             return 1
-        require(
-            not differentiable, "`n_solutions` must be None for differentiable=True."
-        )
+        require(not differentiable, "`n_solutions` must be None for differentiable=True.")
         require(
             torch.isfinite(self.settings.spans).all(),
             "`n_solutions` needs finite ranges of q to compare configurations; give finite `q_min` "
@@ -657,9 +651,7 @@ class InverseKinematics:
         best = max(tracks, key=attrgetter("score"))  # of equal tracks the first
         if alone:
             return best
-        return followed(
-            settings, torch.as_tensor(best.q[0], device=target.device), timed, loop
-        )
+        return followed(settings, torch.as_tensor(best.q[0], device=target.device), timed, loop)
 
     def judged(self, track: Track, *, tol: float | Sequence[float] = _TOL) -> Track:
         """Return a track with the errors and statuses of its tips, after a change of its commands.
@@ -692,14 +684,10 @@ class InverseKinematics:
             held=before == IKStatus.AT_LIMITS,
             singular=before == IKStatus.SINGULAR,
         )
-        error, status = give_back(
-            [e.norm(dim=-1), status], (len(e),), is_numpy(track.q)
-        )
+        error, status = give_back([e.norm(dim=-1), status], (len(e),), is_numpy(track.q))
         return replace(track, error=error, status=status)
 
-    def _starts(
-        self, target: Tensor, q0: Tensor | None, as_numpy: bool
-    ) -> Iterator[Tensor]:
+    def _starts(self, target: Tensor, q0: Tensor | None, as_numpy: bool) -> Iterator[Tensor]:
         """Yield two configurations (n,) at a target (1, ...): of the first start, a regular one."""
         settings = self.settings
         # Arrays of NumPy are solved by the compiled core.
@@ -714,9 +702,7 @@ class InverseKinematics:
         distances = settings.task.distances(x[None], target)[0]
         distances[0] = -1.0
         guesses = guesses[distances.argsort()[: _GUESSES + 1]]
-        solution = self._solved(
-            goal, as_array(guesses) if as_numpy else guesses, max_iter=200
-        )
+        solution = self._solved(goal, as_array(guesses) if as_numpy else guesses, max_iter=200)
         q = as_tensor(solution.q, "q")
         status = as_tensor(solution.status, "status")
         sigma_min = as_tensor(solution.sigma_min, "sigma_min")

@@ -472,16 +472,12 @@ class AxisTask(_OfPoses):
         "direction counts as NaN;"
     )
 
-    def __init__(
-        self, model: object, axis: Numbers = (0.0, 0.0, 1.0), length: float = 0.1
-    ) -> None:
+    def __init__(self, model: object, axis: Numbers = (0.0, 0.0, 1.0), length: float = 0.1) -> None:
         along = as_tensor(axis, "axis").cpu().double()
         check_shape(along, "axis", [3], "a direction in the frame of the tip")
         size = float(along.norm())
         if not IK_NO_AXIS < size < math.inf:
-            raise ValueError(
-                f"`axis` must be finite and not zero, got {along.tolist()}."
-            )
+            raise ValueError(f"`axis` must be finite and not zero, got {along.tolist()}.")
         self.axis = along / size
         self.shape = (6,)
         self.parts = (3, 3)
@@ -642,9 +638,7 @@ class Stack(Task):
     (tensor(True), True)
     """
 
-    def __init__(
-        self, tasks: Sequence[Task], weights: Sequence[float] | None = None
-    ) -> None:
+    def __init__(self, tasks: Sequence[Task], weights: Sequence[float] | None = None) -> None:
         parts = tuple(tasks)
         if len(parts) == 0 or not all(isinstance(task, Task) for task in parts):
             names = [type(task).__name__ for task in parts]
@@ -662,9 +656,7 @@ class Stack(Task):
             )
         sizes = {task.n_actuators for task in parts if task.n_actuators}
         if len(sizes) > 1:
-            raise ValueError(
-                f"`tasks` must have the same actuators, got {sorted(sizes)} of them."
-            )
+            raise ValueError(f"`tasks` must have the same actuators, got {sorted(sizes)} of them.")
         self._take(parts)
 
     def _take(self, tasks: tuple[Task, ...]) -> None:

@@ -420,9 +420,7 @@ class Tracker(Portable):
             tip = plant(self.q)
             return self._settings.readings(tip, "tip", self._like, lead="")[None]
         except Exception as error:
-            warnings.warn(
-                f"`plant` failed at point {i}: {error!r}; its tip is NaN.", stacklevel=7
-            )
+            warnings.warn(f"`plant` failed at point {i}: {error!r}; its tip is NaN.", stacklevel=7)
             return self._like.new_full((1, *self._settings.task.shape), math.nan)
 
 
@@ -463,9 +461,7 @@ class _InTorch:
         self._period = self._settings.dt  # of the last step
         self._last = Tick(q, x, J, unknown, step)
 
-    def tick(
-        self, target: Array, dx: Array | None, tip: Array | None, age: float
-    ) -> bool:
+    def tick(self, target: Array, dx: Array | None, tip: Array | None, age: float) -> bool:
         """Return False: all arguments need full checks."""
         return False
 

@@ -48,16 +48,12 @@ class Trajectory:
         bad = np.flatnonzero(~(np.isfinite(t) & np.isfinite(x).all(axis=1)))
         if bad.size:
             rows = f"{bad.size} rows (first: row {bad[0]})"
-            raise ValueError(
-                f"`t` and `x` must be finite; drop the {rows} that are not."
-            )
+            raise ValueError(f"`t` and `x` must be finite; drop the {rows} that are not.")
         late = np.flatnonzero(np.diff(t) <= 0)
         if late.size:
             row = late[0] + 1
             pair = f"{t[late[0]]:.6g} s before {t[late[0] + 1]:.6g} s"
-            raise ValueError(
-                f"`t` must increase, got {pair} in row {row}; sort, drop repeats."
-            )
+            raise ValueError(f"`t` must increase, got {pair} in row {row}; sort, drop repeats.")
         largest = float(np.abs(x).max())
         if largest > _FAR:
             warnings.warn(
@@ -150,9 +146,7 @@ def figure_eight(
     Trajectory(801 points, 8 s, 0.4 x 0.2 x 0 m)
     """
     center = _checked(center, "center", _POINT, (3,))
-    width, height = _checked(
-        size, "size", "two numbers, positive [m]", (2,), _ABOVE_ZERO
-    )
+    width, height = _checked(size, "size", "two numbers, positive [m]", (2,), _ABOVE_ZERO)
     t, s = _timing(duration, dt, timing)
     across, up, _ = _plane(normal)
     phase = 2.0 * math.pi * s[:, None]
@@ -260,9 +254,7 @@ def line(
     return Trajectory(t, (1.0 - s)[:, None] * start + s[:, None] * end)
 
 
-def from_csv(
-    path: str | PathLike[str], *, dt: float | None = None, unit: str = "m"
-) -> Trajectory:
+def from_csv(path: str | PathLike[str], *, dt: float | None = None, unit: str = "m") -> Trajectory:
     """Return a recorded path from a CSV file.
 
     Parameters
@@ -293,9 +285,7 @@ def from_csv(
         dt = _period(dt, "dt")
     path = as_path(path)
     if not path.is_file():
-        raise FileNotFoundError(
-            f"`path` must be a CSV file of points, there is none at {path}."
-        )
+        raise FileNotFoundError(f"`path` must be a CSV file of points, there is none at {path}.")
     rows = _rows_of(path)
     columns = 4
     need = "t, x, y, z"
@@ -303,9 +293,7 @@ def from_csv(
         columns = 3
         need = "x, y, z"
         if dt is None:
-            raise ValueError(
-                f"{path} has no times; give the time between its points (--dt 0.02)."
-            )
+            raise ValueError(f"{path} has no times; give the time between its points (--dt 0.02).")
     named = bool(rows) and not is_number(rows[0][0])
     numbers = []
     try:
@@ -316,9 +304,7 @@ def from_csv(
         need = f"numbers in {columns} columns ({need}) after one line of names"
         raise ValueError(f"{path} must hold {need}: {error!s:.200}.") from error
     if table.ndim != 2 or table.shape[1] != columns:
-        raise ValueError(
-            f"{path} must have rows of {columns} columns ({need}), got {table.shape}."
-        )
+        raise ValueError(f"{path} must have rows of {columns} columns ({need}), got {table.shape}.")
     x = METRES[unit] * table[:, -3:]
     if dt is not None and columns == 3:
         return Trajectory(dt * np.arange(len(table)), x)
@@ -360,9 +346,7 @@ def periods(duration: float, dt: float) -> float:
     """Return the number of periods `dt` in a duration [s]; raise if there are too many."""
     n = duration / _period(dt, "dt")
     if n > _MOST:
-        raise ValueError(
-            f"`duration` must be at most {_MOST:g} times `dt`, got {n:g} times."
-        )
+        raise ValueError(f"`duration` must be at most {_MOST:g} times `dt`, got {n:g} times.")
     return n
 
 

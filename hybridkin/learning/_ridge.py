@@ -23,10 +23,15 @@ class Statistics(NamedTuple):
     mean: np.ndarray
     scatter: np.ndarray
 
+    @classmethod
+    def none(cls, n_columns):
+        """Return the statistics of no rows."""
+        return cls(0.0, np.zeros(n_columns), np.zeros((n_columns, n_columns)))
+
 
 @torch.no_grad()
 def gather(stats, elm, X, y, sample_weight, block_size):
-    """Return the statistics `stats` (None: no rows yet) with the rows of `X` and `y` added.
+    """Return the statistics `stats` with the rows of `X` and `y` added.
 
     Each block is centred about its own mean. The step from the old mean to the block's mean is
     added as one more row, so each block needs one symmetric product, and the result is exact.
@@ -34,8 +39,6 @@ def gather(stats, elm, X, y, sample_weight, block_size):
     n_features = len(elm.output_weights)
     device = elm.input_center.device
     n_columns = n_features + y.shape[1]
-    if stats is None:
-        stats = Statistics(0.0, np.zeros(n_columns), np.zeros((n_columns, n_columns)))
     if block_size is None:
         block_size = rows_at_once(max(1, BLOCK_ELEMENTS // n_columns), device)
     n = stats.n
@@ -49,11 +52,11 @@ def gather(stats, elm, X, y, sample_weight, block_size):
         block = z[:-1]
         elm.write_features(q, block[:, :n_features])
         block[:, n_features:] = copied(y[rows], device)
-        w = copied(sample_weight[rows], device)
+        w = copied(sample_weight[rows], device)[:, None]
         n_block = w.sum().item()
-        mean_block = w @ block / n_block
+        mean_block = (w * block).sum(0) / n_block
         block -= mean_block
-        block *= w.sqrt()[:, None]
+        block *= w.sqrt()
         step = mean_block - mean
         torch.mul(step, (n / (n + n_block) * n_block) ** 0.5, out=z[-1])
         n += n_block

@@ -327,9 +327,7 @@ class ELMRegressor(FittedNetwork):
             The fitted estimator.
         """
         if not isinstance(other, ELMRegressor):
-            raise TypeError(
-                f"`other` must be a fitted ELMRegressor, got {type(other).__name__}."
-            )
+            raise TypeError(f"`other` must be a fitted ELMRegressor, got {type(other).__name__}.")
         check_is_fitted(self, "module_")
         check_is_fitted(other, "module_")
         for name in (*(f"{name}_" for name in LAYER), "feature_names_in_"):
@@ -361,7 +359,7 @@ class ELMRegressor(FittedNetwork):
         y = y.reshape(len(y), -1)
         if first:
             elm = draw_layer(self, X, sample_weight)
-            stats = None
+            stats = Statistics.none(len(elm.output_weights) + y.shape[1])
         else:
             elm = self.module_
             n, mean, scatter = self._stats
@@ -448,6 +446,4 @@ class ELMRegressor(FittedNetwork):
         elm.solver_ = stored.value("solver", str)
         elm._y_ndim = stored.value("y_ndim", int)
         restore_columns(elm, stored, network.n_actuators)
-        return elm._hold(
-            network, Statistics(stored.value("n_samples_seen", float), mean, scatter)
-        )
+        return elm._hold(network, Statistics(stored.value("n_samples_seen", float), mean, scatter))

@@ -23,7 +23,7 @@ from hybridkin._core.groups import Groups
 from hybridkin._core.stored import plain
 from hybridkin._core.turns import TURNS
 from hybridkin.learning._left_out import LeftOut, left_out
-from hybridkin.learning._ridge import gather
+from hybridkin.learning._ridge import Statistics, gather
 from hybridkin.learning.elm import ELMRegressor, FittedNetwork
 from hybridkin.learning.hidden_layer import (
     check_rows,
@@ -128,10 +128,7 @@ class ELMRegressorCV(FittedNetwork):
         "cv": ["cv_object"],
         "relevance_rounds": [Interval(Integral, 0, None, closed="left")],
         "max_hidden": [Interval(Integral, 0, None, closed="left")],
-        **{
-            name: ELMRegressor._parameter_constraints[name]
-            for name in (*_SHARED, "random_state")
-        },
+        **{name: ELMRegressor._parameter_constraints[name] for name in (*_SHARED, "random_state")},
     }
 
     def __init__(
@@ -242,9 +239,7 @@ class ELMRegressorCV(FittedNetwork):
         """Return the description of the chosen ELMRegressor."""
         check_is_fitted(self, "module_")
         chosen = self.best_estimator_.stored()
-        chosen.settings["feature_names_in"] = plain(
-            vars(self).get("feature_names_in_", [])
-        )
+        chosen.settings["feature_names_in"] = plain(vars(self).get("feature_names_in_", []))
         return chosen
 
 
@@ -318,7 +313,8 @@ class _Search:
         elm = draw_layer(candidate, self.X, self.weights)
         elm = elm.to(device_named(candidate.device))
         rows = self.X, self.targets, self.weights
-        stats = gather(None, elm, *rows, candidate.block_size)
+        none = Statistics.none(len(elm.output_weights) + self.targets.shape[1])
+        stats = gather(none, elm, *rows, candidate.block_size)
         held_out = left_out(elm, stats, *rows, candidate.fit_intercept)
         if isinstance(self.alphas, str):
             alphas = _AUTO_ALPHAS * (held_out.eigenvalues[-1] or 1.0)

@@ -63,9 +63,7 @@ def check_rows(estimator, X, y, sample_weight, reset=True):
     weights = np.asarray(sample_weight, dtype=np.float64)
     good = _is_finite(weights, 1) and len(weights) == len(X)
     if not good or weights.min() < 0.0 or (reset and not weights.any()):
-        weights = _check_sample_weight(
-            sample_weight, X, dtype=np.float64, ensure_non_negative=True
-        )
+        weights = _check_sample_weight(sample_weight, X, dtype=np.float64, ensure_non_negative=True)
     return X, y, weights
 
 

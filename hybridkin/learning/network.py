@@ -182,9 +182,7 @@ class ELM(LeverageModule):
         n_hidden, self.n_actuators = self.input_weights.shape
         n_features, self.n_outputs = self.output_weights.shape
         if n_features not in (n_hidden, n_hidden + self.n_actuators):
-            raise ValueError(
-                f"{n_hidden} hidden neurons cannot have {n_features} features"
-            )
+            raise ValueError(f"{n_hidden} hidden neurons cannot have {n_features} features")
 
     @classmethod
     def from_stored(cls, stored, restore):

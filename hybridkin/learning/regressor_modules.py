@@ -129,9 +129,7 @@ class ResidualRegressor(TransformedTargetRegressor):
     def fit(self, X: NDArray, y: NDArray, **options: Any) -> ResidualRegressor:
         """Fit the regressor to scaled residuals."""
         super().fit(X, y, **options)
-        of_scaled = error_module(
-            self.regressor_, torch.from_numpy(X.astype(np.float64))
-        )
+        of_scaled = error_module(self.regressor_, torch.from_numpy(X.astype(np.float64)))
         self.module_ = _rescaled(of_scaled, self.transformer_)
         return self
 
@@ -291,9 +289,7 @@ class KernelModule(ForwardModel):
     def rescaled(self, mean: Tensor, spread: Tensor) -> KernelModule:
         """Return mean (m,) + spread times this module."""
         bias = mean + spread * self.bias
-        return KernelModule(
-            self.rows, spread * self.weights, bias, self.center, self.scale
-        )
+        return KernelModule(self.rows, spread * self.weights, bias, self.center, self.scale)
 
     def forward(self, q: Tensor) -> Tensor:
         """Return the sum, shape (..., m)."""

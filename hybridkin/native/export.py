@@ -64,20 +64,14 @@ _STEP_PARTS = {
     "TICKS": "ticks.c",
     "STEP_README": "step.md",
 }
-_ABOUT_SPACES = (
-    " For the half-spaces of the tip it solves at most 11 times, usually once."
-)
+_ABOUT_SPACES = " For the half-spaces of the tip it solves at most 11 times, usually once."
 # Operations of a node with `a` numbers, n inputs and m outputs, in a model with S segments.
 _OPERATIONS = {
     "arcs": lambda a, n, m, S: 8 * a + 210 * S + 25 * S * S,
-    "elastic": lambda a, n, m, S: (
-        (8 + 2 ** min(n, 12)) * (200 * S + 40 * n) + 25 * (S + 14) * S
-    ),
+    "elastic": lambda a, n, m, S: (8 + 2 ** min(n, 12)) * (200 * S + 40 * n) + 25 * (S + 14) * S,
     "structural": lambda a, n, m, S: 8 * a + 600 * S + 25 * S * S,
     "rigid": lambda a, n, m, S: 10 * (a - 9) + 15 * n,  # the tip does not turn
-    "hybrid": lambda a, n, m, S: (
-        a * (25 * (S + 12) * S + 18 * S * n + 10 * m * (n + 2))
-    ),
+    "hybrid": lambda a, n, m, S: a * (25 * (S + 12) * S + 18 * S * n + 10 * m * (n + 2)),
 }
 
 
@@ -236,9 +230,7 @@ def c_project(
     if dtype not in _REAL:
         raise ValueError(f'`dtype` must be "float64" or "float32", got {dtype!r}.')
     if not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
-        raise ValueError(
-            f"`name` must be a valid name in C, e.g. trunk_3, got {name!r}."
-        )
+        raise ValueError(f"`name` must be a valid name in C, e.g. trunk_3, got {name!r}.")
     # Twins in float64, as C computes: what they derive from a geometry has its precision, too.
     controller = copy.deepcopy(model) if isinstance(model, _Controller) else None
     if controller:
@@ -317,9 +309,7 @@ def _code(plan: Plan, controller: _Controller | None, dtype: str) -> Entries:
         step = _step_code(plan, task, n_spaces)
 
     # gcc warns about arrays of length 1 if it cannot see that loops over them run at all.
-    defines: Entries = {
-        f"MAX_{s}": max(plan.largest[what], 2) for s, what in _SIZES.items()
-    }
+    defines: Entries = {f"MAX_{s}": max(plan.largest[what], 2) for s, what in _SIZES.items()}
     kinds = {*plan.code[plan.places].tolist()}
     defines["KINDS"] = f"{sum(1 << kind for kind in kinds)}u"
     defines["POSES"] = int(poses)
@@ -395,9 +385,7 @@ def _check_stack(plan: Plan, dtype: str) -> None:
         numbers += 8 * (rows + 1) * (n + 12)
         numbers += 2 * n * plan.entry(plan.root, IK_STATE_ROWS)
     if numbers * np.dtype(dtype).itemsize > _MOST_STACK:
-        raise NoKernel(
-            "its sizes need more than 64 KiB of stack, too much for a controller"
-        )
+        raise NoKernel("its sizes need more than 64 KiB of stack, too much for a controller")
 
 
 def _operations(plan: Plan) -> int:
@@ -488,8 +476,7 @@ def _vectors(
 def usual_range(module: ForwardModel, n: int) -> tuple[NDArray, NDArray]:
     """Return the middle and half width of q: of the training rows, else from the radii."""
     buffers = {
-        name.rpartition(".")[2]: a.numpy(force=True)
-        for name, a in module.state_dict().items()
+        name.rpartition(".")[2]: a.numpy(force=True) for name, a in module.state_dict().items()
     }
     for pair in _RANGES:
         center, half = (buffers.get(name, np.empty(0)) for name in pair)

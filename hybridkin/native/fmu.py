@@ -30,9 +30,7 @@ from hybridkin.native.export import (
     literals,
 )
 
-_FLAGS = (
-    "-std=c99 -O2 -fPIC -shared -fvisibility=hidden -fno-math-errno -fno-trapping-math"
-)
+_FLAGS = "-std=c99 -O2 -fPIC -shared -fvisibility=hidden -fno-math-errno -fno-trapping-math"
 _SYSTEMS = {"linux": "linux", "darwin": "darwin", "win32": "windows"}
 _PROCESSORS = {"AMD64": "x86_64", "arm64": "aarch64"}
 _SUFFIXES = {"linux": ".so", "darwin": ".dylib", "win32": ".dll"}
@@ -221,9 +219,7 @@ def _variables(project: CProject) -> list[Variable]:
     need_delay = Need(f"zero or up to {oldest:.6g} s", 0.0, oldest)
     settings = project.controller.settings
     variables = [
-        Variable(
-            "target", "input", str(project.entries["ABOUT_TARGET"]), width, target
-        ),
+        Variable("target", "input", str(project.entries["ABOUT_TARGET"]), width, target),
         Variable("velocity", "input", "of the target [m/s]", rows, np.zeros(rows)),
         Variable("measured", "input", "tip, or NaN", width, np.full(width, np.nan)),
         Variable("start", "parameter", "command at rest", (n,), home, _START, "fixed"),

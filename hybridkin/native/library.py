@@ -219,9 +219,7 @@ _NO_SOURCES = Sources()
 class ThreadCall(threading.local, Call):
     """A call that has memory of its own in every thread, also for the results of one row."""
 
-    def __init__(
-        self, plan: Plan, opened: ctypes.CDLL, sources: Sources = _NO_SOURCES
-    ) -> None:
+    def __init__(self, plan: Plan, opened: ctypes.CDLL, sources: Sources = _NO_SOURCES) -> None:
         self.results = np.empty(plan.n_outputs * (1 + plan.n_inputs) + 1)
         at_results = self.results.ctypes.data
         super().__init__(plan, opened, at_results, *sources.pointers)  # hk_row
@@ -320,9 +318,7 @@ class Program:
         self._fill(q, [(None, 0), (slopes, self._sizes[0]), (d, 1)], enough)
         return d, slopes
 
-    def _fill(
-        self, q: NDArray, results: list[tuple[NDArray | None, int]], enough: float
-    ) -> None:
+    def _fill(self, q: NDArray, results: list[tuple[NDArray | None, int]], enough: float) -> None:
         n = self._sizes[0]
         if q.shape[-1] != n:
             raise ValueError(f"`q` must have shape (..., {n}), got {q.shape}.")
@@ -338,9 +334,7 @@ class Program:
                 if a is not None:
                     at = address(a) + 8 * width * start
                 places.append(at)
-            self._evaluate(
-                self._call.place, at_q + 8 * n * start, count, *places, enough
-            )
+            self._evaluate(self._call.place, at_q + 8 * n * start, count, *places, enough)
 
         in_chunks(q.size // n, run)
 
@@ -393,9 +387,7 @@ class _Compiled:
             _check_classes(modules)
             tensors = _described_tensors(modules)
             if any(a.device.type != "cpu" or a.is_inference() for a in tensors):
-                raise NoKernel(
-                    "the compiled core needs tensors on the CPU, no inference tensors"
-                )
+                raise NoKernel("the compiled core needs tensors on the CPU, no inference tensors")
             self.tensors = tensors
             memory = [*map(_memory, tensors)]
             copies = [a.copy() for a in memory]
@@ -407,9 +399,7 @@ class _Compiled:
         except (ValueError, TypeError) as error:
             self.reason = str(error).split(";")[0]
 
-    def _set_sources(
-        self, plan: Plan, memory: list[NDArray], copies: list[NDArray]
-    ) -> None:
+    def _set_sources(self, plan: Plan, memory: list[NDArray], copies: list[NDArray]) -> None:
         """Keep the tensors that the plan shares apart from the others."""
         places = {array.ctypes.data for array in plan.shared.values()}
         own = []
@@ -538,12 +528,7 @@ def evaluate(
     """
     q = np.asarray(q, np.float64)
     compiled = model.__dict__.get("_program")
-    if (
-        value
-        and compiled is not None
-        and q.shape == compiled.row_shape
-        and compiled.holds()
-    ):
+    if value and compiled is not None and q.shape == compiled.row_shape and compiled.holds():
         asked = HK_IF_SAME + HK_J * jacobian + HK_DISTANCE * distance
         results = compiled.program.row(q, asked, enough)
         if results is not None:

@@ -43,9 +43,7 @@ def times(value: ArrayLike | None, n_rows: int) -> NDArray | None:
         return None
     t = shaped(value, "t", "T", n_rows)
     if np.isnan(t).any() or not (np.diff(t) > 0.0).all():
-        raise ValueError(
-            "`t` must increase [s]; sort the rows and drop repeated or unknown times."
-        )
+        raise ValueError("`t` must increase [s]; sort the rows and drop repeated or unknown times.")
     return t
 
 

@@ -65,9 +65,7 @@ class Stage:
         self.trail = trail[0]
         self.artists = []
         for line in scene.moving:
-            artists = ax.plot(
-                [], [], [], label=plot_label(line.label) or None, **line.look()
-            )
+            artists = ax.plot([], [], [], label=plot_label(line.label) or None, **line.look())
             self.artists += artists
         small_legend(ax, loc="upper left", bbox_to_anchor=(-0.25, 1.0))
         self.cursor = None

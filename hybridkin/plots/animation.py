@@ -117,14 +117,10 @@ class TrackAnimation(Display):
         K = len(shown)
         inside = K > 0 and shown[0] >= 0 and shown[-1] < T
         if not (inside and (np.diff(shown) > 0).all()):
-            raise ValueError(
-                f"`rows` must increase within the {T} rows of `x`, got {shown}."
-            )
+            raise ValueError(f"`rows` must increase within the {T} rows of `x`, got {shown}.")
         self.rows = shown.astype(int)
         if body is not None and len(body.points) != K:
-            raise ValueError(
-                f"`body` must hold {K} configurations, got {len(body.points)}."
-            )
+            raise ValueError(f"`body` must hold {K} configurations, got {len(body.points)}.")
         self.body = body
         self.name = str(name)
 
@@ -189,9 +185,7 @@ class TrackAnimation(Display):
             finite = np.isfinite(q).all(axis=1)
             x = np.full((len(q), 3), np.nan)
             x[finite] = predicted(model, q[finite])
-        return cls(
-            x, target=target, t=t, body=body, rows=rows, name=name, expected=expected
-        )
+        return cls(x, target=target, t=t, body=body, rows=rows, name=name, expected=expected)
 
     @property
     def fps(self) -> float:
@@ -201,9 +195,7 @@ class TrackAnimation(Display):
         t = self.t[self.rows]
         return (len(t) - 1) / float(t[-1] - t[0])
 
-    def plot(
-        self, ax: Axes | None = None, *, unit: str = "cm", frame: int = -1
-    ) -> Self:
+    def plot(self, ax: Axes | None = None, *, unit: str = "cm", frame: int = -1) -> Self:
         """Draw one frame into a 3-D axes and return self.
 
         Parameters
@@ -269,9 +261,7 @@ class TrackAnimation(Display):
         path = Path(path)
         kind = path.suffix.lower()
         if kind not in _FORMATS:
-            raise ValueError(
-                f"`path` must end in one of {_FORMATS}, got {path.name!r}."
-            )
+            raise ValueError(f"`path` must end in one of {_FORMATS}, got {path.name!r}.")
         if not 0.0 < speed < np.inf:
             raise ValueError(f"`speed` must be positive, got {speed!r}.")
         scene = self._scene(unit)

@@ -37,9 +37,7 @@ class _ErrorDisplay(Display):
             self.errors[name] = values
 
     @classmethod
-    def from_predictions(
-        cls, x: ArrayLike, predictions: Mapping[str, ArrayLike]
-    ) -> Self:
+    def from_predictions(cls, x: ArrayLike, predictions: Mapping[str, ArrayLike]) -> Self:
         """Return the display of the distances from predicted to measured tips.
 
         Parameters
@@ -145,9 +143,7 @@ class ErrorBoxDisplay(_ErrorDisplay):
         Where it was drawn last.
     """
 
-    def plot(
-        self, ax: Axes | None = None, *, unit: str = "cm", log: bool = False
-    ) -> Self:
+    def plot(self, ax: Axes | None = None, *, unit: str = "cm", log: bool = False) -> Self:
         """Draw horizontal boxes with the mean (dot) and the maximum (cross) and return self.
 
         A linear axis shows most models up to their 95 %. Larger means and maxima are numbers at

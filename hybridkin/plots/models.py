@@ -64,9 +64,7 @@ def predicted(model: Model, q: ArrayLike) -> NDArray:
         return positions(model(torch.from_numpy(plain(q, "q"))))
 
 
-def body_of(
-    model: Model, q: ArrayLike, n_points: int, tips: ArrayLike | None = None
-) -> Body:
+def body_of(model: Model, q: ArrayLike, n_points: int, tips: ArrayLike | None = None) -> Body:
     """Return the arguments of `BackboneDisplay` for a robot in configurations q (K, n) or (n,).
 
     Where `tips` (K, 3) are given, or the model corrects its robot inside, the body ends there.

@@ -165,17 +165,11 @@ def _is_ours(raw: Any) -> bool:
 
 def _numbers(values: object, n: int) -> bool:
     """Return whether a value is n finite numbers."""
-    return (
-        isinstance(values, Sequence) and len(values) == n and all(map(_number, values))
-    )
+    return isinstance(values, Sequence) and len(values) == n and all(map(_number, values))
 
 
 def _number(value: object) -> bool:
-    return (
-        isinstance(value, (int, float))
-        and math.isfinite(value)
-        and abs(value) < _FARTHEST
-    )
+    return isinstance(value, (int, float)) and math.isfinite(value) and abs(value) < _FARTHEST
 
 
 def _is_camera(message: _Message) -> bool:
@@ -204,9 +198,7 @@ def _is_value(message: _Message) -> bool:
     """Return whether a slider, a button or a box gets a value, and no other property."""
     updates = message["updates"]
     return (
-        isinstance(message["uuid"], str)
-        and [*updates] == ["value"]
-        and _number(updates["value"])
+        isinstance(message["uuid"], str) and [*updates] == ["value"] and _number(updates["value"])
     )
 
 

@@ -226,12 +226,8 @@ class BackboneDisplay(Display):
         self.points = shaped(points, "points", "KP3")
         K = len(self.points)
         if not isinstance(actuators, Iterable):
-            raise ValueError(
-                f"`actuators` must hold arrays (K, P, 3), got {actuators!r:.80}."
-            )
-        self.actuators = tuple(
-            shaped(path, "actuators", "KP3", K) for path in actuators
-        )
+            raise ValueError(f"`actuators` must hold arrays (K, P, 3), got {actuators!r:.80}.")
+        self.actuators = tuple(shaped(path, "actuators", "KP3", K) for path in actuators)
         n = len(self.actuators)
         if segments is None:
             segments = (0,) * n
@@ -240,14 +236,10 @@ class BackboneDisplay(Display):
             raise ValueError(f"`segments` must hold {n} numbers, one per actuator.")
         self.names = tuple(names)
         if len(self.names) not in (0, n):
-            raise ValueError(
-                f"`names` must hold {n} names, one per actuator, got {names!r:.80}."
-            )
+            raise ValueError(f"`names` must hold {n} names, one per actuator, got {names!r:.80}.")
         self.disks = shaped_or_empty(disks, "disks", "KDC3", K)
         self.frames = shaped_or_empty(frames, "frames", "KF44", K)
-        self.tips = shaped(
-            self.points[:, -1] if tips is None else tips, "tips", "K3", K
-        )
+        self.tips = shaped(self.points[:, -1] if tips is None else tips, "tips", "K3", K)
         self.predicted = shaped_or_empty(predicted, "predicted", "K3", K)
         self.rigid = rigid
 
@@ -340,14 +332,10 @@ class BackboneDisplay(Display):
         if body and self.disks.size:
             lines.append(Line("", _joined(self.disks.swapaxes(0, 1)), "#808080", 1.0))
         if tip:
-            lines.append(
-                Line("tip", self.tips[:, None], "black", 1.0, marker="o", style="none")
-            )
+            lines.append(Line("tip", self.tips[:, None], "black", 1.0, marker="o", style="none"))
         if len(self.predicted):
             way = np.stack([self.tips, self.predicted], axis=1)
-            lines.append(
-                Line("learned correction", way, COLORS[0], 1.5, style=":", marker=".")
-            )
+            lines.append(Line("learned correction", way, COLORS[0], 1.5, style=":", marker="."))
         return lines
 
     def _actuator_lines(self) -> list[Line]:
@@ -355,9 +343,7 @@ class BackboneDisplay(Display):
         lines = []
         if self.names:
             colors = itertools.cycle(COLORS)
-            for name, path, color in zip(
-                self.names, self.actuators, colors, strict=False
-            ):
+            for name, path, color in zip(self.names, self.actuators, colors, strict=False):
                 lines.append(Line(name, path, color, 1.6))
             return lines
         for segment in sorted({*self.segments}):
@@ -384,9 +370,7 @@ class BackboneDisplay(Display):
             space.plot(*points.T, label=plot_label(line.label) or None, **line.look())
         if self.disks.size:
             disks = scale * self.disks[0]
-            space.add_collection3d(
-                Poly3DCollection(disks, alpha=0.15, facecolor="0.5", lw=0.0)
-            )
+            space.add_collection3d(Poly3DCollection(disks, alpha=0.15, facecolor="0.5", lw=0.0))
         if len(self.frames):
             self._draw_frames(space, self.frames[0], scale)
 

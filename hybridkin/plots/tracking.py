@@ -121,15 +121,11 @@ class TrackingDisplay(Display):
         reached = {}
         for name, track in tracks.items():
             if not np.array_equal(plain(track.target), target, equal_nan=True):
-                raise ValueError(
-                    "`tracks` must follow one path, got different targets."
-                )
+                raise ValueError("`tracks` must follow one path, got different targets.")
             reached[name] = track.x if track.x_measured is None else track.x_measured
         return cls(target, reached, first.t)
 
-    def plot(
-        self, ax: Axes | None = None, *, unit: str = "cm", plane: str = "xy"
-    ) -> Self:
+    def plot(self, ax: Axes | None = None, *, unit: str = "cm", plane: str = "xy") -> Self:
         """Draw the paths in one plane of the task space and return self.
 
         Parameters
@@ -223,9 +219,7 @@ class TrackingDisplay(Display):
             if finite.size:
                 least.append(finite.min())
                 label = f"{label}: {finite.mean():.3g} {unit}"
-            ax.plot(
-                steps, level, color="black", linestyle=style, label=plot_label(label)
-            )
+            ax.plot(steps, level, color="black", linestyle=style, label=plot_label(label))
         if least:
             ax.set_yscale("log")
             ax.set_ylim(bottom=max(ax.get_ylim()[0], 1e-4 * min(least)))
@@ -236,9 +230,7 @@ class TrackingDisplay(Display):
 
     def _looks(self) -> list[tuple[str, NDArray, dict[str, Any]]]:
         """Return name, tips and look of every track."""
-        return [
-            *zip(self.tracks, self.tracks.values(), looks_of(self.tracks), strict=True)
-        ]
+        return [*zip(self.tracks, self.tracks.values(), looks_of(self.tracks), strict=True)]
 
     def _summary(self, name: str, scale: float, unit: str) -> str:
         error = scale * distance(self.tracks[name], self.target)
@@ -281,13 +273,9 @@ class ActuatorDisplay:
         limits: ArrayLike | None = None,
     ) -> None:
         counts = np.ravel(np.asarray(actuators_per_segment, dtype=object))
-        self.actuators_per_segment = tuple(
-            whole(k, "actuators_per_segment") for k in counts
-        )
+        self.actuators_per_segment = tuple(whole(k, "actuators_per_segment") for k in counts)
         n = sum(self.actuators_per_segment)
-        self.paths = {
-            name: plain(q, "paths") for name, q in named(paths, "paths").items()
-        }
+        self.paths = {name: plain(q, "paths") for name, q in named(paths, "paths").items()}
         rows = next(iter(self.paths.values())).shape[:1]
         for name, q in self.paths.items():
             if q.shape != (*rows, n):
@@ -358,15 +346,11 @@ class ActuatorDisplay:
         else:
             size = plain(per_unit, "per_unit")
             if size.shape not in ((), (sum(counts),)) or not size.all():
-                raise ValueError(
-                    f"`per_unit` must be one or (n,) numbers, not 0, got {per_unit}."
-                )
+                raise ValueError(f"`per_unit` must be one or (n,) numbers, not 0, got {per_unit}.")
             scale = 1.0 / size
         if axes is None:
             size = (6.0, 1.0 + 1.6 * n)
-            _, axes = plt.subplots(
-                n, 1, figsize=size, sharex=True, layout="constrained"
-            )
+            _, axes = plt.subplots(n, 1, figsize=size, sharex=True, layout="constrained")
         axes = np.ravel(np.asarray(axes, dtype=object))
         if len(axes) != n:
             raise ValueError(f"`axes` must hold {n} axes, got {len(axes)}.")

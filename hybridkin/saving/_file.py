@@ -89,9 +89,7 @@ class _Unpacker:
         entries = {name: header[name] for name in _KINDS}
         for name, kind in _KINDS.items():
             if type(entries[name]) is not kind:
-                raise ValueError(
-                    f"`{name}` must be a {kind.__name__}, got {entries[name]!r:.60}"
-                )
+                raise ValueError(f"`{name}` must be a {kind.__name__}, got {entries[name]!r:.60}")
         text = json.dumps(entries, sort_keys=True)
         if text not in self._described:
             stored = Stored(header["kind"], header["settings"])
@@ -111,24 +109,18 @@ def unpacked(header: Header, arrays: Arrays) -> Stored:
     for name, array in arrays.items():
         numbers = array[np.isfinite(array)]
         if not countable(numbers).all():
-            raise ValueError(
-                f"the numbers of {name!r:.60} must be less than {LARGEST:g}"
-            )
+            raise ValueError(f"the numbers of {name!r:.60} must be less than {LARGEST:g}")
     return _Unpacker(arrays).described(header)
 
 
 def write(path: Path, header: Header, arrays: Arrays) -> None:
     """Write header and arrays to a file with `write_file`; equal content gives equal bytes."""
     text = json.dumps({"format": FORMAT, "version": VERSION, **header}, allow_nan=False)
-    whole = {
-        name: np.array(array, order="C", ndmin=0) for name, array in arrays.items()
-    }
+    whole = {name: np.array(array, order="C", ndmin=0) for name, array in arrays.items()}
     content = save(whole, metadata={_HEADER: text, _CHECKSUM: _checksum(text, whole)})
     # safetensors writes its metadata in random order.
     end = 8 + int.from_bytes(content[:8], "little")
-    head = json.dumps(
-        json.loads(content[8:end]), sort_keys=True, separators=(",", ":")
-    ).encode()
+    head = json.dumps(json.loads(content[8:end]), sort_keys=True, separators=(",", ":")).encode()
     head += b" " * (-len(head) % 8)
 
     def write_parts(staging: Path) -> None:
@@ -141,24 +133,16 @@ def write(path: Path, header: Header, arrays: Arrays) -> None:
 def read(path: Path) -> tuple[Header, Arrays]:
     """Return header and arrays of a file; raise if it is damaged or of another version."""
     if not path.is_file():
-        raise FileNotFoundError(
-            f"`path` must name a saved model, got {path}, which is no file."
-        )
+        raise FileNotFoundError(f"`path` must name a saved model, got {path}, which is no file.")
     try:
         with safe_open(path, framework="numpy") as file:
             metadata = file.metadata() or {}
-            header: Header = dict(
-                json.loads(metadata[_HEADER], parse_constant=_refused)
-            )
+            header: Header = dict(json.loads(metadata[_HEADER], parse_constant=_refused))
             arrays = {name: file.get_tensor(name) for name in file.keys()}
     except _UNREADABLE as error:
-        raise ValueError(
-            f"{path} is not a model saved by hybridkin ({error!r})."
-        ) from error
+        raise ValueError(f"{path} is not a model saved by hybridkin ({error!r}).") from error
     if header.get("format") != FORMAT:
-        raise ValueError(
-            f"{path} is not a model saved by hybridkin: its header does not match."
-        )
+        raise ValueError(f"{path} is not a model saved by hybridkin: its header does not match.")
     if header.get("version") != VERSION:
         raise ValueError(
             f"{path} has format version {header.get('version')!r:.40}, but this hybridkin reads "

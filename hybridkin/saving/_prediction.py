@@ -67,9 +67,7 @@ def check_prediction(model: Any, prediction: object) -> None:
         far = relative * (1.0 + distance) * 10.0
         _check_equal(rows, distance, wanted, far, "the file says of the domain")
     if program_of(module) is not None:
-        by_core, J_by_core, far_by_core = evaluate(
-            module, rows, jacobian=True, distance=True
-        )
+        by_core, J_by_core, far_by_core = evaluate(module, rows, jacobian=True, distance=True)
         _check_finite(rows, by_core, J_by_core, far_by_core)
         _check_equal(rows, x, by_core, tolerance, "the compiled core")
 
@@ -123,9 +121,7 @@ def _rounded(values: NDArray) -> Any:
 def _numbers(stored: Stored, name: str, shape: tuple[int, ...]) -> NDArray:
     values = np.array(stored.value(name, list), dtype=np.float64)
     if values.shape != shape or not np.isfinite(values).all():
-        raise ValueError(
-            f"`{name}` of the stored prediction must be finite and have shape {shape}"
-        )
+        raise ValueError(f"`{name}` of the stored prediction must be finite and have shape {shape}")
     return values
 
 

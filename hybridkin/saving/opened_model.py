@@ -82,8 +82,11 @@ def _described(path: Path) -> HybridForwardModel:
 def _saved(path: Path, robot: str | Path | None) -> HybridForwardModel:
     """Return the model of a file."""
     if path.suffix.lower() in LOG_SUFFIXES:
-        raise ValueError(
-            f"`model` must be a model or a robot description, got the log {path}."
+        raise ValueError(f"`model` must be a model or a robot description, got the log {path}.")
+    if not path.is_file():
+        raise FileNotFoundError(
+            "`model` must be a saved model, the folder of a fit or a robot description, but there "
+            f"is no file {path}."
         )
     opened = load_model(path)
     if not isinstance(opened, HybridForwardModel):

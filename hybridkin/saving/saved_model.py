@@ -169,9 +169,7 @@ def load_model(path: str | Path, *, device: str | torch.device | None = None) ->
 def _check_fitted_to_rows(model: HybridForwardModel) -> None:
     """Raise if no rows were fitted to a model."""
     if "module_" in vars(model) and not np.isfinite(model.training_range_.low).all():
-        raise ValueError(
-            "`model` was not fitted to rows; save its `mechanical_model`, the chain."
-        )
+        raise ValueError("`model` was not fitted to rows; save its `mechanical_model`, the chain.")
 
 
 def _checked(training: Mapping[str, object] | None) -> Header:
@@ -198,12 +196,8 @@ def _check_domain(model: HybridForwardModel, domain: object) -> None:
     ranges = _domain(model)
     for name in ("q_low", "q_high"):
         found, wanted = ranges[name], domain.get(name)
-        if not np.allclose(
-            np.array(wanted, dtype=float), found, rtol=1e-9, atol=1e-300
-        ):
-            raise ValueError(
-                f"`{name}` of the domain is {wanted}, but {found} of the model"
-            )
+        if not np.allclose(np.array(wanted, dtype=float), found, rtol=1e-9, atol=1e-300):
+            raise ValueError(f"`{name}` of the domain is {wanted}, but {found} of the model")
 
 
 def _domain(model: HybridForwardModel) -> Header:

@@ -10,7 +10,7 @@ from torch.testing import assert_close
 
 from hybridkin import ConstantCurvatureChain, RigidChain, calibrate
 from hybridkin.calibration._initial_guesses import aligned
-from hybridkin.calibration._least_squares import LOSSES, Rows
+from hybridkin.calibration._least_squares import LOSSES, TipRows
 from hybridkin.calibration._parameters import Problem
 from hybridkin.calibration._search import Start
 from hybridkin.calibration.calibrate import fit_geometry, refitted
@@ -303,7 +303,7 @@ def test_the_guess_of_the_base_ignores_rows_of_no_weight(rng):
     x = truth(q)
     x[::2] += gauss(rng, 10, 3)
     weights = (torch.arange(20) % 2).double()
-    base = aligned(trunk(), Rows(q, x, weights)).geometry()["base"]
+    base = aligned(trunk(), TipRows(q, x, weights)).geometry()["base"]
     assert_close(base, planted_base(), rtol=0, atol=1e-9)
 
 

@@ -111,6 +111,9 @@ def test_turning_base_and_gravity_turns_the_tip():
     base[:3, :3] = turn
     turned = chain(base=base, gravity=turn @ DOWN)
     assert_close(turned(forces()), chain()(forces()) @ turn.double().T, rtol=0, atol=1e-7)
+    moved = chain().moved(base)
+    assert_close(moved(forces()), turned(forces()), rtol=0, atol=1e-7)
+    assert_close(torch.tensor(moved.gravity).norm(), torch.tensor(1.0))
 
 
 def test_jacobian_is_that_of_torch_and_of_differences():

@@ -1,11 +1,13 @@
 """Data frames of pandas, polars and pyarrow give the log that a file gives."""
 
 import datetime
+import inspect
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from hybridkin import robots
 from hybridkin.datasets import Log, load_log
 
 N = 8
@@ -124,3 +126,17 @@ def test_frames_are_not_changed(library):
     log = Log.from_frame(frame, **NAMES, missing=[9999.0], drop_invalid=True)
     assert log.invalid_lines.tolist() == [2]
     assert np.asarray(frame["X"])[2] == 9999.0
+
+
+def test_an_argument_of_reading_is_one_of_all_that_read():
+    """A file, a data frame, and the format of a robot's logs have the same ones."""
+    path, *of_file = inspect.signature(load_log).parameters.values()
+    frame, *of_frame = inspect.signature(Log.from_frame).parameters.values()
+    assert (path.name, frame.name) == ("path", "df")
+    assert of_file == of_frame
+    of_format = inspect.signature(robots.LogFormat).parameters.values()
+    assert [one for one in of_format if one.name != "group_suffix"] == of_file
+    with pytest.raises(TypeError, match=r"^load_log\(\) got an unexpected keyword argument 'unit'"):
+        load_log("log.csv", ["a"], ["X", "Y", "Z"], unit="mm")
+    with pytest.raises(TypeError, match=r"^from_frame\(\) missing a required argument: 'x'"):
+        Log.from_frame(columns(), ["a"])

@@ -12,12 +12,11 @@ from sklearn.base import BaseEstimator, RegressorMixin
 
 from hybridkin import ConstantCurvatureChain, HybridForwardModel
 from hybridkin._core.groups import Groups
-from hybridkin.hybrid._adapt import _Problem
+from hybridkin.hybrid._adapt import _ChangeProblem
 from hybridkin.hybrid._drift import MISFITS, SWITCH, Drift
 from hybridkin.hybrid._error_models import NoCorrection
 from hybridkin.hybrid._features import Features
-from hybridkin.hybrid._readout_fit import _Problem as ReadoutProblem
-from hybridkin.hybrid._readout_fit import fit_readout
+from hybridkin.hybrid._readout_fit import _ReadoutProblem, fit_readout
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._selection import _is_small
 from hybridkin.hybrid._spec import Spec
@@ -269,7 +268,7 @@ def test_the_likeliest_noise_is_that_of_the_normal_density():
     counts = torch.randint(1, 4, (30,), generator=generator).double()
     J = CHAIN.forward_and_jacobian(q)[1]
     groups = Groups.rows(len(q))
-    problem = ReadoutProblem(CHAIN, Features.of_range(q), q, q[:, :3], counts, groups, True)
+    problem = _ReadoutProblem(CHAIN, Features.of_range(q), q, q[:, :3], counts, groups, True)
     spread = torch.linalg.eigvalsh(J @ J.mT)
     mean = float((counts[:, None] * spread).sum() / (3.0 * counts.sum()))
     ratios = mean * np.logspace(-2, 4, 25)
@@ -297,9 +296,9 @@ def test_the_derivative_of_a_pose_by_a_change_of_the_robot():
     theta = rng.uniform(-0.2, 0.2, 9)
     scale = np.full(3, 0.01)
     with torch.no_grad():
-        change = _Problem(fitted, rows, scale).change(theta)
+        change = _ChangeProblem(fitted, rows, scale).change(theta)
         y = PoseRows(change.after(fitted))(q).numpy()
-    problem = _Problem(fitted, replace(rows, y=y), scale)
+    problem = _ChangeProblem(fitted, replace(rows, y=y), scale)
     residual, A = problem.linearised(theta)
     assert_allclose(residual, 0.0, atol=1e-9)
     for k in range(9):

@@ -18,6 +18,7 @@ from hybridkin.hybrid._fit import fit_hybrid
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._selection import Auto, Settled
 from hybridkin.hybrid._spec import Spec
+from hybridkin.hybrid.log_fit import fit_once
 
 CHAIN = ConstantCurvatureChain([0.05])
 NETWORK = ELMRegressorCV(40, weight_scales=(0.4,), relevance_rounds=0, max_hidden=0, random_state=0)
@@ -194,3 +195,10 @@ def test_names_of_motions_and_the_order_of_rows_do_not_matter(choice, monkeypatc
     assert_array_equal(other.in_domain(new), one.in_domain(new))
     assert other._fit.error.noise == pytest.approx(one._fit.error.noise, rel=1e-6)
     assert np.abs(one.predict_error(new)).max() > 5e-3
+
+
+def test_a_fit_tells_how_many_candidates_are_fitted():
+    q, x, _, _ = learnable()
+    told = []
+    fit_once(Spec(CHAIN, FewAtTip(0), guard=None), Rows.of(q, x), lambda *of: told.append(of))
+    assert told == [(1, 3), (2, 3), (3, 3)]

@@ -13,7 +13,7 @@ from hybridkin.hybrid._linearised import (
     design,
 )
 from hybridkin.hybrid._module import HybridModule, InnerCorrection, TipCorrection
-from hybridkin.hybrid._readout_fit import _Problem, fit_readout
+from hybridkin.hybrid._readout_fit import _ReadoutProblem, fit_readout
 from hybridkin.hybrid._rows import Rows
 
 
@@ -100,7 +100,7 @@ def test_gradient_is_zero_at_the_optimum(robot, kind, rng):
     )
     assert fit.gradient < 1e-7
     # By autograd, in the problem's own variables, and no neighbour is better.
-    problem = _Problem(chain, fit.readout.features, q, x, weight, serial=True)
+    problem = _ReadoutProblem(chain, fit.readout.features, q, x, weight, Groups.rows(80), True)
     penalty = problem.penalty((0.03, 0.3))
     readout, _ = problem.minimum(problem.nothing, penalty)
 

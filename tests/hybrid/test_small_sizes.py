@@ -78,6 +78,7 @@ def test_a_single_coordinate_or_output_in_the_selection(n, m):
     assert model.jacobian(q).shape == (len(q), m, n)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("coupling", "name"), PAIRS)
 def test_one_row_is_refused_and_few_rows_warn(coupling, name):
     q, x = log_of(3, 2)

@@ -60,6 +60,7 @@ def fitted(operator, **settings):
     return model.fit(commands, x, groups=commands.runs)
 
 
+@pytest.mark.slow
 def test_runs_that_begin_elsewhere_are_outside_the_domain(tmp_path):
     model = fitted(FRICTION, coverage=0.9)
     assert model.in_domain(motions(8, seed=2)).mean() > 0.9
@@ -110,6 +111,7 @@ def at_pace(commands, speed):
     return Commands(commands.q, commands.runs, commands.time / speed)
 
 
+@pytest.mark.slow
 def test_paces_that_the_log_lacks_are_outside_the_domain(tmp_path):
     """With creep; friction and backlash do not know how fast they are moved."""
     new = motions(8, seed=2)

@@ -200,6 +200,7 @@ def test_structural_hybrid_of_the_shipped_trunk():
         assert_close(J[..., k], slope, atol=1e-4, rtol=0.0)
 
 
+@pytest.mark.slow
 def test_auto_stands_on_the_structure_where_it_helps():
     q = motions(TRUNK, 30)
     true = with_errors(TRUNK, q)

@@ -70,6 +70,7 @@ def test_nothing_is_learned_from_one_posture(coupling, error_model, guard):
     assert model.error_model_ is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "guard"), PAIRS)
 @pytest.mark.parametrize(("coupling", "error_model"), MODELS, ids=str)
 def test_corrections_are_constant_where_no_row_moves(coupling, error_model, kind, guard):

@@ -39,6 +39,7 @@ def keeps_limits(ik, commands):
     return abs(commands).max() <= 0.01 and fast and sudden
 
 
+@pytest.mark.slow
 @pytest.mark.needs_core
 @pytest.mark.parametrize("start", [0.0, 0.005])  # straight; all tendons slack
 @pytest.mark.parametrize("way", WAYS)

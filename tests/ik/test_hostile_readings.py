@@ -106,7 +106,7 @@ class Exported:
 
     def __init__(self, ik, q, folder, delay):
         native.export_c(ik, folder, name="robot")
-        command = ["cc", "-std=c99", "-O2", "-shared", "-fPIC", "robot.c", "-o", "robot.so", "-lm"]
+        command = ["cc", "-std=c99", "-O0", "-shared", "-fPIC", "robot.c", "-o", "robot.so", "-lm"]
         subprocess.run(command, cwd=folder, check=True)
         self.library = ctypes.CDLL(str(folder / "robot.so"))
         self.state = State()

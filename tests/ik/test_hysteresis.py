@@ -21,6 +21,9 @@ LIMITS = {
     "acceleration": {"dq_max": 0.2, "ddq_max": 1.0},
 }
 KINDS = pytest.mark.parametrize("kind", OPERATORS)
+WITHIN = pytest.mark.parametrize(
+    "limits", ["free", "speed", pytest.param("acceleration", marks=pytest.mark.slow)]
+)
 
 
 def ik_of(operator, **settings):
@@ -40,7 +43,7 @@ def circle(n):
 
 
 @KINDS
-@pytest.mark.parametrize("limits", LIMITS)
+@WITHIN
 @pytest.mark.parametrize("backend", ["core", "torch"])
 def test_commands_keep_the_limits_and_the_state_is_theirs(kind, limits, backend):
     settings = LIMITS[limits]
@@ -84,13 +87,13 @@ def put_where(reference, core):
 
 @pytest.mark.needs_core
 @KINDS
-@pytest.mark.parametrize("limits", LIMITS)
+@WITHIN
 def test_the_core_commands_what_torch_does(kind, limits):
     ik = ik_of(OPERATORS[kind], **LIMITS[limits])
     core = ik.tracker(HOME)
     reference = ik.tracker(torch.from_numpy(HOME))
     assert core.backend == "compiled"
-    for target in targets(400 if limits == "acceleration" else 80):
+    for target in targets(120 if limits == "acceleration" else 80):
         put_where(reference, core)
         before = core.q
         command = core.step(target)
@@ -102,6 +105,7 @@ def test_the_core_commands_what_torch_does(kind, limits):
         assert core.status == reference.status
 
 
+@pytest.mark.slow
 @pytest.mark.needs_core
 @KINDS
 def test_the_core_follows_a_path_as_torch_does(kind):

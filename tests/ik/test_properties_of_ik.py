@@ -7,6 +7,7 @@ compiled core, by 1e-12 in torch, where sums of a batch are taken in another ord
 import warnings
 
 import numpy as np
+import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -207,6 +208,7 @@ def test_a_tracker_stays_within_the_limits_whatever_comes(case, memory, in_torch
         before = command
 
 
+@pytest.mark.slow
 @given(st.data(), solvers(), st.sampled_from([0, 1]), st.sampled_from([None, None, 2]))
 def test_a_solution_stays_within_the_limits_whatever_is_asked(data, case, restarts, places):
     name, ik = case

@@ -96,6 +96,7 @@ def test_a_target_that_moves_out_and_in_again_is_followed():
     assert max(errors) < 0.012  # of 10 mm beyond reach
 
 
+@pytest.mark.slow
 @pytest.mark.needs_core
 @pytest.mark.parametrize("speed", SPEEDS)
 @pytest.mark.parametrize("name", ROBOTS)

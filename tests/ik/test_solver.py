@@ -76,7 +76,13 @@ def test_a_limited_step_is_the_optimum_of_a_reference_qp(rng, relative, m):
     upper[::11, 3] = lower[::11, 3]
     damping_sq = relative * row_gram(J).sigma_max ** 2
     dq, mu = damped_step(
-        J, v, z, damping_sq.sqrt(), StepLimits.of_bounds(lower, upper, z), torch.zeros(N).double(), 0.0 * v
+        J,
+        v,
+        z,
+        damping_sq.sqrt(),
+        StepLimits.of_bounds(lower, upper, z),
+        torch.zeros(N).double(),
+        0.0 * v,
     )
     assert ((dq >= lower) & (dq <= upper)).all()
     assert_close(damping_sq[:, None] * mu, v - apply_rows(J, dq), rtol=0.0, atol=1e-8)
@@ -395,6 +401,7 @@ class TwoRegions(ForwardModel):
         return torch.where(near | (q[..., 3] > 0.4), 0.5, 2.0).to(q)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("as_numpy", [True, False])
 def test_a_track_without_a_start_stays_in_the_domain(as_numpy):
     path = torch.linspace(0.0, 0.3, 61)[:, None] * torch.tensor(

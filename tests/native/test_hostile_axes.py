@@ -78,7 +78,7 @@ def test_the_code_uses_positions_alone_as_python(tmp_path, name):
     native.export_c(controller, tmp_path, name="robot")
     source = MAIN % (in_c(start), in_c(targets), in_c(readings), STEPS)
     (tmp_path / "main.c").write_text("#include <math.h>\n" + source)
-    build = "cc -std=c99 -O2 main.c robot.c -lm -o main"
+    build = "cc -std=c99 -O0 main.c robot.c -lm -o main"
     subprocess.run(build.split(), cwd=tmp_path, check=True)
     found = np.loadtxt(subprocess.check_output([tmp_path / "main"], text=True).splitlines())
     close = rounding.of_commands(commands)

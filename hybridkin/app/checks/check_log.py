@@ -153,7 +153,5 @@ def _invalid_rows(log: Log, valid: NDArray, drop_invalid: bool) -> Iterator[LogF
         message += "; they were left out."
         yield LogFinding("invalid", "warning", message, advice)
     else:
-        advice = (
-            "correct them, or leave them out with --drop-invalid (drop_invalid=True)."
-        )
+        advice = "correct them, or leave them out with --drop-invalid (drop_invalid=True)."
         yield LogFinding("invalid", "error", f"{message}.", advice, invalid)

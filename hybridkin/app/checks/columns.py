@@ -17,9 +17,7 @@ from hybridkin.formats import FRAMES, duration_in_words, in_terms, named_places
 _FROZEN_ROWS = 3  # fewer rows may be chance
 _FROZEN_WAY = 0.1  # part of an actuator's range over which the tip must have moved
 _OFTEN_STILL = 0.2  # part of the rows: a coordinate that rests so often is no sensor
-_ABRUPT = (
-    3.0  # least change before or after a rest that is no rounding, in smallest changes
-)
+_ABRUPT = 3.0  # least change before or after a rest that is no rounding, in smallest changes
 _RESTS = 0.05  # the same for an actuator, elsewhere
 _JUMP = 3.0  # relative to the 90 % quantile of the steps
 _MANY_ROWS = 1000  # of longer logs chance gives larger jumps
@@ -93,9 +91,7 @@ def frozen_tip(rows: LogRows) -> Iterator[LogFinding]:
             yield _frozen_sensor(rows, f"column {name!r}", frozen, "warning")
 
 
-def _frozen_sensor(
-    rows: LogRows, what: str, frozen: NDArray, severity: str
-) -> LogFinding:
+def _frozen_sensor(rows: LogRows, what: str, frozen: NDArray, severity: str) -> LogFinding:
     message = (
         f"{what} does not change at all in {len(frozen)} rows while the actuators move "
         f"({rows.named(frozen)}): the sensor was frozen or lost the marker."
@@ -203,9 +199,7 @@ def same_columns(rows: LogRows) -> Iterator[LogFinding]:
     columns = [*rows.columns("q"), *rows.columns("x")]
     for (first, a), (second, b) in itertools.combinations(columns, 2):
         if np.ptp(a) > 0 and (a == b).all():
-            message = (
-                f"columns {first!r} and {second!r} hold the same values in all rows."
-            )
+            message = f"columns {first!r} and {second!r} hold the same values in all rows."
             advice = "check the names of the columns; equal actuators cannot be distinguished."
             yield rows.finding("same column", message, advice)
 
@@ -222,12 +216,8 @@ def duplicates(rows: LogRows) -> Iterator[LogFinding]:
         n_across = (groups[copies] != groups[original[copies]]).sum()
         if n_across:
             message += f", {n_across} of them in another motion"
-    advice = (
-        "delete them: copies in training and test rows make held-out errors too small."
-    )
-    yield rows.finding(
-        "duplicates", f"{message} ({rows.named(copies)}).", advice, copies
-    )
+    advice = "delete them: copies in training and test rows make held-out errors too small."
+    yield rows.finding("duplicates", f"{message} ({rows.named(copies)}).", advice, copies)
 
 
 def _first_equal(values: NDArray) -> NDArray:
@@ -331,9 +321,7 @@ def times(rows: LogRows) -> Iterator[LogFinding]:
             f"{duration_in_words(steps[is_gap].max())}; the usual step is "
             f"{duration_in_words(usual)} ({rows.named(gaps)})."
         )
-        advice = (
-            "rows were lost or the robot waited; if it was touched, name two motions."
-        )
+        advice = "rows were lost or the robot waited; if it was touched, name two motions."
         yield rows.finding("time", message, advice, gaps)
 
 

@@ -42,6 +42,7 @@ from hybridkin.app.checks.order import (
 from hybridkin.app.checks.report import LogFinding
 from hybridkin.datasets import Log
 from hybridkin.formats import METRES, in_terms
+from hybridkin.native import evaluate
 
 if TYPE_CHECKING:
     from hybridkin import LengthDrivenChain, robots
@@ -67,15 +68,11 @@ _GOOD = 0.55  # relative error of another reading
 _ENOUGH = 0.85  # explained part of the variance
 _TWIST = 120.0  # [deg] least rotation of a base about its axis
 _TILT = 45.0  # [deg] largest tilt of a base
-_FAR_FEWER = (
-    0.6  # error of many changes relative to that of one, from which they are named
-)
+_FAR_FEWER = 0.6  # error of many changes relative to that of one, from which they are named
 _WORTH = 0.3  # relative error from which columns of q and x may be exchanged
 _UNBALANCED = 0.1  # the same, from which tendons are not in balance
 _MOST_FLIPPED = 3  # signs that balance can correct
-_BALANCED = (
-    0.02  # of the spread of the tendons: motion along a direction that counts as none
-)
+_BALANCED = 0.02  # of the spread of the tendons: motion along a direction that counts as none
 _SHIFTED = 0.87  # relative error; for clean logs, simulated and real, it was above 0.89
 _ADVICE = {
     "axes": "check order and signs of the columns of x, which must be right-handed, and [base] of "
@@ -97,9 +94,7 @@ _ADVICE = {
 }
 
 
-def geometry_findings(
-    log: Log, chain: LengthDrivenChain, base_is_free: bool
-) -> list[LogFinding]:
+def geometry_findings(log: Log, chain: LengthDrivenChain, base_is_free: bool) -> list[LogFinding]:
     """Return contradictions to the chain: those of the first check that finds any."""
     findings = [*_negated_zeros(log, chain)]
     if findings:
@@ -128,9 +123,7 @@ def _in_metres(log: Log, chain: LengthDrivenChain) -> tuple[Log, LengthDrivenCha
     plain = {"gains": torch.ones_like(chain.gains)}
     if "actuator_zeros" in chain.geometry():
         plain["actuator_zeros"] = torch.zeros_like(chain.gains)
-    return replace(log, q=q, units={**log.units, "q": "m"}), chain.with_geometry(
-        **plain
-    )
+    return replace(log, q=q, units={**log.units, "q": "m"}), chain.with_geometry(**plain)
 
 
 class _Comparison:
@@ -201,6 +194,7 @@ class _Comparison:
             rows=np.arange(n_rows),
             x=self.few_x,
             model=self.chain,
+            path=evaluate(self.chain, q)[0],
             bodies=[self.chain],
             actuators=Actuators(self.q_names, "mm", per_unit, self.layout),
             inside=np.ones(n_rows, dtype=bool),
@@ -350,8 +344,7 @@ def _wrong_units(comparison: _Comparison) -> Iterator[LogFinding]:
             f"{radii.max():g} m, which look like millimetres; q and x do not fit to them."
         )
         advice = (
-            "give radii, lengths and offsets of the description in metres: "
-            "divide them by 1000."
+            "give radii, lengths and offsets of the description in metres: divide them by 1000."
         )
         yield LogFinding("units", "error", message, advice)
         return
@@ -404,9 +397,7 @@ def _unit_finding(name: str, what: str, unit: str, factor: float) -> LogFinding:
             looks = f"these look like {words}"
             remedy = f'set {name}_unit = "{other}" {where} {other}'
     message = f"columns of {name} are declared as {unit}, but {what}; {looks}."
-    advice = (
-        f"{remedy}; or correct the radii and lengths of the description, in metres."
-    )
+    advice = f"{remedy}; or correct the radii and lengths of the description, in metres."
     return LogFinding("units", "error", message, advice)
 
 
@@ -506,9 +497,7 @@ def _few_changes(layout: robots.ActuatorLayout) -> Iterator[list[NDArray]]:
 def _misread_columns(comparison: _Comparison) -> Iterator[LogFinding]:
     """Yield another numbering, order or signs of the columns of q that explain far more."""
     way, error = comparison.reading
-    limit = min(
-        comparison.good_error, comparison.better_values * comparison.declared_error
-    )
+    limit = min(comparison.good_error, comparison.better_values * comparison.declared_error)
     many, error_of_many = comparison.better_way
     if error_of_many < _FAR_FEWER * error and comparison.keeps_balance(many):
         way = many
@@ -584,8 +573,7 @@ def _changed_values(comparison: _Comparison) -> Iterator[LogFinding]:
     kind, _, words = _VALUES[type(best.cause)]
     ratio = best.mean / compared.nothing.mean
     message = (
-        f"the error of the nominal model falls to {100 * ratio:.0f} % if "
-        f"{words(comparison, best)}."
+        f"the error of the nominal model falls to {100 * ratio:.0f} % if {words(comparison, best)}."
     )
     yield LogFinding(kind, "warning", message, _ADVICE[kind])
 
@@ -607,9 +595,7 @@ def _unexplained(comparison: _Comparison) -> Iterator[LogFinding]:
     """Yield a finding if the chain explains little of the motion of the tip."""
     error = comparison.declared_error
     if 1 - error**2 < _ENOUGH:
-        explained = (
-            f"{_explained(error)} of the tip's motion, in any order and sign of q"
-        )
+        explained = f"{_explained(error)} of the tip's motion, in any order and sign of q"
         message = f"the nominal model explains only {explained}."
         yield LogFinding("geometry", "warning", message, _ADVICE["geometry"])
 

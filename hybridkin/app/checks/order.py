@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from hybridkin.app.checks.rotations import nearest_turn
+from hybridkin.rotations import nearest_rotation
 
 if TYPE_CHECKING:
     from hybridkin import LengthDrivenChain
@@ -73,9 +73,7 @@ def other_direction(counts: Sequence[int]) -> list[int]:
     return order
 
 
-def _reordered(
-    declared: NDArray, columns: Sequence[int], order: Sequence[int]
-) -> NDArray:
+def _reordered(declared: NDArray, columns: Sequence[int], order: Sequence[int]) -> NDArray:
     """Return the way with some columns in another order."""
     way = declared.copy()
     way[:, columns] = declared[:, order]
@@ -91,9 +89,7 @@ def _segments_listed(counts: Sequence[int], listed: Sequence[int]) -> list[int]:
     return order
 
 
-def misses(
-    chain: LengthDrivenChain, qs: NDArray, x: NDArray, base_is_free: bool
-) -> NDArray:
+def misses(chain: LengthDrivenChain, qs: NDArray, x: NDArray, base_is_free: bool) -> NDArray:
     """Return for each q (N, n) of qs (K, N, n) the relative error of the chain's tips.
 
     This is the rms distance of the tips x (N, 3) from those of the chain, after the best shift (for
@@ -101,7 +97,7 @@ def misses(
     """
     tips, measured = _centred(chain, qs, x)
     if base_is_free:
-        turn, trace = nearest_turn(measured.T @ tips)
+        turn, trace = nearest_rotation(measured.T @ tips)
         size = np.square(tips).sum(axis=(-2, -1)).clip(min=np.finfo(float).tiny)
         tips = (trace / size)[:, None, None] * tips @ turn.swapaxes(-2, -1)
     squared_error = np.square(tips - measured).sum(axis=-1).mean(axis=-1)
@@ -113,7 +109,7 @@ def base_turn(chain: LengthDrivenChain, q: NDArray, x: NDArray) -> tuple[float, 
     """Return the rotation of the base about its axis that fits the tips, and its tilt [deg]."""
     tips, measured = _centred(chain, q[None], x)
     base = chain.base[:3, :3].numpy(force=True).astype(float)
-    motion, _ = nearest_turn(measured.T @ tips[0])
+    motion, _ = nearest_rotation(measured.T @ tips[0])
     turn = base.T @ motion @ base
     sine = turn[1, 0] - turn[0, 1]
     cosine = turn[0, 0] + turn[1, 1]
@@ -122,9 +118,7 @@ def base_turn(chain: LengthDrivenChain, q: NDArray, x: NDArray) -> tuple[float, 
     return float(np.degrees(twist)), float(np.degrees(tilt))
 
 
-def _centred(
-    chain: LengthDrivenChain, qs: NDArray, x: NDArray
-) -> tuple[NDArray, NDArray]:
+def _centred(chain: LengthDrivenChain, qs: NDArray, x: NDArray) -> tuple[NDArray, NDArray]:
     """Return the tips (K, N, 3) of the chain and the measured ones, each minus their mean."""
     rows = torch.from_numpy(np.ascontiguousarray(qs, dtype=np.float64))
     with torch.no_grad():

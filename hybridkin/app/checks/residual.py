@@ -24,9 +24,7 @@ _LAG = 0.6
 _MOST = 50_000  # rows of a fit
 
 
-def residual_findings(
-    log: Log, chain: ForwardModel | None, same: NDArray
-) -> Iterator[LogFinding]:
+def residual_findings(log: Log, chain: ForwardModel | None, same: NDArray) -> Iterator[LogFinding]:
     """Yield findings on a drift of the tip and on lags.
 
     Parameters

@@ -13,7 +13,9 @@ import hybridkin
 from hybridkin.formats import write_file
 
 if TYPE_CHECKING:
-    from hybridkin.app.workflow import FitRecord, Report, TrackRecord
+    from hybridkin.app.workflow import Report
+    from hybridkin.app.workflow.fit_record import FitRecord
+    from hybridkin.app.workflow.track import TrackRecord
 
 _ROWS = 240
 _BLOCK = 12
@@ -24,9 +26,7 @@ def write_log(path: Path) -> None:
     """Write postures of the simulated trunk, lengths and tips in millimetres."""
     data = hybridkin.datasets.load_trunk()
     rows = np.flatnonzero(data.part == 3)[:_ROWS]  # where all segments move
-    table = np.column_stack(
-        [np.arange(_ROWS) // _BLOCK, 1e3 * data.q[rows], 1e3 * data.x[rows]]
-    )
+    table = np.column_stack([np.arange(_ROWS) // _BLOCK, 1e3 * data.q[rows], 1e3 * data.x[rows]])
     names = "group,c1,c2,c3,c4,c5,c6,c7,c8,c9,tip_x,tip_y,tip_z"
     form = {"fmt": "%.6g", "delimiter": ",", "header": names, "comments": ""}
     write_file(path, partial(np.savetxt, X=table, **form))
@@ -54,9 +54,7 @@ def summary(out: Path, records: dict[str, Any]) -> Report[dict[str, Any]]:
     track: TrackRecord = records["track"]
     calibrated = fit.held_out[_SHOWN[1]].mean
     saved = fit.held_out[fit.saved].mean
-    report = hybridkin.app.workflow.Report(
-        "From a log to a film, on SIMULATED data", records
-    )
+    report = hybridkin.app.workflow.Report("From a log to a film, on SIMULATED data", records)
     report.text(
         f"The log comes from a physics simulator, not from a robot: {_ROWS} postures of a "
         "pneumatic trunk, three segments of three chambers, with sensor noise. A row has nine "

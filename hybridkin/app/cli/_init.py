@@ -27,7 +27,7 @@ from hybridkin.app.cli._values import (
 from hybridkin.formats import METRES, UNITS, toml_value, visible
 
 if TYPE_CHECKING:
-    from hybridkin.app.workflow import MeasuredLog
+    from hybridkin.app.workflow.log import MeasuredLog
 
 _NEEDED = object()  # the default of what must be given
 _Answers = dict[str, Any]
@@ -76,9 +76,7 @@ QUESTIONS = (
         f"length of the backbone of a segment, or of its chambers where q is 0 {_EACH}",
         in_millimetres,
     ),
-    _Question(
-        "spool_radius", f"radius of the spools of motors {_EACH}", in_millimetres, None
-    ),
+    _Question("spool_radius", f"radius of the spools of motors {_EACH}", in_millimetres, None),
     _Question("counts_per_turn", "q of a whole turn of a spool, in its unit", positive),
     _Question(
         "gain",
@@ -250,9 +248,7 @@ def with_zeros(answers: _Answers, log: MeasuredLog) -> tuple[_Answers, str]:
     unit = answers["q_unit"]
     is_length = unit in METRES
     whole_turns_off = any(f.kind == "encoder" for f in log.report.findings)
-    needless = _has_chambers(answers) or (
-        answers["kind"] != "tendons" and not is_length
-    )
+    needless = _has_chambers(answers) or (answers["kind"] != "tendons" and not is_length)
     if needless or whole_turns_off:
         return answers, ""
     span = np.ptp(log.q, axis=0)

@@ -57,9 +57,7 @@ def parser() -> argparse.ArgumentParser:
     for the mechanical model alone.
     """
     top = _Parser(prog="hybridkin", **_help(parser))
-    top.add_argument(
-        "--version", action="version", version=f"hybridkin {hybridkin.__version__}"
-    )
+    top.add_argument("--version", action="version", version=f"hybridkin {hybridkin.__version__}")
     commands = top.add_subparsers(required=True, metavar="COMMAND", dest="command")
     begin = (_demo, _merge, _init, _describe, _fit, _evaluate)
     use = (_view, _track, _verify, _animate)
@@ -343,6 +341,7 @@ def _evaluate(command: argparse.ArgumentParser) -> None:
     add(
         "--fail-above",
         type=float,
+        default=float("inf"),
         metavar="MM",
         help="exit with 1 if the mean error is larger",
     )
@@ -484,6 +483,7 @@ def _track(command: argparse.ArgumentParser) -> None:
         nargs="?",
         type=positive,
         const=True,
+        default=False,
         metavar="STEP",
         help=whole,
     )
@@ -520,9 +520,7 @@ def _verify(command: argparse.ArgumentParser) -> None:
         metavar="MEASURED",
         help="measured tips, with commands or without",
     )
-    _add_delay(
-        command, "each is compared with the command of its time (that of the track)"
-    )
+    _add_delay(command, "each is compared with the command of its time (that of the track)")
     _add_out(command, "folder for the report (none)")
     _add_log(command)
 
@@ -613,15 +611,11 @@ def _describe(command: argparse.ArgumentParser) -> None:
       hybridkin describe robot.toml
       hybridkin describe log.csv --robot robot.toml
     """
-    _add_model(
-        command, "log", "MODEL|ROBOT.toml|LOG", "model, robot description or log"
-    )
+    _add_model(command, "log", "MODEL|ROBOT.toml|LOG", "model, robot description or log")
     _add_log(command)
 
 
-def _add_out(
-    command: argparse.ArgumentParser, text: str, required: bool = False
-) -> None:
+def _add_out(command: argparse.ArgumentParser, text: str, required: bool = False) -> None:
     add = command.add_argument
     add("--out", type=Path, required=required, metavar="DIR", help=text)
 
@@ -681,9 +675,7 @@ def _add_text_form(command: argparse._ActionsContainer) -> None:
 
 
 def _add_log(command: argparse.ArgumentParser) -> None:
-    log = command.add_argument_group(
-        "log file; options replace [log] of the robot description"
-    )
+    log = command.add_argument_group("log file; options replace [log] of the robot description")
     add = log.add_argument
     add("--q", type=names, metavar="A,B,...", help="columns of the actuators")
     add("--x", type=names, metavar="X,Y,Z", help="columns of the tip")

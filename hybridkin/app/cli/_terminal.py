@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import sys
 import time
+from collections.abc import Callable
 from typing import TextIO
 
 from rich.console import Console
@@ -15,6 +16,70 @@ from hybridkin.formats import visible, visible_lines
 
 _PATIENCE = 15.0  # seconds between two lines of progress in files and pipes
 _LONG = 30.0  # seconds of a stage from which on the remaining time is of interest
+
+
+class _Stage:
+    """A stage of a command, of which nothing is shown: none has begun."""
+
+    what = ""
+
+    def show(self, done: int, total: int, state: str) -> None:
+        """Show how much is done, in words."""
+
+    def end(self) -> None:
+        """Show that the stage is completed."""
+
+    def close(self) -> None:
+        """Leave a stage that was not completed."""
+
+
+_NO_STAGE = _Stage()
+
+
+class _Bar(_Stage):
+    """A stage with a bar on a terminal."""
+
+    def __init__(self, what: str, console: Console) -> None:
+        self.what = what
+        text = TextColumn("{task.description}", markup=False)
+        columns = text, BarColumn(), TimeElapsedColumn()
+        self._bar = Progress(*columns, console=console)
+        self._task = self._bar.add_task(what, total=None)
+        self._bar.start()
+
+    def show(self, done: int, total: int, state: str) -> None:
+        """Show how much is done, in words."""
+        whole = total if total > 1 else None
+        self._bar.update(self._task, total=whole, completed=done, description=state)
+
+    def end(self) -> None:
+        """Show that the stage is completed."""
+        self._bar.update(self._task, total=1, completed=1, description=self.what)
+
+    def close(self) -> None:
+        """Leave a stage that was not completed."""
+        self._bar.stop()
+
+
+class _Lines(_Stage):
+    """A stage with lines in a file or a pipe."""
+
+    def __init__(self, what: str, line: Callable[[str], None]) -> None:
+        self.what = what
+        self._line = line
+        self._began = self._last_line = time.monotonic()
+        line(f"{what} ...")
+
+    def show(self, done: int, total: int, state: str) -> None:
+        """Show how much is done, in words."""
+        now = time.monotonic()
+        if 0 < done < total and now > self._last_line + _PATIENCE:
+            self._last_line = now
+            self._line(state)
+
+    def end(self) -> None:
+        """Show that the stage is completed."""
+        self._line(f"{self.what}: {_in_words(time.monotonic() - self._began)}")
 
 
 class Stages:
@@ -32,8 +97,8 @@ class Stages:
     def __init__(self, quiet: bool = False) -> None:
         self.quiet = quiet
         self._console = Console(stderr=True)
-        self._bar: Progress | None = None
-        self._what: str | None = None
+        self._stage = _NO_STAGE
+        self._began = 0.0
         self._seen: set[str] = set()
 
     def __call__(self, what: str, done: int, total: int) -> None:
@@ -42,29 +107,18 @@ class Stages:
             return
         what = visible(what)
         now = time.monotonic()
-        if self._what != what:
+        if self._stage.what != what:
             self._end()
-            self._what = what
             self._began = now
-            self._said = now
             if self._console.is_terminal:
-                text = TextColumn("{task.description}", markup=False)
-                columns = text, BarColumn(), TimeElapsedColumn()
-                self._bar = Progress(*columns, console=self._console)
-                self._task = self._bar.add_task(what, total=None)
-                self._bar.start()
+                self._stage = _Bar(what, self._console)
             else:
-                self._line(f"{what} ...")
+                self._stage = _Lines(what, self._line)
         spent = now - self._began
         left = spent * (total - done) / done if done else 0.0
         state = f"{what}: {done} of {total}" if total > 1 else what
         state += f", about {_in_words(left)} left" if spent + left > _LONG else ""
-        if self._bar is not None:
-            whole = total if total > 1 else None
-            self._bar.update(self._task, total=whole, completed=done, description=state)
-        elif 0 < done < total and now > self._said + _PATIENCE:
-            self._said = now
-            self._line(state)
+        self._stage.show(done, total, state)
         if done >= total:
             self._end()
 
@@ -84,15 +138,11 @@ class Stages:
 
     def close(self) -> None:
         """End the bar of a stage that was not completed."""
-        if self._bar is not None:
-            self._bar.stop()
-        self._bar = self._what = None
+        self._stage.close()
+        self._stage = _NO_STAGE
 
     def _end(self) -> None:
-        if self._bar is not None:
-            self._bar.update(self._task, total=1, completed=1, description=self._what)
-        elif self._what is not None:
-            self._line(f"{self._what}: {_in_words(time.monotonic() - self._began)}")
+        self._stage.end()
         self.close()
 
     def _line(self, text: str) -> None:
@@ -105,9 +155,7 @@ def write(text: str, to: TextIO, *, end: str = "\n", indent: str = "") -> None:
 
     Further lines are indented, so that none looks like one of its own.
     """
-    print(
-        visible_lines(text).replace("\n", f"\n{indent}"), end=end, file=to, flush=True
-    )
+    print(visible_lines(text).replace("\n", f"\n{indent}"), end=end, file=to, flush=True)
 
 
 def _in_words(seconds: float) -> str:

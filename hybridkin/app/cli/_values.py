@@ -13,9 +13,7 @@ def numbers(text: str) -> Sequence[float]:
     try:
         return tuple(float(part) for part in text.split(","))
     except ValueError:
-        raise argparse.ArgumentTypeError(
-            f"must be numbers, as in 1.5,2, got {text!r}"
-        ) from None
+        raise argparse.ArgumentTypeError(f"must be numbers, as in 1.5,2, got {text!r}") from None
 
 
 def in_millimetres(text: str) -> Sequence[float]:
@@ -58,9 +56,7 @@ def hysteresis(text: str) -> float | str:
         return text
     value = float(text)
     if not 0.0 <= value < float("inf"):
-        raise argparse.ArgumentTypeError(
-            f"must be auto or a width, zero or more, got {text}"
-        )
+        raise argparse.ArgumentTypeError(f"must be auto or a width, zero or more, got {text}")
     return value
 
 
@@ -95,9 +91,7 @@ def one_of(*known: Any) -> Callable[[str], Any]:
 
     def value(text: str) -> Any:
         if text not in values:
-            raise argparse.ArgumentTypeError(
-                f"must be one of {', '.join(values)}, got {text!r}"
-            )
+            raise argparse.ArgumentTypeError(f"must be one of {', '.join(values)}, got {text!r}")
         return values[text]
 
     return value

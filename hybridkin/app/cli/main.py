@@ -30,22 +30,19 @@ from hybridkin.app.cli._terminal import Stages, write
 from hybridkin.formats import FRAMES, METRES, check_outputs, visible, write_file
 
 if TYPE_CHECKING:
-    from hybridkin import ForwardModel, robots, trajectories
+    from hybridkin import ForwardModel, HybridForwardModel, robots, trajectories
     from hybridkin.app import LogReport
     from hybridkin.app.workflow import (
         Counts,
-        HybridForwardModel,
-        MeasuredLog,
         PathLimits,
         Report,
     )
+    from hybridkin.app.workflow.log import MeasuredLog
     from hybridkin.datasets import Log
 
 _DT = 0.02
 _LIGHT = ("describe", "init")  # commands that compute little
-_INSIDE = (
-    0.8  # least share of a path reached, and in the domain; else the exit code is 1
-)
+_INSIDE = 0.8  # least share of a path reached, and in the domain; else the exit code is 1
 # What the user can correct is printed without a traceback.
 _OF_INPUT = (ValueError, TypeError, OSError, ImportError, MemoryError)
 
@@ -108,9 +105,7 @@ def _interruptible() -> Iterator[None]:
     caught: list[KeyboardInterrupt] = []
 
     def stop(number: int, _: object) -> None:
-        caught.append(
-            _Terminated() if number == signal.SIGTERM else KeyboardInterrupt()
-        )
+        caught.append(_Terminated() if number == signal.SIGTERM else KeyboardInterrupt())
         raise caught[-1]
 
     for number in ours:
@@ -204,16 +199,12 @@ def _replaced_model(arguments: argparse.Namespace) -> str:
     model = arguments.out / "model.safetensors"
     if not model.is_file():
         return ""
-    words = (
-        f"the model of {datetime.fromtimestamp(model.stat().st_mtime):%Y-%m-%d %H:%M}"
-    )
+    words = f"the model of {datetime.fromtimestamp(model.stat().st_mtime):%Y-%m-%d %H:%M}"
     if sys.stdin.isatty() and not arguments.force and not arguments.json:
         question = f"Replace {words} in {visible(arguments.out)}? [y/N]: "
         write(question, sys.stderr, end="")
         if input().strip().lower() not in ("y", "yes"):
-            raise FileExistsError(
-                f"{arguments.out} keeps {words}; name another folder by --out."
-            )
+            raise FileExistsError(f"{arguments.out} keeps {words}; name another folder by --out.")
     return words
 
 
@@ -222,12 +213,9 @@ def _evaluate(arguments: argparse.Namespace, stages: Stages) -> _Result:
     nominal = None if model.description_.created else model.module_.robot
     log = _log_of(model, arguments, stages, chain=nominal)
     _note(log.report, stages)
-    report = hybridkin.app.workflow.evaluate_log(
-        model, log, arguments.out, force=arguments.force
-    )
+    report = hybridkin.app.workflow.evaluate_log(model, log, arguments.out, force=arguments.force)
     mean = 1000.0 * report.record.judged.mean
-    limit = arguments.fail_above
-    return report, int(limit is not None and mean > limit)
+    return report, int(mean > arguments.fail_above)
 
 
 def _view(arguments: argparse.Namespace, stages: Stages) -> _Result:
@@ -238,9 +226,7 @@ def _view(arguments: argparse.Namespace, stages: Stages) -> _Result:
     path = _path_of(arguments, model)
     limits = _scaled_limits(arguments, model)
     place = {"host": arguments.host, "port": arguments.port}
-    with hybridkin.app.view(
-        model, log, path=path, **vars(limits), **place
-    ) as shown_robot:
+    with hybridkin.app.view(model, log, path=path, **vars(limits), **place) as shown_robot:
         address = shown_robot.address
         words = f"{visible(model.description_.name)} is at {address}. Ctrl-C ends it."
         stages.note(words, important=True)
@@ -301,16 +287,16 @@ def _track(arguments: argparse.Namespace, stages: Stages) -> _Result:
     return report, int(not good)
 
 
-def _counts(arguments: argparse.Namespace, model: HybridForwardModel) -> Counts | None:
-    """Return the numbers to which commands are rounded, None without `--round`."""
+def _counts(arguments: argparse.Namespace, model: HybridForwardModel) -> Counts:
+    """Return the numbers to which commands are rounded, any without `--round`."""
     Counts = hybridkin.app.workflow.Counts
-    if arguments.round is None:
-        return None
+    if not arguments.round:
+        return Counts()
     if arguments.round is not True:
         n = model.n_features_in_
         return Counts([arguments.round] * n, [0.0] * n)
     counts = Counts.read(model.description_.training)
-    if counts is None or not any(counts.steps):
+    if not counts:
         raise ValueError(
             "`--round` needs a model that was fitted by `hybridkin fit` to a log with whole "
             "numbers; give the step of the actuators in the unit of the log: --round 1."
@@ -343,9 +329,7 @@ def _measured_track(
     if held & {name.split("[")[0] for name in log_format.q}:
         return _read(arguments, log_format, stages)
     stages.note("The file holds no commands: they are those of the track.")
-    return hybridkin.app.workflow.read_tips(
-        arguments.log, log_format, arguments.delimiter
-    )
+    return hybridkin.app.workflow.read_tips(arguments.log, log_format, arguments.delimiter)
 
 
 def _animate(arguments: argparse.Namespace, stages: Stages) -> _Result:
@@ -387,14 +371,12 @@ def _describe(arguments: argparse.Namespace, stages: Stages) -> _Result:
     workflow = hybridkin.app.workflow
     if arguments.log.suffix.lower() == ".toml":
         robot = hybridkin.robots.read_description(arguments.log)
-        return workflow.describe_robot(robot), 0
-    if not workflow.is_log(arguments.log):
+        return workflow.description.describe_robot(robot), 0
+    if not workflow.model.is_log(arguments.log):
         model = hybridkin.open_model(arguments.log, arguments.robot)
         return workflow.describe(model), 0
     if arguments.robot is None:
-        raise ValueError(
-            f"{arguments.log} is a log; name its robot: --robot ROBOT.toml."
-        )
+        raise ValueError(f"{arguments.log} is a log; name its robot: --robot ROBOT.toml.")
     robot = hybridkin.robots.read_description(arguments.robot)
     log_format = _log_format(arguments, robot.log, arguments.robot)
     log = _read(arguments, log_format, stages, robot.chain, robot.base_is_free)
@@ -483,9 +465,7 @@ def _robot_of(text: str) -> Any:
 def _demo(arguments: argparse.Namespace, stages: Stages) -> _Result:
     out = arguments.out
     if out.exists() and not (out.is_dir() and not [*out.iterdir()]):
-        raise FileExistsError(
-            f"{out} is not an empty folder; name another one by --out."
-        )
+        raise FileExistsError(f"{out} is not an empty folder; name another one by --out.")
     out.mkdir(parents=True, exist_ok=True)
     stages.note("The data of this demo are simulated; no robot was measured.")
     demo.write_log(out / "log.csv")
@@ -534,9 +514,7 @@ def _limits(
     return hybridkin.app.workflow.path_limits(model, **vars(scaled), **options)
 
 
-def _scaled_limits(
-    arguments: argparse.Namespace, model: HybridForwardModel
-) -> robots.Limits:
+def _scaled_limits(arguments: argparse.Namespace, model: HybridForwardModel) -> robots.Limits:
     """Return the limits of the arguments, in the log's unit and sign, which may swap the ends."""
     limits = hybridkin.robots.Limits(
         arguments.q_min, arguments.q_max, arguments.dq_max, arguments.ddq_max
@@ -601,11 +579,7 @@ def _log_format(
     if arguments.time_unit not in (None, FRAMES):
         entries["rate"] = None  # that of the description is one of frames
     options = vars(arguments)
-    names = [
-        field.name
-        for field in fields(hybridkin.robots.LogFormat)
-        if field.name in options
-    ]
+    names = [field.name for field in fields(hybridkin.robots.LogFormat) if field.name in options]
     for name in names:
         if options[name] is not None:
             entries[name] = None if options[name] == "none" else options[name]

@@ -113,9 +113,7 @@ def _body_of(model: Any, robot: SteeredRobot) -> BackboneDisplay:
 class Ghost:
     """The backbone of another model at the same command."""
 
-    def __init__(
-        self, scene: Any, name: str, chain: ForwardModel, robot: SteeredRobot
-    ) -> None:
+    def __init__(self, scene: Any, name: str, chain: ForwardModel, robot: SteeredRobot) -> None:
         self._chain = chain
         self.line = scene.add_spline_catmull_rom(
             f"/{name}",
@@ -167,9 +165,7 @@ class LogCloud:
                 visible=False,
             )
 
-    def row_at(
-        self, origin: NDArray, direction: NDArray
-    ) -> tuple[NDArray, NDArray] | None:
+    def row_at(self, origin: NDArray, direction: NDArray) -> tuple[NDArray, NDArray] | None:
         """Return the command (n,) and the tip (3,) of the first row that a ray meets, or None."""
         ways = self._tips - origin
         along = ways @ direction

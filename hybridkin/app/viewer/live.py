@@ -108,9 +108,7 @@ def view(
     if log is not None and not _has_range(model):
         q_min = np.where(np.isfinite(q_min), q_min, np.nanmin(log.q, axis=0))
         q_max = np.where(np.isfinite(q_max), q_max, np.nanmax(log.q, axis=0))
-    limits = path_limits(
-        model, q_min=q_min, q_max=q_max, dq_max=dq_max, ddq_max=ddq_max
-    )
+    limits = path_limits(model, q_min=q_min, q_max=q_max, dq_max=dq_max, ddq_max=ddq_max)
     return LiveView(SteeredRobot(model, limits), log, path, host, port)
 
 
@@ -143,9 +141,7 @@ class LiveView:
         try:
             self._server = page_server(host, port, label="hybridkin")
         except ImportError as error:
-            raise ImportError(
-                'a live view needs viser: pip install "hybridkin[view]".'
-            ) from error
+            raise ImportError('a live view needs viser: pip install "hybridkin[view]".') from error
         self.robot = robot
         self.ticks_per_second = 0.0
         self.address = f"http://{host}:{self._server.get_port()}"
@@ -170,9 +166,7 @@ class LiveView:
         middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
         self._server.initial_camera.look_at = middle
         self._server.initial_camera.position = middle + robot.size * _CAMERA
-        scene.add_frame(
-            "/base", axes_length=0.15 * robot.size, axes_radius=0.004 * robot.size
-        )
+        scene.add_frame("/base", axes_length=0.15 * robot.size, axes_radius=0.004 * robot.size)
         self._body = Body(scene, robot.model, robot)
         self._aim = scene.add_transform_controls(
             "/target",
@@ -185,9 +179,7 @@ class LiveView:
         self._measured = scene.add_icosphere(
             "/measured", 0.015 * robot.size, (0, 0, 0), visible=False
         )
-        self._radius = scene.add_icosphere(
-            "/radius", 1.0, color=ORANGE, opacity=0.2, visible=False
-        )
+        self._radius = scene.add_icosphere("/radius", 1.0, color=ORANGE, opacity=0.2, visible=False)
         self._switched: dict[str, Any] = {}
         self._switched["reachable"] = scene.add_point_cloud(
             "/reachable",

@@ -90,7 +90,8 @@ class SteeredRobot:
             gain=_GAIN,
             dt=1.0 / RATE,
         ).tracker(self.q, tol=self._close)
-        self._goal: NDArray | None = None
+        self._goal = self.q
+        self._by_hand = False  # the actuators are set, not led by the target
         self._resting = False
         self._history = deque([self.q], maxlen=_REMEMBERED)
         self._lock = Lock()
@@ -101,9 +102,9 @@ class SteeredRobot:
         if point.shape != (3,) or not np.isfinite(point).all():
             return
         with self._lock:
-            if self._goal is not None:
+            if self._by_hand:
                 self._tracker.reset(self.q)
-                self._goal = None
+                self._by_hand = False
             self.target = point
             self._resting = False
 
@@ -114,6 +115,7 @@ class SteeredRobot:
             return
         with self._lock:
             self._goal = np.clip(goal, self.limits.q_min, self.limits.q_max)
+            self._by_hand = True
             self._resting = False
 
     def tick(self) -> bool:
@@ -122,13 +124,13 @@ class SteeredRobot:
             if self._resting:
                 return False
             before = self.q
-            if self._goal is None:
-                self.q = np.asarray(self._tracker.step(self.target))
-            else:
+            if self._by_hand:
                 way = self._goal - before
                 self.q = before + np.clip(way, -self._largest_step, self._largest_step)
+            else:
+                self.q = np.asarray(self._tracker.step(self.target))
             self.x = tips_at(self.model, self.q[None])[0]
-            if self._goal is not None:
+            if self._by_hand:
                 self.target = self.x
             self._history.append(self.q)
             moved = np.abs(self.q - before) / self.span
@@ -143,7 +145,7 @@ class SteeredRobot:
             error = float(np.linalg.norm(self.target - self.x))
             reached = error <= self._close
             out_of_reach = False
-            if self._goal is not None:
+            if self._by_hand:
                 words = "Actuators set by hand"
                 reached = True
                 error = math.nan

@@ -3,49 +3,37 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from hybridkin.app.workflow.description import Description, describe, describe_robot
-from hybridkin.app.workflow.log import LogError, MeasuredLog, read_log
-from hybridkin.app.workflow.model import LOG_SUFFIXES, is_log
+from hybridkin.app.workflow.description import describe
+from hybridkin.app.workflow.log import LogError, read_log
 from hybridkin.app.workflow.report import Report
 
 if TYPE_CHECKING:
     from hybridkin.app.workflow.compare import FitSettings
     from hybridkin.app.workflow.counts import Counts
-    from hybridkin.app.workflow.delay import Delay, estimated_delay
+    from hybridkin.app.workflow.delay import estimated_delay
     from hybridkin.app.workflow.domain import PathLimits, path_limits
-    from hybridkin.app.workflow.evaluate import Evaluation, evaluate_log
+    from hybridkin.app.workflow.evaluate import evaluate_log
     from hybridkin.app.workflow.export import export_model
     from hybridkin.app.workflow.film import animate_track
     from hybridkin.app.workflow.fit import fit_log
-    from hybridkin.app.workflow.fit_record import FitRecord
     from hybridkin.app.workflow.merge import merge_files
     from hybridkin.app.workflow.path import scaled_path, shape_path
     from hybridkin.app.workflow.planning import next_rows
-    from hybridkin.app.workflow.track import TrackRecord, track_path
-    from hybridkin.app.workflow.verify import Verification, read_tips, verify_track
+    from hybridkin.app.workflow.track import track_path
+    from hybridkin.app.workflow.verify import read_tips, verify_track
 
 __all__ = [
-    "LOG_SUFFIXES",
     "Counts",
-    "Delay",
-    "Description",
-    "Evaluation",
-    "FitRecord",
     "FitSettings",
     "LogError",
-    "MeasuredLog",
     "PathLimits",
     "Report",
-    "TrackRecord",
-    "Verification",
     "animate_track",
     "describe",
-    "describe_robot",
     "estimated_delay",
     "evaluate_log",
     "export_model",
     "fit_log",
-    "is_log",
     "merge_files",
     "next_rows",
     "path_limits",
@@ -60,13 +48,8 @@ __all__ = [
 # A description of a robot needs no fit and no inverse kinematics.
 _MODULE_OF = {
     "Counts": "counts",
-    "Delay": "delay",
-    "Evaluation": "evaluate",
-    "FitRecord": "fit_record",
     "FitSettings": "compare",
     "PathLimits": "domain",
-    "TrackRecord": "track",
-    "Verification": "verify",
     "animate_track": "film",
     "estimated_delay": "delay",
     "evaluate_log": "evaluate",

@@ -114,9 +114,7 @@ def calibrated_parameters(
     return parameters
 
 
-def _before_and_after(
-    start: Chain, name: str, calibrated: NDArray
-) -> tuple[NDArray, NDArray]:
+def _before_and_after(start: Chain, name: str, calibrated: NDArray) -> tuple[NDArray, NDArray]:
     """Return the numbers (k,) of a parameter before and after its calibration."""
     before = _start_value(start, name)
     if name != "base":
@@ -217,9 +215,7 @@ class Calibration:
             report.items(self.unidentified)
 
 
-def deviations(
-    start: Chain, result: CalibrationResult, q_unit: LogUnit
-) -> Iterator[str]:
+def deviations(start: Chain, result: CalibrationResult, q_unit: LogUnit) -> Iterator[str]:
     """Yield what the calibration moved far from the description, and what else may be wrong."""
     far = []
     for parameter in calibrated_parameters(start, result, q_unit):

@@ -40,16 +40,12 @@ def choices_by_fold(compared: CrossFit, unit: LogUnit) -> list[dict[str, str]]:
     n_folds = len(np.unique(compared.fold))
     words: list[dict[str, str]] = [{} for _ in range(n_folds)]
     for name, table in compared.tables.items():
-        for of_fold, choice, weights in zip(
-            words, table.choices, table.fold_weights, strict=True
-        ):
+        for of_fold, choice, weights in zip(words, table.choices, table.fold_weights, strict=True):
             if isinstance(choice.error_model, ELMRegressorCV):
                 of_fold[name] = network_in_words(choice.error_model)
             elif len(table.names) > 1:
                 by_name = dict(zip(table.names, weights.tolist(), strict=True))
-                of_fold[name] = _blend_in_words(
-                    by_name, choice.parameters, choice.hysteresis, unit
-                )
+                of_fold[name] = _blend_in_words(by_name, choice.parameters, choice.hysteresis, unit)
     return words
 
 
@@ -91,16 +87,13 @@ def auto_in_words(model: HybridForwardModel, unit: LogUnit) -> list[str]:
         words = f"{millimetres(errors['cv'], '.2f')} on held-out motions"
         if not math.isnan(errors.get("io", math.nan)):
             words += f", {millimetres(errors['io'], '.2f')} outside the fitted rows"
-        sentences.append(
-            f"Of {len(tried)} sets of parameters, auto calibrates {taken}: {words}."
-        )
+        sentences.append(f"Of {len(tried)} sets of parameters, auto calibrates {taken}: {words}.")
     errors = dict(zip(results["candidate"], results["mean_distance"], strict=True))
     listed = [f"{name} {1e3 * error:.2f}" for name, error in errors.items()]
     expected = millimetres(results["expected_distance"], ".2f")
     chosen = ", ".join(_chosen(results["weights"]))
     sentences += [
-        f"Auto chose {chosen}. Mean errors on held-out motions in mm: "
-        f"{', '.join(listed)}.",
+        f"Auto chose {chosen}. Mean errors on held-out motions in mm: {', '.join(listed)}.",
         f"Expected on new motions like these: {expected}.",
     ]
     if model.hysteresis_:

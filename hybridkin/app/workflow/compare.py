@@ -21,7 +21,6 @@ from hybridkin import (
     GeometryChoice,
     HybridForwardModel,
     Hysteresis,
-    as_forward_model,
     choose_geometry,
     cross_fit,
     robots,
@@ -216,7 +215,9 @@ def mechanical_of(
         with warnings.catch_warnings():  # the models above it give them
             warnings.simplefilter("ignore")
             linear.fit(rows.q, rows.x)
-        return Mechanical(as_forward_model(linear))
+        module: Any = linear.module_  # of one correction, without mechanical model
+        (correction,) = module.corrections
+        return Mechanical(correction.module)
     nominal: Chain = chain
     if robot.base_is_free:
         base = GeometryChoice(chain, ("base",))
@@ -355,9 +356,7 @@ def compare(
     CrossFit
         The models by kind, without the calibrated model with backlash if there is no hysteresis.
     """
-    with (
-        warnings.catch_warnings()
-    ):  # the report and the mechanical model say what matters
+    with warnings.catch_warnings():  # the report and the mechanical model say what matters
         warnings.simplefilter("ignore")
         compared = cross_fit(
             models_of(robot, mechanical, settings),
@@ -377,9 +376,7 @@ def compare(
     if not settings.follows_order:  # it is the calibrated model
         tips.pop(BACKLASH, None)
     names = sorted(tips, key=lambda name: _KINDS.index(name.partition(",")[0]))
-    return replace(
-        compared, names=tuple(names), tips=np.array([tips[name] for name in names])
-    )
+    return replace(compared, names=tuple(names), tips=np.array([tips[name] for name in names]))
 
 
 def _models_for(

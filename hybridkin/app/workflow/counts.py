@@ -17,7 +17,7 @@ _INSIDE = 1e-9  # limits are met to this share of a step
 
 @dataclass(frozen=True)
 class Counts:
-    """Whole numbers that the columns of a log can hold, in the unit of the log.
+    """Whole numbers that the columns of a log can hold, in the unit of the log; `Counts()`: any.
 
     Attributes
     ----------
@@ -27,8 +27,12 @@ class Counts:
         One of these numbers (n,).
     """
 
-    steps: Sequence[float]
-    zeros: Sequence[float]
+    steps: Sequence[float] = ()
+    zeros: Sequence[float] = ()
+
+    def __bool__(self) -> bool:
+        """Return whether a column has steps."""
+        return any(self.steps)
 
     @classmethod
     def of_log(cls, columns: NDArray) -> Self:
@@ -45,10 +49,9 @@ class Counts:
         return cls(steps.astype(float).tolist(), zeros.tolist())
 
     @classmethod
-    def read(cls, notes: Mapping[str, Any]) -> Self | None:
-        """Return the steps in the notes of a fit, None if they are not known."""
-        entry = notes.get("counts")
-        return None if entry is None else cls(**entry)
+    def read(cls, notes: Mapping[str, Any]) -> Self:
+        """Return the steps in the notes of a fit, none if they are not known."""
+        return cls(**(notes.get("counts") or {}))
 
     @property
     def whole(self) -> NDArray[np.bool_]:

@@ -98,10 +98,20 @@ class HeldOutErrors(Errors):
 
 @dataclass(frozen=True)
 class ExpectedErrors:
-    """Mean errors (N,) to expect of a robot, and the errors that 95 % do not exceed [m]."""
+    """Mean errors (N,) to expect of a robot, and what 95 % do not exceed [m]; NaN: unknown."""
 
     mean: NDArray
     p95: NDArray
+
+    @classmethod
+    def unknown(cls, n: int) -> Self:
+        """Return those of n commands for a model that promises nothing."""
+        return cls(np.full(n, np.nan), np.full(n, np.nan))
+
+    @property
+    def known(self) -> bool:
+        """Whether the model promises an error of any command."""
+        return bool(np.isfinite(self.mean).any())
 
 
 @dataclass(frozen=True)
@@ -127,9 +137,7 @@ class Promise:
         """Return the promise from errors (N,) of held-out rows and their distances (N,)."""
         columns = np.column_stack([np.ones_like(errors), distances])
         at_rows, per_distance = scipy.optimize.nnls(columns, errors)[0]
-        if (
-            at_rows == 0.0
-        ):  # a robot without error at the rows of its log is not credible
+        if at_rows == 0.0:  # a robot without error at the rows of its log is not credible
             at_rows = errors.mean()
             per_distance = 0.0
         if at_rows == 0.0:  # no errors at all

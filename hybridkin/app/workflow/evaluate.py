@@ -172,9 +172,7 @@ def evaluate_log(
         held_out=None if fitted_errors is None else held_out_errors(model),
         markers=errors_of_markers(markers),
     )
-    report = Report(
-        f"{model.description_.name}: errors on {Path(log.source).name}", record
-    )
+    report = Report(f"{model.description_.name}: errors on {Path(log.source).name}", record)
     _write_errors(report, model)
     if out is not None:
         _add_figures(report, model, measured, predicted)
@@ -182,9 +180,7 @@ def evaluate_log(
     return report
 
 
-def _row_errors(
-    model: HybridForwardModel, commands: Commands, markers: NDArray
-) -> _RowErrors:
+def _row_errors(model: HybridForwardModel, commands: Commands, markers: NDArray) -> _RowErrors:
     in_domain = np.full(len(commands), np.nan)
     in_radius = in_domain
     if is_fitted(model):
@@ -202,9 +198,7 @@ def _write_errors(report: Report[Evaluation], model: HybridForwardModel) -> None
     write_check(report, record.log_check)
     report.text("## Errors by motion, largest first")
     if record.fitted_rows is None:
-        report.text(
-            "The model does not say which rows it was fitted to; they have smaller errors."
-        )
+        report.text("The model does not say which rows it was fitted to; they have smaller errors.")
     if record.fitted_rows:
         report.text(
             f"**{record.fitted_rows} of {record.all.rows} rows were fitted: their errors are "
@@ -224,9 +218,7 @@ def _write_errors(report: Report[Evaluation], model: HybridForwardModel) -> None
         columns += ["share_in_domain", "share_in_radius"]
     report.errors(entries | dict(largest_first), columns)
     if model.radius_ is not None:
-        report.text(
-            f"Estimated error radius: {model.radius_}. Rows without a radius do not count."
-        )
+        report.text(f"Estimated error radius: {model.radius_}. Rows without a radius do not count.")
     write_markers(report, record.markers, "all rows")
 
 
@@ -247,6 +239,4 @@ def _add_figures(
         body = plots.BackboneDisplay.from_estimator(model.module_.robot, q).points[0]
     tips = plots.WorkspaceDisplay(log.x[:, -3:], predicted[:, -3:], body, row)
     tips.plot(ax, unit="mm")
-    report.figure(
-        "workspace", figure, "Measured tips, coloured by the tip error of the model."
-    )
+    report.figure("workspace", figure, "Measured tips, coloured by the tip error of the model.")

@@ -71,14 +71,12 @@ def animate_track(
         target=log.x if tuple(log.x_names) == TARGET else None,
         t=log.time,
         tips=tips_at(model, q),
-        expected=None if promised is None else promised.mean,
+        expected=promised.mean if promised.known else None,
         names=model.description_.log.q if model.module_.robot.rings else (),
         n_frames=n_frames,
     )
     try:
-        film.save(
-            out, unit=unit, speed=speed, progress=partial(progress, "drawing frames")
-        )
+        film.save(out, unit=unit, speed=speed, progress=partial(progress, "drawing frames"))
     except RuntimeError as error:  # no program to write films with
         raise ValueError(str(error)) from error
     fps = speed * film.fps

@@ -106,9 +106,7 @@ def fit_log(
     settings = with_hysteresis_detected(settings, rows, robot, mechanical)
     if not settings.follows_order:
         rows = measured
-    compared = compare(
-        rows, robot, settings, mechanical, n_jobs=n_jobs, progress=progress
-    )
+    compared = compare(rows, robot, settings, mechanical, n_jobs=n_jobs, progress=progress)
     saved = AUTO if settings.auto else _best_to_save(compared)
     model = compared.models[saved]
     if model.calibrate is mechanical.calibrate:
@@ -119,9 +117,7 @@ def fit_log(
     held_out = {}
     errors = errors_of_rows(compared)
     for name, of_model in errors.items():
-        held_out[name] = HeldOutErrors.of_motions(
-            of_model, measured.motions, compared.fold
-        )
+        held_out[name] = HeldOutErrors.of_motions(of_model, measured.motions, compared.fold)
     record = FitRecord(
         log=Path(log.source).name,
         robot=robot.name,
@@ -136,9 +132,7 @@ def fit_log(
         chosen=choice_in_words(model, rows.q_unit),
         held_out=held_out,
         promise=Promise.of(errors[saved], compared.distances_from_others),
-        counts=None
-        if robot.log is None
-        else Counts.of_log(robot.log.to_log(complete.q)),
+        counts=None if robot.log is None else Counts.of_log(robot.log.to_log(complete.q)),
         choices_by_fold=choices_by_fold(compared, rows.q_unit),
         log_check=complete.report,
         worst=largest_errors(errors, measured.motions),
@@ -163,9 +157,7 @@ def fit_log(
     return report
 
 
-def _check(
-    log: MeasuredLog, robot: robots.RobotDescription, settings: FitSettings
-) -> None:
+def _check(log: MeasuredLog, robot: robots.RobotDescription, settings: FitSettings) -> None:
     """Raise if the log or the settings do not allow a comparison by motions."""
     n_motions = len(np.unique(log.motions))
     if n_motions < 3:
@@ -210,9 +202,7 @@ def _add_model(
 ) -> None:
     """Add the model and the description of its robot to the files of a report."""
     training = training_notes(report.record)
-    report.file(
-        "model.safetensors", lambda path: save_model(model, path, training=training)
-    )
+    report.file("model.safetensors", lambda path: save_model(model, path, training=training))
     report.text("The model: `hybridkin.load_model('model.safetensors')`.")
     if robot.path is not None:  # the description it was made from
         report.file("robot.toml", partial(shutil.copyfile, robot.path))

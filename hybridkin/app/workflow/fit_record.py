@@ -167,18 +167,14 @@ def write_comparison(report: Report[FitRecord]) -> None:
         ratio = record.held_out[first].mean / record.held_out[name].mean
         ratios.append(f"by that of {name}: **{ratio:.2f}**")
     best = min(record.held_out, key=lambda name: record.held_out[name].mean)
-    report.text(
-        f"Mean error of {first} divided {', '.join(ratios)}. Least mean error: {best}."
-    )
+    report.text(f"Mean error of {first} divided {', '.join(ratios)}. Least mean error: {best}.")
 
 
 def write_model(report: Report[FitRecord]) -> None:
     """Add the motions of largest errors, what was saved and chosen, and the calibration."""
     record = report.record
     shown = shown_models(record.held_out)
-    report.text(
-        f"Mean errors in mm of the five motions with the largest errors of {shown[-1]}:"
-    )
+    report.text(f"Mean errors in mm of the five motions with the largest errors of {shown[-1]}:")
     rows = []
     for entry in record.worst:
         means = [f"{1e3 * entry.means[name]:.1f}" for name in shown]
@@ -228,9 +224,7 @@ def errors_of_rows(compared: CrossFit) -> dict[str, NDArray]:
     return dict(zip(compared.names, compared.distances, strict=True))
 
 
-def largest_errors(
-    errors: Mapping[str, NDArray], motions: NDArray
-) -> list[MotionErrors]:
+def largest_errors(errors: Mapping[str, NDArray], motions: NDArray) -> list[MotionErrors]:
     """Return the motions with the largest errors of the last of the `shown_models`."""
     names, motion = np.unique(motions, return_inverse=True)
     counts = np.bincount(motion)
@@ -253,9 +247,7 @@ def errors_of_markers(errors: NDArray) -> list[Errors]:
 def write_markers(report: Report, markers: Sequence[Errors], what: str) -> None:
     """Add the errors of several markers, one by one."""
     if markers:
-        report.text(
-            f"Errors of the markers, base to tip ({what}). Other tables give their mean."
-        )
+        report.text(f"Errors of the markers, base to tip ({what}). Other tables give their mean.")
         entries = {f"marker {k}": errors for k, errors in enumerate(markers)}
         report.errors(entries, ("rows", "mean", "p95", "max"))
 

@@ -35,9 +35,7 @@ class LogError(ValueError):
             further = f" ({len(report.errors) - 1} more above)"
         else:
             further = ""
-        super().__init__(
-            f"the log did not pass its check: {first.message} {first.advice}{further}"
-        )
+        super().__init__(f"the log did not pass its check: {first.message} {first.advice}{further}")
         self.report = report
 
 
@@ -206,12 +204,8 @@ def read_log(
     ValueError
         If columns or motions do not exist.
     """
-    if not isinstance(exclude, Sequence) or not all(
-        isinstance(p, str) for p in exclude
-    ):
-        raise TypeError(
-            f"`exclude` must be a list of patterns of names, got {exclude!r:.80}."
-        )
+    if not isinstance(exclude, Sequence) or not all(isinstance(p, str) for p in exclude):
+        raise TypeError(f"`exclude` must be a list of patterns of names, got {exclude!r:.80}.")
     suffix = log_format.group_suffix
     reading = replace(log_format, delimiter=delimiter, drop_invalid=True).reading
     log = load_log(path, **reading)
@@ -264,19 +258,13 @@ def _check(
     base_is_free: bool = True,
     drop_invalid: bool = True,
 ) -> LogReport:
-    return check_log(
-        log, chain=chain, base_is_free=base_is_free, drop_invalid=drop_invalid
-    )
+    return check_log(log, chain=chain, base_is_free=base_is_free, drop_invalid=drop_invalid)
 
 
-def _with_motions(
-    log: Log, report: LogReport, excluded: tuple[str, ...] = ()
-) -> MeasuredLog:
+def _with_motions(log: Log, report: LogReport, excluded: tuple[str, ...] = ()) -> MeasuredLog:
     named = log.groups is not None
     n = len(log.q)
     columns = dict(vars(log))
     if not named:
         columns["groups"] = np.arange(n) * _BLOCKS // n
-    return MeasuredLog(
-        **columns, report=report, named=named, counts=np.ones(n), excluded=excluded
-    )
+    return MeasuredLog(**columns, report=report, named=named, counts=np.ones(n), excluded=excluded)

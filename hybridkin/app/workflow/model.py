@@ -55,9 +55,7 @@ def domain_distance(model: HybridForwardModel, q: NDArray) -> NDArray:
     return native.evaluate(tip, q, value=False, distance=True)[0]
 
 
-def commands_for(
-    model: HybridForwardModel, q: NDArray, time: NDArray | None = None
-) -> NDArray:
+def commands_for(model: HybridForwardModel, q: NDArray, time: NDArray | None = None) -> NDArray:
     """Return the commands (N, n) that move the actuators along q (N, n), row after row.
 
     The times (N,) of the rows matter with creep [s]; without them the robot rests at each row.
@@ -129,15 +127,15 @@ def kind_of(model: HybridForwardModel) -> str:
     return model.description_.training.get("saved", kind)
 
 
-def promised_errors(model: HybridForwardModel, q: NDArray) -> ExpectedErrors | None:
+def promised_errors(model: HybridForwardModel, q: NDArray) -> ExpectedErrors:
     """Return the errors (N,) to expect where the actuators do q (N, n).
 
-    They are those of held-out motions at the same distance from the log. None if the file does not
-    have them.
+    They are those of held-out motions at the same distance from the log, unknown if the file does
+    not have them.
     """
     training = model.description_.training
     if not is_fitted(model) or "promise" not in training:
-        return None
+        return ExpectedErrors.unknown(len(q))
     promise = Promise(**training["promise"])
     tested = model.fitted_module_.tested
     if tested is None:
@@ -150,7 +148,7 @@ def expected_errors(model: HybridForwardModel, q: NDArray) -> dict[str, NDArray]
     """Return by name the errors (N,) [m] to expect of the robot where the actuators do q."""
     expected = {}
     promised = promised_errors(model, q)
-    if promised is not None:
+    if promised.known:
         expected["held-out motions, mean"] = promised.mean
         expected["held-out motions, 95 %"] = promised.p95
     radius = model.radius_

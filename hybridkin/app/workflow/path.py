@@ -106,9 +106,7 @@ def shape_path(
     middle = tips.mean(axis=0) if center is None else real_array(center, "center")
     plane: ArrayLike = _normal_of(tips, model) if normal is None else normal
     if shape == "figure-eight":
-        path = trajectories.figure_eight(
-            middle, extent, normal=plane, duration=duration, dt=dt
-        )
+        path = trajectories.figure_eight(middle, extent, normal=plane, duration=duration, dt=dt)
     elif shape == "spiral":
         path = trajectories.spiral(
             middle,

@@ -103,9 +103,7 @@ def next_rows(
         "limits": limits,
         "expected_errors": errors,
     }
-    report = Report(
-        f"{model.description_.name}: {n} configurations to measure next", record
-    )
+    report = Report(f"{model.description_.name}: {n} configurations to measure next", record)
     shown = sorted({k for k in _SHOWN if k < n} | {n})
     table = [[str(k), f"{1e3 * errors[k - 1]:.2f}"] for k in shown]
     report.table(["rows", "expected error [mm]"], table)
@@ -117,8 +115,6 @@ def next_rows(
     log = model.description_.log
     sent = log.to_log(commands_for(model, candidates[rows]))
     numbers = np.column_stack([sent, errors / METRES[log.x_unit]])
-    report.table_file(
-        "next.csv", [*log.q, "expected_error"], np.char.mod("%.9g", numbers)
-    )
+    report.table_file("next.csv", [*log.q, "expected_error"], np.char.mod("%.9g", numbers))
     report.write(out)
     return report

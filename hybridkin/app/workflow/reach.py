@@ -20,9 +20,7 @@ _POINTS = 13  # of the path, evenly in time; its ends in each direction are adde
 _PLACES = 48  # places that are tried for a path
 _HALVINGS = 7
 _ITERATIONS = 100
-_MOST_MISSED = (
-    0.1  # share of the checked points of a path that does not leave the reach
-)
+_MOST_MISSED = 0.1  # share of the checked points of a path that does not leave the reach
 _OTHER_UNIT = 20.0  # a path this many times larger than the workspace: another unit
 
 
@@ -53,7 +51,7 @@ def placed(
     best = int(good[0])
     q = solution.q[good]
     promised = promised_errors(domain.model, q.reshape(-1, q.shape[-1]))
-    if promised is not None:
+    if promised.known:
         best = int(good[promised.mean.reshape(len(good), -1).mean(axis=1).argmin()])
     return trajectories.Trajectory(path.t, path.x + shifts[best]), float(inside[best])
 
@@ -96,9 +94,7 @@ def check_reach(
         """Return by how much points of the scaled path are missed (k,) [m]; reached: 0."""
         progress("checking the reach", 0, 1)
         x = center + scale * (path.x[rows] - center)
-        solution = domain.solver().solve(
-            x, q0=domain.nearest(x), tol=tol, max_iter=_ITERATIONS
-        )
+        solution = domain.solver().solve(x, q0=domain.nearest(x), tol=tol, max_iter=_ITERATIONS)
         return np.where(solution.error <= tol, 0.0, solution.error)
 
     rows = _some_rows(path)

@@ -97,7 +97,7 @@ class Report(Generic[Record]):
     title : str
         Heading of the report.
     record : dataclass or dict
-        Every number of the report; the content of its JSON.
+        Every number of the report; the content of its JSON. ``help(report.record)`` explains it.
 
     Attributes
     ----------
@@ -280,9 +280,7 @@ def _write_text(path: Path, text: str) -> None:
     path.write_text(text, encoding="utf-8", newline="")
 
 
-def check_out(
-    out: str | Path, command: str, files: Sequence[str] = (), *, force: bool
-) -> None:
+def check_out(out: str | Path, command: str, files: Sequence[str] = (), *, force: bool) -> None:
     """Raise, before any work, if `out` cannot be used as a folder for results.
 
     `files` and a report are replaced only if the report is one of the same command, or by `force`.
@@ -292,9 +290,7 @@ def check_out(
     entry = f'"command": "{command}"'
     is_ours = report.is_file() and entry in report.read_text(errors="replace")
     names = (*files, "report.json", "report.md")
-    check_outputs(
-        [path / name for name in names], command, lambda _: is_ours, force=force
-    )
+    check_outputs([path / name for name in names], command, lambda _: is_ours, force=force)
 
 
 def quiet(label: str, done: int, total: int) -> None:
@@ -315,9 +311,7 @@ def json_text(record: object) -> str:
         JSON text.
     """
     text = json.dumps(plain(record), indent=2, allow_nan=False, default=_in_json)
-    return text.replace(
-        "\x7f", "\\u007f"
-    )  # the one control character that JSON lets pass
+    return text.replace("\x7f", "\\u007f")  # the one control character that JSON lets pass
 
 
 def _in_json(value: object) -> Any:

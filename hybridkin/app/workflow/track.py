@@ -51,6 +51,7 @@ _PUSH = 10.0 / math.sqrt(3.0)  # its largest acceleration
 _MOST_OUTSIDE = 0.05  # share of the points outside the domain that is not worth a word
 _SLOW = 0.1  # share of the range per second, without known limits
 _DT = 0.02  # period of a path of one point [s]
+_ANY_NUMBER = Counts()
 _FINER = (1, 4)  # times as many steps, in each attempt
 _SHOWN = 100  # times that a track reports its progress
 
@@ -152,7 +153,7 @@ def _write(report: Report[TrackRecord], model: HybridForwardModel, better: str) 
     report.text(_outcome(record, better))
 
 
-def _about_counts(record: TrackRecord, counts: Counts | None) -> list[str]:
+def _about_counts(record: TrackRecord, counts: Counts) -> list[str]:
     """Return what rounding costs, or that it is possible."""
     if record.rounded is not None:
         before = millimetres(record.rounded["before"])
@@ -161,7 +162,7 @@ def _about_counts(record: TrackRecord, counts: Counts | None) -> list[str]:
             f"Commands are rounded to whole steps of the actuators. Mean error of the solver: "
             f"{before} before, {after} after."
         ]
-    if counts is not None and counts.whole.all():
+    if counts and counts.whole.all():
         return [
             "The columns of the log hold whole numbers; these commands are not rounded: --round."
         ]
@@ -175,9 +176,7 @@ def _outcome(record: TrackRecord, better: str) -> str:
         by = millimetres(record.missed_by, ".2g")
         words += f"; missed: {record.missed}, by up to {by}"
     if not record.expected:
-        unknown = (
-            "The error of the robot is not known: the model has no held-out errors"
-        )
+        unknown = "The error of the robot is not known: the model has no held-out errors"
         return f"{words}. {unknown}{better}."
     mean = millimetres(record.expected["mean"], ".2g")
     p95 = millimetres(record.expected["p95"], ".2g")
@@ -203,7 +202,7 @@ def track_path(
     start: ArrayLike | str = "rest",
     tol: float = 1e-4,
     delay: float = 0.0,
-    counts: Counts | None = None,
+    counts: Counts = _ANY_NUMBER,
     out_of_reach: bool = False,
     force: bool = False,
     progress: Progress = quiet,
@@ -274,7 +273,7 @@ def track_path(
         track = best_track(domain, path, tol, attempts, lead_in)
     n_lead = len(lead_in) - 1
     rounded = None
-    if counts is not None:
+    if counts:
         exact = track
         lead_in = _rounded(lead_in, counts, domain)
         track = _with_commands(
@@ -323,7 +322,7 @@ def track_path(
     _add_path(report, model, track)
     _add_commands(report, domain, whole.t, commands, n_lead)
     statuses = [LEAD_IN] * n_lead + statuses
-    digits = 9 if counts is None else 15
+    digits = 15 if counts else 9
     _add_track(report, whole, commands, statuses, model.description_.log, digits)
     report.write(out)
     return report
@@ -337,7 +336,7 @@ def _expected(
     The directions in which the solver and the model miss a point do not depend on each other.
     """
     promised = promised_errors(model, track.effective[rows])
-    if promised is None or len(promised.mean) == 0:
+    if not promised.known:
         return {}
     missed = track.error[rows]
     means = np.hypot(promised.mean, missed)
@@ -481,9 +480,7 @@ def best_track(
 def _in_steps(path: trajectories.Trajectory, n: int) -> trajectories.Trajectory:
     """Return the path with every segment between two points cut into n."""
     places = np.arange((len(path) - 1) * n + 1) / n
-    return trajectories.interpolated(
-        path, np.interp(places, np.arange(len(path)), path.t)
-    )
+    return trajectories.interpolated(path, np.interp(places, np.arange(len(path)), path.t))
 
 
 def _thinned(track: Track, every: int) -> Track:
@@ -531,9 +528,7 @@ def _steps(track: Track) -> NDArray:
     return np.diff(track.t, prepend=track.t[0])
 
 
-def _with_commands(
-    track: Track, q: NDArray, domain: Domain, tol: float, state: Any
-) -> Track:
+def _with_commands(track: Track, q: NDArray, domain: Domain, tol: float, state: Any) -> Track:
     """Return a track with commands q (N, n) that are sent alone, and what they do."""
     model = domain.model
     effective = q
@@ -568,9 +563,7 @@ def read_track(path: str | Path, log_format: robots.LogFormat) -> Log:
     if file.is_dir():
         file = file / "track.csv"
     if not file.is_file():
-        raise FileNotFoundError(
-            f"`track` must be a file of commands, there is none at {file}."
-        )
+        raise FileNotFoundError(f"`track` must be a file of commands, there is none at {file}.")
     columns = replace(log_format, groups=None)
     with open(file, encoding="utf-8", errors="replace") as text:
         first_line = text.readline().rstrip("\n")
@@ -612,9 +605,7 @@ def _text(values: NDArray, digits: int = 9) -> NDArray:
     return np.char.mod(f"%.{digits}g", values + 0.0).T  # no -0
 
 
-def _add_path(
-    report: Report[TrackRecord], model: HybridForwardModel, track: Track
-) -> None:
+def _add_path(report: Report[TrackRecord], model: HybridForwardModel, track: Track) -> None:
     plots = hybridkin.plots
     figure, axes = plots.new_figure(11.0, 4.6, 1, 3)
     display = plots.TrackingDisplay.from_tracks({f"solver on {kind_of(model)}": track})
@@ -644,17 +635,13 @@ def _add_commands(
     rings = model.module_.tip_model.robot.rings or (slice(0, model.n_features_in_),)
     counts = [ring.stop - ring.start for ring in rings]
     n = len(counts)
-    figure, axes = hybridkin.plots.new_figure(
-        7.0, 1.0 + 1.8 * n, n, 1, sharex=True, squeeze=False
-    )
+    figure, axes = hybridkin.plots.new_figure(7.0, 1.0 + 1.8 * n, n, 1, sharex=True, squeeze=False)
     low, high = domain.limits.commands
     display = hybridkin.plots.ActuatorDisplay(
         commands, counts, t, names=log_format.q, limits=np.stack([low, high])
     )
     display.plot(axes[:, 0], unit=log_format.q_unit, per_unit=log_format.q_factor)
-    caption = (
-        "Commands and their limits, with the names, unit and sign of the robot's logs."
-    )
+    caption = "Commands and their limits, with the names, unit and sign of the robot's logs."
     if n_lead:
         for ax in axes[:, 0]:
             ax.axvline(t[n_lead], color="0.6", linewidth=1.0)

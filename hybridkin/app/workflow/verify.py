@@ -30,6 +30,7 @@ from hybridkin.app.workflow.report import Report, check_out, millimetres, percen
 from hybridkin.app.workflow.track import LEAD_IN, read_track
 from hybridkin.arguments import check_tips, number
 from hybridkin.datasets import Log, load_log, log_columns
+from hybridkin.native import evaluate
 
 _KEPT = 1.5  # largest mean error of a kept promise, relative to the promised one
 _OFF = 0.01  # least distance from the plane of the log, as a share of the range of the commands
@@ -120,9 +121,7 @@ class Verification:
         if self.kept:
             report.text("The promise is kept.")
         elif self.cause is None:
-            report.text(
-                "None of the known causes explains the error; check load and friction."
-            )
+            report.text("None of the known causes explains the error; check load and friction.")
         else:
             report.text(f"Likely cause: {self.cause}. To do: {self.remedy}.")
             if self.amount:
@@ -224,9 +223,7 @@ def verify_track(
     rows = rows[used]
     x = x[used]
     if len(rows) < 3:
-        raise ValueError(
-            f"`log` must have at least 3 measured tips of the path, got {len(rows)}."
-        )
+        raise ValueError(f"`log` must have at least 3 measured tips of the path, got {len(rows)}.")
     q = motion[rows]
     predicted = tips_at(model, q)
     later = None
@@ -240,7 +237,7 @@ def verify_track(
         if part.any():
             parts[name] = _errors_of(part, errors, promised)
     kept = None
-    if promised is not None:
+    if promised.known:
         kept = bool(parts["path"].mean <= _KEPT * parts["path"].promised)
     compared = compare_causes(_evidence(model, sent, motion, rows, x, promised))
     cause = None
@@ -271,9 +268,7 @@ def verify_track(
         delay=delay,
         later=later,
     )
-    title = (
-        f"{model.description_.name}: {Path(track).name} against {Path(log.source).name}"
-    )
+    title = f"{model.description_.name}: {Path(track).name} against {Path(log.source).name}"
     report = Report(title, record)
     record._write(report)
     if out is not None:
@@ -342,11 +337,7 @@ def _parts(model: HybridForwardModel, q: NDArray) -> dict[str, NDArray]:
     return parts
 
 
-def _errors_of(
-    rows: NDArray, errors: NDArray, promised: ExpectedErrors | None
-) -> PartErrors:
-    if promised is None:
-        return PartErrors.of(errors[rows])
+def _errors_of(rows: NDArray, errors: NDArray, promised: ExpectedErrors) -> PartErrors:
     return PartErrors.of(
         errors[rows],
         promised=promised.mean[rows].mean(),
@@ -370,7 +361,7 @@ def _evidence(
     motion: NDArray,
     rows: NDArray,
     x: NDArray,
-    promised: ExpectedErrors | None,
+    promised: ExpectedErrors,
 ) -> Evidence:
     """Return the evidence of measured tips x (N, 3) at rows (N,) of a motion (T, n)."""
     order = np.argsort(rows, kind="stable")
@@ -384,13 +375,14 @@ def _evidence(
     if is_fitted(model):
         low, high = model.training_range_
     expected = 0.0
-    if promised is not None:
+    if promised.known:
         expected = float(promised.mean.mean())
     return Evidence(
         motion=Motion.of(motion, sent.time, None),
         rows=rows,
         x=x[order],
         model=model.module_.tip_model,
+        path=evaluate(model.module_.tip_model, motion)[0],
         bodies=bodies,
         actuators=_actuators(model.description_.log, robot.actuator_layout),
         inside=domain_distance(model, q - off_plane) <= 1.0,
@@ -428,9 +420,7 @@ def _off_plane(model: HybridForwardModel, q: NDArray) -> NDArray:
     return np.where(np.abs(off).max() > _OFF * np.ptp(q, axis=0).max(), off, 0.0)
 
 
-def read_tips(
-    path: str | Path, log_format: robots.LogFormat, delimiter: str | None = None
-) -> Log:
+def read_tips(path: str | Path, log_format: robots.LogFormat, delimiter: str | None = None) -> Log:
     """Return the tips of a file of a camera, which holds none of the commands.
 
     Parameters

@@ -79,9 +79,7 @@ class Creep(Stage):
 class SlowParts(Follower):
     """Creep with shares (J, n) and time constants (J,), as in stage_creep.h."""
 
-    def __init__(
-        self, shares: NDArray, times: NDArray, state: NDArray, rounding: float
-    ) -> None:
+    def __init__(self, shares: NDArray, times: NDArray, state: NDArray, rounding: float) -> None:
         super().__init__(state)
         self.shares = shares
         self.times = times

@@ -26,7 +26,7 @@ typedef struct {
 enum { NEAR_EQUATION = -1, NEAR_NONE = -2 };
 typedef struct {
     int N, count, rounds, chosen, which[NEAR_MOST];
-    real x[NEAR_MOST], e[IK_MOST_ROWS], force[NEAR_MOST], pushed; /* pushed: by the one chosen */
+    real x[NEAR_MOST], first[IK_MOST_ROWS], e[IK_MOST_ROWS], force[NEAR_MOST], pushed; /* pushed: by the one chosen */
     real free[NEAR_MOST * NEAR_MOST];    /* projector (N, N) onto the directions that they leave */
     real inverse[NEAR_MOST * NEAR_MOST]; /* rows (N) of the pseudo-inverse of their normals */
 } near_state;
@@ -96,7 +96,7 @@ static inline void near_begin(const near_problem *p, near_state *s) {
     for (int j = 0; j < N; j++) s->x[j] = j < n ? p->z[j] : R(0.0);
     for (int i = 0; i < N * N; i++) s->free[i] = i % (N + 1) ? R(0.0) : R(1.0);
     for (int i = 0; i < p->m; i++) {
-        real missing = s->e[i] = p->v[i] + p->excess * p->mu[i];
+        real missing = s->e[i] = s->first[i];
         for (int j = 0; j < N; j++) {
             normal[j] = j < n ? p->J[n * i + j] : j == n + i ? p->damping : R(0.0);
             missing -= normal[j] * s->x[j];
@@ -134,7 +134,11 @@ static inline int near_worst(const near_problem *p, const near_state *s) {
         const int which = k < n ? k : k < 2 * n ? N + k - n : 2 * (N - n) + k;
         const real end = k < n ? p->lower[k] : k < 2 * n ? p->upper[k - n] : p->b[k - 2 * n];
         const real beyond = near_beyond(p, s, which);
-        if (!(beyond > most && beyond > close + unit * ik_abs(end))) continue;
+        if (!(beyond > most)) continue;
+        real size = unit * ik_abs(end) + (k < 2 * n ? close : R(0.0)); /* bounds clip at last */
+        for (int j = 0; k >= 2 * n && j < n; j++)
+            size += unit * ik_abs(p->A[n * (k - 2 * n) + j] * s->x[j]);
+        if (!(beyond > size)) continue;
         int active = 0;
         for (int c = 0; c < s->count; c++) active |= s->which[c] == which;
         if (!active) most = beyond, worst = which;
@@ -243,6 +247,7 @@ static inline int near_change(const near_problem *p, near_state *s) {
 /* dq (n), exactly within the bounds, and at those that it reaches up to rounding. */
 static HK_NOINLINE void ik_nearest(const near_problem *p, real *dq) {
     near_state s;
+    for (int i = 0; i < p->m; i++) s.first[i] = p->v[i] + p->excess * p->mu[i];
     near_begin(p, &s);
     for (int change = 0; change < IK_CHANGES; change++) {
         if (s.chosen < 0) s.chosen = near_worst(p, &s), s.pushed = R(0.0);

@@ -46,6 +46,7 @@ def evidence(x, q=Q, chain=CHAIN, alignment=None, noise=2e-5, seed=1):
         rows=np.arange(n_rows),
         x=x,
         model=chain,
+        path=tips(q, chain),
         bodies=[chain],
         actuators=Actuators(NAMES, "mm", np.full(6, 1e-3), chain.actuator_layout),
         inside=np.ones(n_rows, dtype=bool),

@@ -116,6 +116,11 @@ def test_a_fit_to_a_thinned_log_knows_all_of_its_rows(log, tmp_path):
     assert fitted_rows(loaded, measured.q, measured.x, measured.motions).all()
     assert not fitted_rows(loaded, measured.q, measured.x + 1e-5, measured.motions).any()
     assert held_out_errors(loaded).mean == record.held_out[record.saved].mean > 0.0
+    again = loaded.fit(measured.q, measured.x)  # a new model, of which no file tells
+    assert not again.description_.created
+    assert not again.description_.training
+    with pytest.raises(FileNotFoundError, match="`model` must be a saved model, the folder of a"):
+        open_model(tmp_path / "nothing")
     nominal = open_model(robot)
     assert not fitted_rows(nominal, measured.q, measured.x, measured.motions).any()
     report = workflow.evaluate_log(nominal, measured)

@@ -28,9 +28,7 @@ class Follower:
         self.log = self.model.description_.log
         self.names = list(self.log.q)
         factors = np.abs(self.log.q_factor)
-        limits = workflow.path_limits(
-            self.model, dq_max=dq_max * factors if dq_max > 0.0 else None
-        )
+        limits = workflow.path_limits(self.model, dq_max=dq_max * factors if dq_max > 0.0 else None)
         self._low, self._high = limits.commands
         self._ik = InverseKinematics(
             self.model,
@@ -51,9 +49,7 @@ class Follower:
         values = dict(zip(names, positions, strict=True))
         missing = [name for name in self.names if name not in values]
         if missing:
-            raise ValueError(
-                f"joint states lack {missing}; the model needs {self.names}."
-            )
+            raise ValueError(f"joint states lack {missing}; the model needs {self.names}.")
         row = np.array([values[name] for name in self.names])
         q = np.clip(self.log.from_log(row), self._low, self._high)
         self._tracker = self._ik.tracker(q, tol=self._tolerance)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridkin.app.checks.rotations import nearest_turn
+from hybridkin.rotations import nearest_rotation
 
 
 class Alignment:
@@ -33,6 +33,6 @@ class FreeBase(Alignment):
         center = normalised @ tips
         target = normalised @ x
         centred = tips - center
-        turn, trace = nearest_turn((normalised[:, None] * (x - target)).T @ centred)
+        turn, trace = nearest_rotation((normalised[:, None] * (x - target)).T @ centred)
         size = max(normalised @ np.square(centred).sum(axis=1), np.finfo(float).tiny)
         return trace / size * centred @ turn.T + target

@@ -68,17 +68,13 @@ class OffPlane(LinearCause):
 
     def columns(self, evidence: Evidence) -> NDArray:
         """Return the distances from the plane, for each coordinate, (N, 3, 3 n)."""
-        return np.kron(np.eye(3), evidence.off_plane[:, None, :]).reshape(
-            len(evidence.rows), 3, -1
-        )
+        return np.kron(np.eye(3), evidence.off_plane[:, None, :]).reshape(len(evidence.rows), 3, -1)
 
     def amount(self, evidence: Evidence, parameters: NDArray) -> str:
         """Return how far commands are off the plane in words."""
         actuators = evidence.actuators
         far = np.abs(evidence.off_plane / actuators.per_unit).max()
-        return f"commands are up to {far:.3g} {actuators.unit} off it".replace(
-            "  ", " "
-        )
+        return f"commands are up to {far:.3g} {actuators.unit} off it".replace("  ", " ")
 
 
 class OutsideTheLog(Cause):
@@ -137,9 +133,7 @@ class Misread(Cause):
         return [cls(tuple(np.sort(evidence.rows[misread]).tolist()))]
 
     @classmethod
-    def _sudden(
-        cls, evidence: Evidence, residual: NDArray, far: NDArray
-    ) -> Sequence[Self]:
+    def _sudden(cls, evidence: Evidence, residual: NDArray, far: NDArray) -> Sequence[Self]:
         """Return the one block of rows between two jumps of the residual, if it is far off."""
         jumps = np.linalg.norm(np.diff(residual, axis=0), axis=1)
         if len(jumps) < 8:
@@ -211,9 +205,7 @@ class ModelError(Cause):
             columns.append(z[:, first] * z[:, second])
         return np.hstack(columns)
 
-    def fit(
-        self, evidence: Evidence, used: NDArray, start: NDArray, rounds: int
-    ) -> NDArray:
+    def fit(self, evidence: Evidence, used: NDArray, start: NDArray, rounds: int) -> NDArray:
         """Return the weights (3 F,) of the features for some rows, by ridge regression."""
         features = self._features(evidence)
         fitted = features[used]

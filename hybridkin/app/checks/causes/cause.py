@@ -81,9 +81,7 @@ class Cause(ABC):
         """Return the rows (N,) of bool about which the cause says nothing."""
         return np.zeros(len(evidence.rows), dtype=bool)
 
-    def fit(
-        self, evidence: Evidence, used: NDArray, start: NDArray, rounds: int
-    ) -> NDArray:
+    def fit(self, evidence: Evidence, used: NDArray, start: NDArray, rounds: int) -> NDArray:
         """Return the parameters (P,) for some rows: Gauss-Newton on robust distances.
 
         Parameters
@@ -126,16 +124,12 @@ class Cause(ABC):
                 break
         return parameters
 
-    def aligned(
-        self, evidence: Evidence, parameters: NDArray, weights: NDArray
-    ) -> NDArray:
+    def aligned(self, evidence: Evidence, parameters: NDArray, weights: NDArray) -> NDArray:
         """Return the tips (N, 3) in the measuring frame, aligned by rows with weights (N,) [m]."""
         tips = self.tips(evidence, parameters)
         return evidence.alignment.aligned(tips, evidence.x, weights)
 
-    def _residual(
-        self, evidence: Evidence, parameters: NDArray, weights: NDArray
-    ) -> NDArray:
+    def _residual(self, evidence: Evidence, parameters: NDArray, weights: NDArray) -> NDArray:
         return self.aligned(evidence, parameters, weights) - evidence.x
 
 
@@ -150,9 +144,7 @@ class LinearCause(Cause):
         """Return the tips (N, 3) with these parameters (P,) [m]."""
         return evidence.tips + self.columns(evidence) @ parameters
 
-    def fit(
-        self, evidence: Evidence, used: NDArray, start: NDArray, rounds: int
-    ) -> NDArray:
+    def fit(self, evidence: Evidence, used: NDArray, start: NDArray, rounds: int) -> NDArray:
         """Return the parameters (P,) for some rows, by weighted least squares."""
         columns = self.columns(evidence)[used]
         residual = (evidence.x - evidence.tips)[used]

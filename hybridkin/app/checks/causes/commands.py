@@ -17,9 +17,7 @@ from hybridkin.app.checks.causes.evidence import Evidence
 _STILL = 1e-3  # of the largest range: an actuator that moves less does not move
 _LARGER = 1.5  # least factor by which bends are of another size
 _LEAST_GAIN = 0.2  # an actuator that moves less is dead
-_AWAY = (
-    0.05  # of the range: values at the first row this far from the rest are not at rest
-)
+_AWAY = 0.05  # of the range: values at the first row this far from the rest are not at rest
 
 
 def _moved_actuators(evidence: Evidence) -> list[int]:
@@ -298,9 +296,7 @@ class Numbering(Reading):
     """The actuators of every segment are numbered in the other direction."""
 
     name = "numbering in the other direction"
-    remedy = (
-        "set clockwise in every [[segment]], or list the columns in the other order"
-    )
+    remedy = "set clockwise in every [[segment]], or list the columns in the other order"
 
     @classmethod
     def members(cls, evidence: Evidence) -> Sequence[Self]:
@@ -367,9 +363,7 @@ class Size(ActuatorCause):
         straight = np.broadcast_to(actuators.rest, evidence.q.shape).copy()
         for columns in actuators.segments:
             if actuators.absolute[columns].all():
-                straight[:, columns] = evidence.q[:, columns].mean(
-                    axis=1, keepdims=True
-                )
+                straight[:, columns] = evidence.q[:, columns].mean(axis=1, keepdims=True)
         return straight + self._factor(parameters) * (evidence.q - straight)
 
     def _factor(self, parameters: NDArray) -> float:

@@ -74,9 +74,7 @@ _FOLDS = 5
 _SCREENED = 100  # rows of the first fits
 _ROUNDS = (1, 8, 1)  # iterations of the first fits, of the best, and in each fold
 _CANDIDATES = 2  # of a kind, which are fitted to all rows
-_RIVAL = (
-    1.2  # ratio of the error of a candidate that may become the best, and of the best
-)
+_RIVAL = 1.2  # ratio of the error of a candidate that may become the best, and of the best
 _LAST_RESORT = 1.5  # ratio of the errors that a named cause and the last resort leave
 _MOST_NOISE = 0.5  # of the error: largest difference that can be noise
 _AS_MUCH = 0.1  # of the error: causes that differ less explain as much
@@ -203,9 +201,7 @@ def blocks(n_rows: int) -> NDArray:
     return min(_BLOCKS, n_rows) * np.arange(n_rows) // n_rows
 
 
-def compare_causes(
-    evidence: Evidence, causes: Sequence[type[Cause]] = CAUSES
-) -> CauseComparison:
+def compare_causes(evidence: Evidence, causes: Sequence[type[Cause]] = CAUSES) -> CauseComparison:
     """Return how much of the error of a model each cause explains on held-out rows.
 
     Parameters
@@ -221,14 +217,10 @@ def compare_causes(
     for kind in causes:
         explanations += _explained(evidence, few, kind)
     (nothing,) = Nothing.members(evidence)
-    return CauseComparison(
-        evidence, _judged(evidence, nothing, np.zeros(0)), explanations
-    )
+    return CauseComparison(evidence, _judged(evidence, nothing, np.zeros(0)), explanations)
 
 
-def _explained(
-    evidence: Evidence, few: Evidence, kind: type[Cause]
-) -> list[Explanation]:
+def _explained(evidence: Evidence, few: Evidence, kind: type[Cause]) -> list[Explanation]:
     """Return the best cause of a kind, judged on held-out rows, if the evidence has any."""
     n_bodies = len(evidence.bodies) if kind.moves_actuators else 1
     screened = []

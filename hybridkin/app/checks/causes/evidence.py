@@ -81,6 +81,8 @@ class Evidence:
         The measured tips [m].
     model : ForwardModel
         Motion of the actuators -> tip [m].
+    path : ndarray of shape (T, 3)
+        Tips of the model along the whole motion [m].
     bodies : sequence of ForwardModel
         The mechanical part of the model, for commands far from its training rows, then robots that
         do alike for such rows and not elsewhere.
@@ -104,6 +106,7 @@ class Evidence:
     rows: NDArray
     x: NDArray
     model: ForwardModel
+    path: NDArray
     bodies: Sequence[ForwardModel]
     actuators: Actuators
     inside: NDArray
@@ -128,11 +131,6 @@ class Evidence:
     def q(self) -> NDArray:
         """What the actuators did at the measured tips, (N, n)."""
         return self.motion.q[self.rows]
-
-    @cached_property
-    def path(self) -> NDArray:
-        """Tips (T, 3) of the model along the motion [m]."""
-        return evaluate(self.model, self.motion.q)[0]
 
     @property
     def tips(self) -> NDArray:
@@ -197,21 +195,17 @@ class Evidence:
 
     def with_body(self, body: int) -> Self:
         """Return the evidence with another mechanical model."""
-        other = replace(self, body=body)
-        vars(other)["path"] = self.path
-        return other
+        return replace(self, body=body)
 
     def some(self, chosen: NDArray) -> Self:
         """Return the evidence of some of the measured tips: places or a mask (N,)."""
-        fewer = replace(
+        return replace(
             self,
             rows=self.rows[chosen],
             x=self.x[chosen],
             inside=self.inside[chosen],
             off_plane=self.off_plane[chosen],
         )
-        vars(fewer)["path"] = self.path
-        return fewer
 
     def followed_by(self, q: NDArray, period: float) -> Self:
         """Return the evidence of a further motion q (K, n), one row each `period`, without tips."""
@@ -225,13 +219,13 @@ class Evidence:
             np.concatenate([before.runs, np.repeat(before.runs[-1:], n_rows)]),
             before.clock,
         )
-        further = replace(
+        tips, *_ = evaluate(self.model, q)
+        return replace(
             self,
             motion=motion,
+            path=np.concatenate([self.path, tips]),
             rows=n_before + np.arange(n_rows),
             x=np.zeros((n_rows, 3)),
             inside=np.ones(n_rows, dtype=bool),
             off_plane=np.zeros_like(q),
         )
-        vars(further)["path"] = np.concatenate([self.path, evaluate(self.model, q)[0]])
-        return further

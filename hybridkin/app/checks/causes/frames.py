@@ -17,7 +17,7 @@ from hybridkin.app.checks.causes.cause import (
     robust_weights,
 )
 from hybridkin.app.checks.causes.evidence import Evidence
-from hybridkin.app.checks.rotations import angle_of, rigid_motion
+from hybridkin.rotations import rigid_motion, rotation_angle
 
 _ROUNDS = 4  # of the weights of a rigid motion
 _UNITS = {
@@ -114,9 +114,7 @@ class MovedBase(Cause):
         """Return no motion: the matrix (3, 4), row by row."""
         return [np.eye(3, 4).ravel()]
 
-    def fit(
-        self, evidence: Evidence, used: NDArray, start: NDArray, rounds: int
-    ) -> NDArray:
+    def fit(self, evidence: Evidence, used: NDArray, start: NDArray, rounds: int) -> NDArray:
         """Return the rigid motion (12,) that brings some rows nearest to the measured tips."""
         rows = used & self.moved_rows(evidence)
         if rows.sum() < 3:
@@ -141,7 +139,7 @@ class MovedBase(Cause):
     def amount(self, evidence: Evidence, parameters: NDArray) -> str:
         """Return the angle, and how far the middle of the tips moves, in words."""
         motion = parameters.reshape(3, 4)
-        turn = angle_of(motion[:, :3])
+        turn = rotation_angle(motion[:, :3])
         middle = evidence.tips.mean(axis=0)
         shift = motion[:, :3] @ middle + motion[:, 3] - middle
         return (

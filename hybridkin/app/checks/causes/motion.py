@@ -96,9 +96,7 @@ class Motion:
         passed = np.clip(self.time[rows] - delay, first[rows], last[rows])
         # One axis of time for all runs: each begins after the end of the one before.
         length = np.array([last[r][0] - first[r][0] for r in self._rows_of_runs])
-        begin = np.append(0.0, np.cumsum(length + self.period))[
-            self.runs - self.runs[0]
-        ]
+        begin = np.append(0.0, np.cumsum(length + self.period))[self.runs - self.runs[0]]
         places = begin + self.time - first
         passed = begin[rows] + passed - first[rows]
         columns = [np.interp(passed, places, column) for column in values.T]

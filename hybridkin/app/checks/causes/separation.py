@@ -15,9 +15,7 @@ _ROWS = 40  # of a sweep
 _HOLD = 10.0  # [s]
 _SLOWER = 10.0
 _CLEARLY = 1.1  # ratio of the differences on a later motion and on a simpler one
-_TOLD = (
-    3.0  # times the error that is left: least difference that tells two causes apart
-)
+_TOLD = 3.0  # times the error that is left: least difference that tells two causes apart
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,9 +34,7 @@ class Separation:
     difference: float
 
 
-def separating_motion(
-    evidence: Evidence, one: Explanation, other: Explanation
-) -> Separation:
+def separating_motion(evidence: Evidence, one: Explanation, other: Explanation) -> Separation:
     """Return the simple motion in the range of the model on which two fitted causes differ most.
 
     The candidates move one actuator alone out and back, all together from one end of the range to
@@ -80,9 +76,7 @@ def _candidates(evidence: Evidence) -> list[tuple[str, NDArray, float]]:
     far = still.copy()
     far[: _ROWS // 8] = evidence.high
     pause = max(_HOLD / _ROWS, period)
-    candidates.append(
-        ("go far out and back at once, then hold still for 10 s", far, pause)
-    )
+    candidates.append(("go far out and back at once, then hold still for 10 s", far, pause))
     return candidates
 
 

@@ -124,18 +124,14 @@ class Creep(_Hysteresis):
         beginnings = []
         for late_part in _SHARES:
             for time in _TIMES:
-                beginnings.append(
-                    np.array([np.log(late_part / (1.0 - late_part)), np.log(time)])
-                )
+                beginnings.append(np.array([np.log(late_part / (1.0 - late_part)), np.log(time)]))
         return beginnings
 
     def steps(self, evidence: Evidence) -> NDArray:
         """Return one for both."""
         return np.ones(2)
 
-    def _share_and_time(
-        self, motion: Motion, parameters: NDArray
-    ) -> tuple[float, float]:
+    def _share_and_time(self, motion: Motion, parameters: NDArray) -> tuple[float, float]:
         late_part = 0.95 / (1.0 + np.exp(-np.clip(parameters[0], -30.0, 30.0)))
         longest = np.log(motion.duration / motion.period)
         time = motion.period * np.exp(np.clip(parameters[1], -1.0, max(longest, 0.0)))
