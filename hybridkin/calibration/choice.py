@@ -243,7 +243,7 @@ def choose_geometry(
     if weights is None:
         weights = np.ones(len(q))
     weights = as_tensor(weights, "weights").to(q)
-    given = tuple(parameters or ())
+    names = tuple(parameters or ())
     first, counts, _ = distinct_rows(q, x, weights, motions.apart)
     motions = motions.take(first)
     order = np.argsort(motions.labels, kind="stable")
@@ -251,8 +251,8 @@ def choose_geometry(
     rows = TipRows(q[first], x[first], torch.from_numpy(counts).to(q)).take(chosen)
     motions = motions.take(chosen)
     with torch.no_grad():
-        candidates = _candidates(chain, q, given)
-        messages = () if given else unmoved(chain, q)
+        candidates = _candidates(chain, q, names)
+        messages = () if names else unmoved(chain, q)
     if len(starts) < len(candidates):
         starts = _starts(candidates, rows, loss)
     starts = starts[: len(candidates)]
@@ -316,13 +316,13 @@ def _best(
     return simplest_within(np.where(good, scores, np.inf), _EQUAL)
 
 
-def _candidates(chain: Chain, q: Tensor, given: tuple[str, ...]) -> list[_Candidate]:
-    """Return the sets to choose from, the smaller ones first; or of given parameters one."""
-    sets = [given] if given else chain.parameter_sets
+def _candidates(chain: Chain, q: Tensor, names: tuple[str, ...]) -> list[_Candidate]:
+    """Return the sets to choose from, the smaller ones first; of named parameters one."""
+    sets = [names] if names else chain.parameter_sets
     candidates = [_Candidate(_name(names), chain, names) for names in sets]
     for elastic in chain.rivals(q):
         elastic_sets = [names for names in elastic.parameter_sets if len(names) > 1]
-        if given:
+        if names:
             elastic_sets = [_elastic_parameters(chain, elastic, sets[0])]
         for names in elastic_sets:
             candidates.append(_Candidate(_RIVAL + _name(names), elastic, names))

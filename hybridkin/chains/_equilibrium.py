@@ -165,12 +165,12 @@ def shapes_of_least_energy(statics: Statics, forces: Tensor, start: Tensor) -> F
     """
     unit = statics.unit
     n = len(unit)
-    found = Found(
+    shapes = Found(
         statics.rest[:, None].expand(-1, len(forces)).clone(),
         forces.new_zeros(len(forces), n, n),
         torch.full_like(forces[:, 0], Outcome.NOT_FOUND, dtype=torch.long),
     )
-    found.outcome[~forces.isfinite().all(1)] = Outcome.INVALID
+    shapes.outcome[~forces.isfinite().all(1)] = Outcome.INVALID
     live = _started(statics, forces, start)
     live = live.take(live.imbalance.norm(dim=1).isfinite() & live.tol.isfinite())
     for _ in range(_MOST_STEPS):
@@ -181,16 +181,16 @@ def shapes_of_least_energy(statics: Statics, forces: Tensor, start: Tensor) -> F
         at_rest = (size <= live.tol) & step.is_stable
         stuck = live.take(step.is_stuck)
         why = torch.where(_is_short(statics, stuck), Outcome.COMPRESSED, Outcome.BUCKLED)
-        found.outcome[stuck.row] = why
+        shapes.outcome[stuck.row] = why
         if at_rest.any():
-            _record(found, statics, live.take(at_rest))
+            _record(shapes, statics, live.take(at_rest))
         going = ~(at_rest | step.is_stuck)
         if not going.all():
             live = live.take(going)
             step.way = step.way[going]
         if len(live.row):
             _move(statics, live, step.way)
-    return found
+    return shapes
 
 
 def _started(statics: Statics, forces: Tensor, start: Tensor) -> _Live:
@@ -266,17 +266,17 @@ def _move(statics: Statics, live: _Live, way: Tensor) -> None:
     live.damping = torch.where(accepted, less, more)
 
 
-def _record(found: Found, statics: Statics, live: _Live) -> None:
+def _record(shapes: Found, statics: Statics, live: _Live) -> None:
     """Put shapes at rest into the results, unless an arc is too short."""
     is_short = _is_short(statics, live)
-    found.outcome[live.row[is_short]] = Outcome.COMPRESSED
+    shapes.outcome[live.row[is_short]] = Outcome.COMPRESSED
     if is_short.any():
         live = live.take(~is_short)
     eye = identity(live.hessian.shape[1], live.hessian).expand_as(live.hessian)
     inverse, _ = torch.linalg.solve_ex(live.hessian, eye)
-    found.outcome[live.row] = Outcome.AT_REST
-    found.arcs[:, live.row] = live.arcs.mT
-    found.compliance[live.row] = statics.unit[:, None] * inverse * statics.unit
+    shapes.outcome[live.row] = Outcome.AT_REST
+    shapes.arcs[:, live.row] = live.arcs.mT
+    shapes.compliance[live.row] = statics.unit[:, None] * inverse * statics.unit
 
 
 def _is_short(statics: Statics, live: _Live) -> Tensor:

@@ -76,8 +76,8 @@ def _one_or_many(test: _Test) -> _Test:
     return lambda value: test(value) or _many(test)(value)
 
 
-def _among(*known: Any) -> tuple[str, _Test]:
-    return f"be one of {known}", lambda v: type(v) is type(known[0]) and v in known
+def _among(*values: Any) -> tuple[str, _Test]:
+    return f"be one of {values}", lambda v: type(v) is type(values[0]) and v in values
 
 
 _TABLE = ("be a table of keys", lambda value: isinstance(value, dict))
@@ -250,9 +250,9 @@ def _check_keys_of_model(table: Mapping[str, Any], where: str, model: str) -> No
     for key in table:
         models = _MODELS.get(key, _CHAINS)
         if model not in models:
-            known = " or ".join(f'"{name}"' for name in models)
+            choices = " or ".join(f'"{name}"' for name in models)
             raise ValueError(
-                f"`{key}` in {where} belongs to another model; remove it, or set model = {known}."
+                f"`{key}` in {where} belongs to another model; remove it, or set model = {choices}."
             )
     for key in _NEEDED.get(model, ()):
         if key not in table:

@@ -414,17 +414,17 @@ class ForceTendonChain(ElasticBody):
         the implicit function theorem the first one gives the first derivative, the second one the
         second. Their values count only where they make the imbalance smaller.
         """
-        found, compliance, is_known = self._shapes(q)
+        arcs, compliance, is_known = self._shapes(q)
         statics = self._statics().at(q)
         forces = self.forces(torch.where(is_known[:, None], q, 0.0))
-        first = Shape(statics, found, forces).imbalance.mT
-        stepped = found - applied(compliance, first).mT
+        first = Shape(statics, arcs, forces).imbalance.mT
+        stepped = arcs - applied(compliance, first).mT
         second = Shape(statics, stepped, forces).imbalance.mT
         arcs = stepped - applied(compliance, second).mT
 
         unit = statics.unit
         is_better = (unit * second).norm(dim=1) < (unit * first).norm(dim=1)
-        value = torch.where(is_better, stepped, found).detach()
+        value = torch.where(is_better, stepped, arcs).detach()
         arcs = value + (arcs - arcs.detach())
         return torch.where(is_known, arcs, torch.nan)
 
@@ -443,17 +443,17 @@ class ForceTendonChain(ElasticBody):
         """Return what `_shapes` returns side by side (N, ...), for entries of the geometry."""
         geometry = dict(zip(self._entries, entries, strict=True))
         chain = self.with_geometry(**geometry)
-        found = chain._found(q)
+        shapes = chain._found(q)
         first = first_row()
         last = self._last
         if last is not None:
             last.q = q
-            last.arcs = found.arcs
+            last.arcs = shapes.arcs
         elif first is not None:
-            for message in chain._missing(q, found.outcome, first):
+            for message in chain._missing(q, shapes.outcome, first):
                 warnings.warn(f"{message} Results are NaN there.", stacklevel=2)
-        is_known = found.outcome == Outcome.AT_REST
-        parts = [found.arcs.mT, found.compliance.flatten(1), is_known[:, None].to(q)]
+        is_known = shapes.outcome == Outcome.AT_REST
+        parts = [shapes.arcs.mT, shapes.compliance.flatten(1), is_known[:, None].to(q)]
         return torch.cat(parts, dim=1)
 
     def _found(self, q: Tensor) -> Found:

@@ -303,25 +303,25 @@ def merge_logs(
     else:
         lag = number(lag, "lag")
     time = tips.time - lag
-    kept, runs = _covered(commands, time, _longest_gap(commands, tolerance, hold))
-    if not kept.any():
+    is_covered, runs = _covered(commands, time, _longest_gap(commands, tolerance, hold))
+    if not is_covered.any():
         raise ValueError(
             f"No camera row lies between two motor rows: at the lag of {lag:.4f} s the camera "
             f"records from {time[0]:.6g} to {time[-1]:.6g} s, the motors from "
             f"{commands.time[0]:.6g} to {commands.time[-1]:.6g} s; give `lag`, or a larger "
             "`tolerance`."
         )
-    q = commands_at(commands, time[kept], hold)
-    x = tips.values[kept]
+    q = commands_at(commands, time[is_covered], hold)
+    x = tips.values[is_covered]
     groups = commands.groups
     if groups is not None:
-        groups = groups[_row_before(commands, time[kept])]
+        groups = groups[_row_before(commands, time[is_covered])]
     log = Log(
         q,
         x,
         groups=groups,
-        time=time[kept],
-        runs=runs[kept],
+        time=time[is_covered],
+        runs=runs[is_covered],
         q_names=motors.names,
         x_names=camera.names,
         units={"q": _si_unit(motors.unit), "x": "m"},
@@ -335,7 +335,7 @@ def merge_logs(
             f"explain at most {explained:.0%} of the motion of the tip, at {lag:.4f} s. Check that "
             "both record the same motion, or give `lag` (0 if they share a clock)."
         )
-    n_left_out = len(camera.time) - int(kept.sum())
+    n_left_out = len(camera.time) - int(is_covered.sum())
     return Merged(log, lag, explained, is_estimated, n_left_out)
 
 
@@ -352,9 +352,14 @@ def _measured(camera: TimedColumns) -> TimedColumns:
     markers = camera.values.reshape(len(camera.time), -1, 3)
     complete = countable(markers).all(axis=2)
     values = np.where(complete.repeat(3, axis=1), camera.values, np.nan)
-    kept = complete.any(axis=1)
+    is_complete = complete.any(axis=1)
     return TimedColumns(
-        values[kept], camera.time[kept], camera.names, camera.unit, None, camera.source
+        values[is_complete],
+        camera.time[is_complete],
+        camera.names,
+        camera.unit,
+        None,
+        camera.source,
     )
 
 

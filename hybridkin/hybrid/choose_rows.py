@@ -164,7 +164,7 @@ def _chosen(
     rows: Tensor,
     q: Tensor,
     n: int,
-    known: Tensor,
+    measured: Tensor,
     aim: Tensor,
 ) -> tuple[list[int], NDArray]:
     """Return n of the motions q (G, R, n), and the errors; `rows` set the units."""
@@ -173,7 +173,7 @@ def _chosen(
             errors = _StructuralErrors(robot, model, rows)
         else:
             errors = _TipErrors(robot, rows)
-        return _greedy(errors, q, n, known, aim)
+        return _greedy(errors, q, n, measured, aim)
 
 
 def _few_rows_of(groups: NDArray) -> tuple[NDArray, NDArray]:
@@ -357,7 +357,7 @@ class _TipErrors(_Errors):
 
 
 def _greedy(
-    errors: _Errors, q: Tensor, n: int, known: Tensor, aim: Tensor
+    errors: _Errors, q: Tensor, n: int, measured: Tensor, aim: Tensor
 ) -> tuple[list[int], NDArray]:
     """Return n of the motions q (G, R, n), each the best given those before, and the errors.
 
@@ -370,7 +370,7 @@ def _greedy(
     times = errors.times(flat)
     noise = _of_motions(errors.noise(flat), size)
     M = errors.gram(aim) / len(aim)
-    information = identity(len(M), M) + errors.information(known)
+    information = identity(len(M), M) + errors.information(measured)
     S = torch.cholesky_inverse(torch.linalg.cholesky(information))
     SMS = S @ M @ S
     blocks = (errors.design(part.flatten(0, 1)) for part in q.split(_BLOCK // size))

@@ -755,10 +755,10 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
             return np.ones(len(commands), dtype=bool)
         rows = check_inputs(self, commands.q)
         low, high = states_of_log.shifted(-self.change_.shift)
-        seen = np.ones(len(commands), dtype=bool)
+        is_tested = np.ones(len(commands), dtype=bool)
         states = self.hysteresis_.each_inner_state(rows, commands.run_of_rows, commands.time)
         for k, state in enumerate(states):
-            seen &= ((low[k] <= state) & (state <= high[k])).all(axis=1)
+            is_tested &= ((low[k] <= state) & (state <= high[k])).all(axis=1)
         if self._fit.pace is not None and commands.time is not None:
             paces = each_pace(
                 rows,
@@ -766,8 +766,8 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 commands.time,
                 self.hysteresis_.time_constants,
             )
-            seen &= self._fit.pace.holds(paces, len(rows))
-        return seen
+            is_tested &= self._fit.pace.holds(paces, len(rows))
+        return is_tested
 
     def take_fit(self, fit: HybridFit) -> None:
         """Become the model of a fit; the robot has not changed since."""

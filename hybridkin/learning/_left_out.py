@@ -89,7 +89,7 @@ class LeftOut:
         """Return whether the errors of a split come from `_refitted`."""
         return False
 
-    def _refitted(self, out, asked, alphas):
+    def _refitted(self, out, test_rows, alphas):
         """Return the errors of one split from sums over the remaining rows."""
         raise NotImplementedError
 
@@ -111,30 +111,30 @@ class LeftOut:
             yield rows, errors / self._root[rows, None]
 
     def together(self, splits, alphas):
-        """Yield the asked rows of each split, and their errors (n_alphas, n_asked, n_outputs).
+        """Yield the test rows of each split, and their errors (n_alphas, n_asked, n_outputs).
 
         Parameters
         ----------
-        splits : list of (out, asked)
+        splits : list of (out, test_rows)
             Held-out rows, ascending, and the rows of them to evaluate.
         alphas : ndarray of shape (n_alphas,)
             Penalties.
         """
         D = self._d(alphas)
         for part in self._in_parts(splits, self._rows_at_a_time(len(alphas))):
-            out, asked = part[0]
+            out, test_rows = part[0]
             if self._is_refitted(out):
-                yield asked, self._refitted(out, asked, alphas)
+                yield test_rows, self._refitted(out, test_rows, alphas)
                 continue
             rows = np.concatenate([out for out, _ in part])
             Z = self._z(rows)
             residuals = self._residuals(Z, D, rows)
             start = 0
-            for out, asked in part:
+            for out, test_rows in part:
                 stop = start + len(out)
                 errors = self._solved(Z[start:stop], D, residuals[:, start:stop], out)
-                of_asked = errors[:, np.searchsorted(out, asked)]
-                yield asked, of_asked / self._root[asked, None]
+                test_errors = errors[:, np.searchsorted(out, test_rows)]
+                yield test_rows, test_errors / self._root[test_rows, None]
                 start = stop
 
     def _in_parts(self, splits, n_rows):
@@ -255,7 +255,7 @@ class _OfManyRows(LeftOut):
         """Return whether sums over the remaining rows are faster than P_SS of every penalty."""
         return 2 * len(out) > len(self._center)
 
-    def _refitted(self, out, asked, alphas):
+    def _refitted(self, out, test_rows, alphas):
         n_features = len(self._center)
         # Sums of squares and products of [phi, y], less those of the rows out.
         scatter = self._scatter.copy()
@@ -275,9 +275,9 @@ class _OfManyRows(LeftOut):
         moment = V.T @ scatter[:n_features, n_features:]
         by_alpha = shrunk.T[:, :, None] * moment[:, None]
         W = V @ by_alpha.reshape(n_features, -1)
-        errors = np.empty((len(alphas), len(asked), self._y.shape[1]))
-        for batch in gen_batches(len(asked), self._rows_at_a_time(len(alphas))):
-            rows = asked[batch]
+        errors = np.empty((len(alphas), len(test_rows), self._y.shape[1]))
+        for batch in gen_batches(len(test_rows), self._rows_at_a_time(len(alphas))):
+            rows = test_rows[batch]
             root = self._root[rows, None]
             z = self._features(rows) / root - mean[:n_features]
             y = self._y[rows] / root - mean[n_features:]

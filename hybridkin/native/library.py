@@ -281,8 +281,8 @@ class Program:
         lead = q.shape[:-1]
         n, m = self._sizes
         if q.size == n == q.shape[-1]:
-            asked = HK_J * jacobian + HK_DISTANCE * distance
-            results = self.row(np.asarray(q, np.float64), asked, enough)
+            wanted = HK_J * jacobian + HK_DISTANCE * distance
+            results = self.row(np.asarray(q, np.float64), wanted, enough)
             assert results is not None
             return results
         x = np.empty((*lead, m))
@@ -291,21 +291,21 @@ class Program:
         self._fill(q, [(x, m), (J, m * n), (d, 1)], enough)
         return tuple([a for a in (x, J, d) if a is not None])
 
-    def row(self, q: NDArray, asked: int, enough: float) -> Results | None:
+    def row(self, q: NDArray, wanted: int, enough: float) -> Results | None:
         """Return the results of one row (..., n), quickly: they share an array.
 
         None with HK_IF_SAME in what is asked for, if the sources have changed.
         """
         call = self._call
-        if self._evaluate_row(call.place, q.tobytes(), asked, enough):
+        if self._evaluate_row(call.place, q.tobytes(), wanted, enough):
             return None
         lead = q.shape[:-1]
         n, m = self._sizes
         numbers = call.results.copy()
         results = (numbers[:m].reshape(*lead, m),)
-        if asked & HK_J:
+        if wanted & HK_J:
             results += (numbers[m:-1].reshape(*lead, m, n),)
-        if asked & HK_DISTANCE:
+        if wanted & HK_DISTANCE:
             results += (numbers[-1:].reshape(lead),)
         return results
 
@@ -529,8 +529,8 @@ def evaluate(
     q = np.asarray(q, np.float64)
     compiled = model.__dict__.get("_program")
     if value and compiled is not None and q.shape == compiled.row_shape and compiled.holds():
-        asked = HK_IF_SAME + HK_J * jacobian + HK_DISTANCE * distance
-        results = compiled.program.row(q, asked, enough)
+        wanted = HK_IF_SAME + HK_J * jacobian + HK_DISTANCE * distance
+        results = compiled.program.row(q, wanted, enough)
         if results is not None:
             return results
     program = program_of(model, copies=False)

@@ -94,23 +94,23 @@ def _saved(path: Path, robot: str | Path | None) -> HybridForwardModel:
     beside = path.with_name(_ROBOT)
     if robot is None and path.name == _MODEL and beside.is_file():
         robot = beside
-    known = _of_file(path, opened.description_)
+    description = _of_file(path, opened.description_)
     if robot is not None:
-        known = replace(known, robot=read_description(robot))
+        description = replace(description, robot=read_description(robot))
     n = opened.n_features_in_
-    if known.robot.n_actuators not in (0, n):
+    if description.robot.n_actuators not in (0, n):
         raise ValueError(
-            f"`robot` {known.name!r} has {known.robot.n_actuators} actuators, but the model "
-            f"{path} has {n}; give the description that it was fitted with."
+            f"`robot` {description.name!r} has {description.robot.n_actuators} actuators, but the "
+            f"model {path} has {n}; give the description that it was fitted with."
         )
-    return opened.described(known)
+    return opened.described(description)
 
 
-def _of_file(path: Path, known: ModelDescription) -> ModelDescription:
+def _of_file(path: Path, description: ModelDescription) -> ModelDescription:
     """Return what the header of a file says of its model."""
     header = model_header(path)
     return replace(
-        known,
+        description,
         robot=RobotDescription(path.stem, None, (), None),
         path=path,
         training=header.get("training") or {},

@@ -91,15 +91,15 @@ def path_limits(
         If the range of the actuators is not known.
     """
     n = model.n_features_in_
-    given = {"q_min": q_min, "q_max": q_max, "dq_max": dq_max, "ddq_max": ddq_max}
-    given = {name: _limit(value, name, n) for name, value in given.items()}
+    limit_of = {"q_min": q_min, "q_max": q_max, "dq_max": dq_max, "ddq_max": ddq_max}
+    limit_of = {name: _limit(value, name, n) for name, value in limit_of.items()}
     described = model.description_.limits
     trained = robots.Limits()
     if within_fit or not described.are_finite:
         trained = trained_range(model)
     usual = described.narrowed(half_width(model)).intersect(trained)
     usual = usual.intersect(_rates_of(model))
-    chosen = robots.Limits(**given).narrowed(half_width(model))
+    chosen = robots.Limits(**limit_of).narrowed(half_width(model))
     limits = {}
     for name, limit in vars(chosen).items():
         # Of one given end, scaled to actuators of both signs, some entries are open.
@@ -121,7 +121,7 @@ def path_limits(
     if np.isfinite(trained.q_min).any():
         sources.append("training range")
     source = ", within the ".join(sources)
-    ends = [np.isfinite(given[name]).any() for name in ("q_min", "q_max")]
+    ends = [np.isfinite(limit_of[name]).any() for name in ("q_min", "q_max")]
     if all(ends):
         source = "given"
     elif any(ends):
@@ -141,8 +141,8 @@ def _limit(value: ArrayLike, name: str, n: int) -> NDArray:
 
 def _rates_of(model: HybridForwardModel) -> robots.Limits:
     """Return the limits of speed and acceleration of the model itself."""
-    own = model.module_.tip_model.robot.limits
-    rates = {name: real_array(own[name], name) for name in ("dq_max", "ddq_max")}
+    limits = model.module_.tip_model.robot.limits
+    rates = {name: real_array(limits[name], name) for name in ("dq_max", "ddq_max")}
     return robots.Limits(**rates)
 
 
