@@ -399,7 +399,7 @@ ENTRIES = {
             "q_min": 0.1,
             "q_max": np.full(3, 0.4),
             "dq_max": 1.0,
-            "ddq_max": None,
+            "ddq_max": np.inf,
             "within_fit": False,
         },
     ),

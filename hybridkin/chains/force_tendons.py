@@ -344,7 +344,7 @@ class ForceTendonChain(ElasticBody):
         """
         moved = super().moved(motion)
         if not is_at_rest(motion):
-            down = torch.tensor(self.gravity, dtype=torch.float64)
+            down = torch.tensor(self.gravity, dtype=torch.float64, device="cpu")
             moved.gravity = tuple((motion[:3, :3].to(down) @ down).tolist())
         return moved
 

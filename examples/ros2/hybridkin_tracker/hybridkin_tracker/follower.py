@@ -28,7 +28,8 @@ class Follower:
         self.log = self.model.description_.log
         self.names = list(self.log.q)
         factors = np.abs(self.log.q_factor)
-        limits = workflow.path_limits(self.model, dq_max=dq_max * factors if dq_max > 0.0 else None)
+        fastest = dq_max * factors if dq_max > 0.0 else np.inf
+        limits = workflow.path_limits(self.model, dq_max=fastest)
         self._low, self._high = limits.commands
         self._ik = InverseKinematics(
             self.model,
