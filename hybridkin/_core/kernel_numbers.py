@@ -68,6 +68,7 @@ IK_NO_AXIS = 1e-12  # a direction that is shorter is none
 HK_ASIDE = 0.6  # a component of a unit vector below which a coordinate axis is not along it
 IK_HEALTHY = 0.02  # sigma_min / sigma_max above which no damping is needed
 IK_CHANGES = 400  # of the active constraints of a step; a handful is usual
+IK_CLOSE = 500.0  # rounding by which a step may end beside a bound [eps]
 IK_SWEEPS = 30  # of Jacobi's method for eigenvalues; six are usual
 IK_PROXIMAL = 2  # rounds that remove the effect of the least damping
 IK_NORMALS = 6  # most normals of the plane of a log

@@ -44,9 +44,7 @@ class Polyhedron(NamedTuple):
 
     def rounding(self, x: Tensor) -> Tensor:
         """Return what rounding may leave of the excess of x, shape (N, 2 n + k)."""
-        # Steps are clipped to their bounds at last, but rows must hold as they are.
-        largest = x.abs().amax(-1, keepdim=True)
-        bounds = torch.cat([self.lower, self.upper], dim=-1).abs() + largest
+        bounds = torch.cat([self.lower.abs() + x.abs(), self.upper.abs() + x.abs()], dim=-1)
         rows = apply_rows(self.A.abs(), x.abs()) + self.b.abs()
         return 8.0 * torch.finfo(x.dtype).eps * torch.cat([bounds, rows], dim=-1)
 
@@ -227,6 +225,8 @@ class _Live(NamedTuple):
         The factor of the multipliers in later rounds.
     rounds : Tensor of shape (N,)
         Rounds left.
+    close : Tensor of shape (N,)
+        What rounding of all that led to x may be, once it has been seen.
     equations, active : _Active
         The constraints at the start, and at present.
     chosen : Tensor of shape (N,)
@@ -244,6 +244,7 @@ class _Live(NamedTuple):
     first: Tensor
     excess: Tensor
     rounds: Tensor
+    close: Tensor
     equations: _Active
     active: _Active
     chosen: Tensor
@@ -280,6 +281,7 @@ class _Live(NamedTuple):
             within.e,
             excess,
             rounds,
+            torch.zeros_like(force),
             active,
             active,
             none,
@@ -300,7 +302,8 @@ class _Live(NamedTuple):
         live = self
         for _ in range(1 + IK_PROXIMAL):
             beyond = live.within.excess(live.x)
-            violated = torch.where(beyond > live.within.rounding(live.x), beyond, 0.0)
+            least = live.within.rounding(live.x) + live.close[:, None]
+            violated = torch.where(beyond > least, beyond, 0.0)
             violated = violated.masked_fill(live.active.chosen_of(beyond), 0.0)
             most, worst = violated.max(-1)
             none = (live.chosen < 0) & (most > 0.0)
@@ -332,12 +335,13 @@ class _Live(NamedTuple):
             length = torch.where(pulls, least / size, 0.0)
             x = x - length[:, None] * way
             active = active.without(leaving).pushing(x - self.origin, pulls[:, None])
-        return self._replace(
+        begun = self._replace(
             x=x,
             active=active,
             within=self.within._replace(e=values),
             rounds=self.rounds - ended[:, 0].long(),
         )
+        return begun._replace(x=begun._refined())
 
     def after_change(self) -> _Live:
         """Return the same after one constraint more or less, or with a row that is relaxed."""
@@ -387,12 +391,21 @@ class _Live(NamedTuple):
         factors = torch.cat([-shares, torch.ones_like(missing)[:, None]], dim=-1)
         least, slot = which.max(-1)
         has_row = stuck & (least >= first_row)
-        by = missing / factors.gather(-1, slot[:, None])[:, 0] * (1.0 + 1e-9)
+        by = missing / factors.gather(-1, slot[:, None])[:, 0]
         row = (least - first_row).clamp_min(0)
         over = torch.where(has_row, by, 0.0)
         b = self.within.b
         if b.shape[-1]:
+            rounding = 32.0 * torch.finfo(b.dtype).eps
+            by = by + rounding * (by + b.gather(-1, row[:, None])[:, 0].abs())
+            over = torch.where(has_row, by, 0.0)
             b = b.scatter_add(-1, row[:, None], over[:, None]).minimum(self.within.most)
+        # Where no row contradicts it is rounding, and nothing begins anew.
+        size = 8.0 * torch.finfo(b.dtype).eps * self.x.abs().amax(-1)
+        close = torch.where(stuck & ~has_row, size, self.close)
+        chosen = torch.where(stuck, -1, self.chosen)
+        force = torch.where(stuck, 0.0, self.force)
+        stuck = has_row
         anew = stuck[:, None]
         active = self.active.where(~stuck, self.equations)
         return self._replace(
@@ -400,8 +413,9 @@ class _Live(NamedTuple):
             within=self.within._replace(b=b, e=torch.where(anew, self.first, self.within.e)),
             rounds=torch.where(stuck & (self.excess > 0.0), IK_PROXIMAL, self.rounds),
             active=active,
-            chosen=torch.where(stuck, -1, self.chosen),
-            force=torch.where(stuck, 0.0, self.force),
+            chosen=chosen,
+            force=force,
+            close=torch.where(stuck, 0.0, close),
         )
 
     def _refined(self) -> Tensor:

@@ -8,10 +8,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from hybridkin._core.kernel_numbers import IK_CLOSE
 from hybridkin.ik._gram import apply_rows
 from hybridkin.ik._nearest import Polyhedron, nearest
-
-_CLOSE = 100.0  # rounding of a step [eps]
 
 
 class StepLimits(NamedTuple):
@@ -56,7 +55,7 @@ class StepLimits(NamedTuple):
 
         Where a step has no choice it ends beside a bound by the rounding of all that led there.
         """
-        close = _CLOSE * torch.finfo(dq.dtype).eps
+        close = IK_CLOSE * torch.finfo(dq.dtype).eps
         largest = dq.abs().amax(-1, keepdim=True)
         at_lower = (dq - self.lower) <= close * (largest + self.lower.abs())
         at_upper = (self.upper - dq) <= close * (largest + self.upper.abs())

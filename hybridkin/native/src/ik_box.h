@@ -244,12 +244,14 @@ typedef struct {
 
 /* The step within its limits whose task part does not depend on the preferred step z: near a
    singularity the damped task is solved for z = 0 first, then z chooses among the steps that move
-   the tip so. */
+   the tip so. `work`: IK_STRICT_WORK(n, m) numbers. */
+#define IK_STRICT_WORK(n, m) (NEAR_WORK(n, m) + HK_MAX_N * (n))
 static void ik_strict_step(int m, int n, const real *J, const real *g, const real *v,
                            const real *z, const real *lower, const real *upper,
-                           const ik_rows_t *rows, real damping_sq, int calm, real *dq) {
+                           const ik_rows_t *rows, real damping_sq, int calm, real *work,
+                           real *dq) {
     real sum = R(0.0), moved[IK_MOST_ROWS], none[HK_MAX_N], slower[HK_MAX_N];
-    real A[HK_MAX_N * HK_MAX_N], b[HK_MAX_N], most[HK_MAX_N];
+    real *A = work + NEAR_WORK(n, m), b[HK_MAX_N], most[HK_MAX_N];
     real mu[IK_MOST_ROWS] = {R(0.0)};
     int preferred = 0;
     for (int k = 0, at = 0; k < m; k++)
@@ -270,7 +272,7 @@ static void ik_strict_step(int m, int n, const real *J, const real *g, const rea
         }
         most[i] = most[i] > rows->b[i] / unit ? most[i] : rows->b[i] / unit;
     }
-    near_problem p = {n, m, rows->k, J, v, z, lower, upper, A, b, most, R(0.0), R(0.0), mu};
+    near_problem p = {n, m, rows->k, J, v, z, lower, upper, A, b, most, R(0.0), R(0.0), mu, work};
     for (int stage = damping_sq > R(0.0) && preferred ? 0 : 1; stage < 2; stage++) {
         for (int i = 0; i < rows->k; i++) {
             const real length = ik_norm(n, rows->A + n * i);

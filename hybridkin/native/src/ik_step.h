@@ -30,10 +30,17 @@ typedef struct {
 enum { IK_WEIGHTED, IK_IN_PLANE, IK_TAUT, IK_WISHED, IK_END, IK_SLOTS = IK_END + 3 };
 
 /* Numbers of these matrices. */
-#define IK_SLOTS_WORK(n, m, normals) (IK_SLOTS * (n) * ((m) + (normals)))
+#define IK_SLOTS_WORK(n, m, normals)                                                               \
+    (IK_SLOTS * (n) * ((m) + (normals)) + IK_STRICT_WORK(n, (m) + (normals)) + HK_MAX_N * (n))
 
 static inline real *ik_slot(const ik_settings *ik, int which) {
     return ik->slots + which * ik->n * (ik->m + ik->n_normals);
+}
+
+/* Memory of a step within limits, and rows (k, n) of these. */
+static inline real *ik_strict_memory(const ik_settings *ik) { return ik_slot(ik, IK_SLOTS); }
+static inline real *ik_rows_memory(const ik_settings *ik) {
+    return ik_slot(ik, IK_SLOTS) + IK_STRICT_WORK(ik->n, ik->m + ik->n_normals);
 }
 
 #define IK_IS_POSE(ik) (HK_POSES && (ik)->flags & IK_POSE)
@@ -254,7 +261,7 @@ static HK_NOINLINE void ik_limited_in_plane(const ik_settings *ik, const real *J
     }
     ik_products(m + ik->n_normals, n, rows, NULL, g);
     ik_strict_step(m + ik->n_normals, n, rows, g, motion, z, lower, upper, limits, damping_sq,
-                   ik->least > R(0.0), dq);
+                   ik->least > R(0.0), ik_strict_memory(ik), dq);
 }
 
 /* Fill in a step for the task v within its bounds; `slides`: with its posture step. `trust` is
@@ -306,7 +313,7 @@ HK_INLINE void ik_limited_step_of(int m, int n, const ik_settings *ik, const rea
     if (ik->flags & IK_LIMITED) {
         int over =
             ik->n_normals > 0 && ik->flags & IK_WEIGHTS; /* weights turn J out of the plane */
-        real A[HK_SPACES ? HK_MAX_N * HK_MAX_N : 1];
+        real *A = ik_rows_memory(ik);
         const ik_rows_t rows = {margin ? ik->n_spaces : 0, A, margin};
         for (int j = 0; j < n; j++) over |= ik_clip(dq[j], lower[j], upper[j]) != dq[j];
         for (int i = 0; i < rows.k; i++) {
@@ -324,7 +331,7 @@ HK_INLINE void ik_limited_step_of(int m, int n, const ik_settings *ik, const rea
                                 damping_sq, dq);
         else if (over)
             ik_strict_step(m, n, J, g, v, z, lower, upper, &rows, damping_sq, ik->least > R(0.0),
-                           dq);
+                           ik_strict_memory(ik), dq);
     }
     for (int j = 0; j < n; j++) {
         s->held[j] = (unsigned char)((dq[j] <= lower[j]) | (dq[j] >= upper[j]));
@@ -436,7 +443,7 @@ static HK_NOINLINE void ik_allowed(const ik_settings *ik, const real *margin, co
     for (int i = 0; i < k; i++)
         for (int r = 0; r < m; r++) normals[m * i + r] = ik->spaces[r * k + i], ends[i] = margin[i];
     for (int r = 0; r < m; r++) low[r] = -R(INFINITY), high[r] = R(INFINITY);
-    const near_problem p = {m, 0, k, NULL, NULL, v, low, high, normals, ends, NULL, R(1.0), R(0.0), NULL};
+    const near_problem p = {m, 0, k, NULL, NULL, v, low, high, normals, ends, NULL, R(1.0), R(0.0), NULL, ik_strict_memory(ik)};
     ik_nearest(&p, to);
     for (int r = 0; r < m; r++) allowed[r] = to[r];
 }

@@ -19,6 +19,7 @@ typedef struct {
     real damping;   /* lambda > 0 */
     real excess;    /* what has been added to lambda^2: proximal rounds take its effect out, */
     real *mu;       /* from these multipliers (m) on, (v - J dq) / lambda^2, which they improve */
+    real *work;     /* NEAR_WORK(n, m) numbers */
 } near_problem;
 
 /* The active constraints: inequality j is the lower bound of x_j, N + j the upper one and 2 N + i
@@ -26,11 +27,13 @@ typedef struct {
 enum { NEAR_EQUATION = -1, NEAR_NONE = -2 };
 typedef struct {
     int N, count, rounds, chosen, which[NEAR_MOST];
+    real close; /* what rounding of all that led to x may be, once it has been seen */
     real x[NEAR_MOST], first[IK_MOST_ROWS], e[IK_MOST_ROWS], force[NEAR_MOST], pushed; /* pushed: by the one chosen */
-    real free[NEAR_MOST * NEAR_MOST];    /* projector (N, N) onto the directions that they leave */
-    real inverse[NEAR_MOST * NEAR_MOST]; /* rows (N) of the pseudo-inverse of their normals */
+    real *free;    /* projector (N, N) onto the directions that they leave */
+    real *inverse; /* rows (N) of the pseudo-inverse of their normals */
 } near_state;
 
+#define NEAR_WORK(n, m) (2 * ((n) + (m)) * ((n) + (m)))
 #define NEAR_ROUNDING (R(100.0) * HK_EPS)
 
 /* y (N) = a symmetric matrix times a vector. */
@@ -92,7 +95,7 @@ static inline void near_drop(near_state *s, int slot) {
 static inline void near_begin(const near_problem *p, near_state *s) {
     const int n = p->n, N = s->N = n + p->m;
     real normal[NEAR_MOST], way[NEAR_MOST], shares[NEAR_MOST];
-    s->count = 0, s->chosen = NEAR_NONE, s->rounds = p->excess > R(0.0) ? IK_PROXIMAL : 0;
+    s->count = 0, s->close = R(0.0), s->chosen = NEAR_NONE, s->rounds = p->excess > R(0.0) ? IK_PROXIMAL : 0;
     for (int j = 0; j < N; j++) s->x[j] = j < n ? p->z[j] : R(0.0);
     for (int i = 0; i < N * N; i++) s->free[i] = i % (N + 1) ? R(0.0) : R(1.0);
     for (int i = 0; i < p->m; i++) {
@@ -124,24 +127,35 @@ static inline real near_largest(const near_state *s) {
     return largest;
 }
 
+static inline int near_is_active(const near_state *s, int which) {
+    for (int c = 0; c < s->count; c++)
+        if (s->which[c] == which) return 1;
+    return 0;
+}
+
 /* The inequality violated most, by more than rounding, that is not active. */
 static inline int near_worst(const near_problem *p, const near_state *s) {
     const int n = p->n, N = s->N;
-    const real unit = R(8.0) * HK_EPS, close = unit * near_largest(s);
+    const real unit = R(8.0) * HK_EPS;
     real most = R(0.0);
     int worst = NEAR_NONE;
-    for (int k = 0; k < 2 * n + p->k; k++) {
-        const int which = k < n ? k : k < 2 * n ? N + k - n : 2 * (N - n) + k;
-        const real end = k < n ? p->lower[k] : k < 2 * n ? p->upper[k - n] : p->b[k - 2 * n];
-        const real beyond = near_beyond(p, s, which);
-        if (!(beyond > most)) continue;
-        real size = unit * ik_abs(end) + (k < 2 * n ? close : R(0.0)); /* bounds clip at last */
-        for (int j = 0; k >= 2 * n && j < n; j++)
-            size += unit * ik_abs(p->A[n * (k - 2 * n) + j] * s->x[j]);
-        if (!(beyond > size)) continue;
-        int active = 0;
-        for (int c = 0; c < s->count; c++) active |= s->which[c] == which;
-        if (!active) most = beyond, worst = which;
+    for (int j = 0; j < n; j++) {
+        const real x = s->x[j], low = p->lower[j], high = p->upper[j];
+        const int above = x - high > low - x;
+        const real beyond = above ? x - high : low - x, end = ik_abs(above ? high : low);
+        if (beyond > most && beyond > s->close + unit * (ik_abs(x) + end) &&
+            !near_is_active(s, above ? N + j : j))
+            most = beyond, worst = above ? N + j : j;
+    }
+    for (int i = 0; i < p->k; i++) {
+        const real *row = p->A + n * i;
+        real beyond = -p->b[i], size = ik_abs(p->b[i]);
+        for (int j = 0; j < n; j++) {
+            const real part = row[j] * s->x[j];
+            beyond += part, size += ik_abs(part);
+        }
+        if (beyond > most && beyond > s->close + unit * size && !near_is_active(s, 2 * N + i))
+            most = beyond, worst = 2 * N + i;
     }
     return worst;
 }
@@ -190,16 +204,17 @@ static inline void near_next_round(const near_problem *p, near_state *s) {
         near_push(p, s);
         for (int c = p->m; c < s->count; c++)
             if (s->force[c] < least) least = s->force[c], slot = c;
-        if (slot < 0) return;
+        if (slot < 0) break;
         for (int j = 0; j < N; j++) size += s->inverse[N * slot + j] * s->inverse[N * slot + j];
         for (int j = 0; j < N; j++) s->x[j] -= least / size * s->inverse[N * slot + j];
         near_drop(s, slot);
     }
+    near_refine(p, s);
 }
 
 /* Relax the least important of the rows that contradict the one chosen, which is `missing` and a sum
-   of active normals with factors `shares`, none positive; all begins anew. Returns 0 if none is a
-   row. */
+   of active normals with factors `shares`, none positive; all begins anew. Where none is a row it is
+   rounding, else the bounds contradict each other: returns 0. */
 static inline int near_relax(const near_problem *p, near_state *s, real missing,
                              const real *shares) {
     int least = NEAR_NONE;
@@ -210,9 +225,14 @@ static inline int near_relax(const near_problem *p, near_state *s, real missing,
         if (row < 0 || which <= least || (p->most && p->b[row] >= p->most[row])) continue;
         least = which, factor = c < p->m ? R(1.0) : -shares[c];
     }
-    if (least < 0) return 0;
+    if (least < 0) {
+        const real close = R(8.0) * HK_EPS * near_largest(s);
+        if (missing > close || s->close > R(0.0)) return 0;
+        s->close = close, s->chosen = NEAR_NONE;
+        return 1;
+    }
     real *b = p->b + least - 2 * s->N;
-    *b += missing / factor * (R(1.0) + R(1e7) * HK_EPS);
+    *b += missing / factor + R(32.0) * HK_EPS * (ik_abs(*b) + missing / factor);
     if (p->most) *b = *b < p->most[least - 2 * s->N] ? *b : p->most[least - 2 * s->N];
     near_begin(p, s);
     return 1;
@@ -247,6 +267,7 @@ static inline int near_change(const near_problem *p, near_state *s) {
 /* dq (n), exactly within the bounds, and at those that it reaches up to rounding. */
 static HK_NOINLINE void ik_nearest(const near_problem *p, real *dq) {
     near_state s;
+    s.free = p->work, s.inverse = p->work + (p->n + p->m) * (p->n + p->m);
     for (int i = 0; i < p->m; i++) s.first[i] = p->v[i] + p->excess * p->mu[i];
     near_begin(p, &s);
     for (int change = 0; change < IK_CHANGES; change++) {
@@ -259,7 +280,7 @@ static HK_NOINLINE void ik_nearest(const near_problem *p, real *dq) {
     }
     near_multipliers(p, &s);
     s.N = p->n; /* without the slack */
-    const real unit = NEAR_ROUNDING, close = unit * near_largest(&s);
+    const real unit = IK_CLOSE * HK_EPS, close = unit * near_largest(&s);
     for (int j = 0; j < p->n; j++) {
         dq[j] = s.x[j];
         const real low = p->lower[j], high = p->upper[j];
