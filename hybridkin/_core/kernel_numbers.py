@@ -67,6 +67,7 @@ IK_HALF_TURN = 3.141592653589793  # [rad]
 IK_NO_AXIS = 1e-12  # a direction that is shorter is none
 HK_ASIDE = 0.6  # a component of a unit vector below which a coordinate axis is not along it
 IK_HEALTHY = 0.02  # sigma_min / sigma_max above which no damping is needed
+IK_NEWTON = 60  # Newton steps in a box; a handful is usual
 IK_CHANGES = 400  # of the active constraints of a step; a handful is usual
 IK_CLOSE = 500.0  # rounding by which a step may end beside a bound [eps]
 IK_SWEEPS = 30  # of Jacobi's method for eigenvalues; six are usual

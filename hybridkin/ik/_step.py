@@ -20,6 +20,7 @@ from hybridkin._core.kernel_numbers import (
     IK_SLIP,
     IK_STUCK,
 )
+from hybridkin.ik._calm import calmed
 from hybridkin.ik._escape import way_out
 from hybridkin.ik._gram import (
     adaptive_damping,
@@ -31,7 +32,7 @@ from hybridkin.ik._gram import (
     solve_rows,
 )
 from hybridkin.ik._settings import Bounds, StepSettings, stopping
-from hybridkin.ik._strict import StepLimits, calmed, strict_step
+from hybridkin.ik._strict import StepLimits, step_within
 
 
 class StepRows(NamedTuple):
@@ -227,9 +228,9 @@ def limited_step(
         over = (box.broken(dq) | out_of_plane).nonzero()[:, 0]
         if over.numel() > 0:
             rows, motion = _with_plane(settings, J, v, posture)
-            damping = damping_sq.sqrt()
-            problem = (a[over] for a in (rows, motion, z, damping))
-            inside = strict_step(*problem, box.take(over), calm[over])
+            inside = step_within(
+                rows[over], motion[over], z[over], damping_sq[over], box.take(over), calm[over]
+            )
             dq = dq.index_put((over,), inside)
     held = box.held(dq)
     dq = limits.clip(dq * unit)

@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 
 from hybridkin._core.kernel_numbers import IK_CLOSE
+from hybridkin.ik._box import BoxProblem, strict_box_step
+from hybridkin.ik._calm import calmed
 from hybridkin.ik._gram import apply_rows
 from hybridkin.ik._nearest import Polyhedron, nearest
 
@@ -46,8 +48,10 @@ class StepLimits(NamedTuple):
         return (dq <= self.lower) | (dq >= self.upper)
 
     def broken(self, dq: Tensor) -> Tensor:
-        """Return whether steps are beyond a limit, bool (N,)."""
-        beyond = apply_rows(self.A, dq) > self.b
+        """Return whether steps are beyond a bound, or by more than rounding a row, bool (N,)."""
+        size = apply_rows(self.A.abs(), dq.abs()) + self.b.abs()
+        rounding = 8.0 * torch.finfo(dq.dtype).eps * size
+        beyond = apply_rows(self.A, dq) > self.b + rounding
         return (self.clip(dq) != dq).any(-1) | beyond.any(-1)
 
     def snapped(self, dq: Tensor) -> Tensor:
@@ -76,15 +80,18 @@ class StepLimits(NamedTuple):
         return StepLimits(*(a[rows] for a in self))
 
 
-def calmed(z: Tensor, task: Tensor, calm: Tensor) -> Tensor:
-    """Return steps z (N, n), in the rows `calm` (N,) at most half as long as those of a task.
-
-    Else the way to a posture would go on shaking a robot that rests where its target is out of
-    reach.
-    """
-    share = task.norm(dim=-1) / (2.0 * z.norm(dim=-1))
-    share = torch.where(calm, share.clamp_max(1.0), 1.0)
-    return share.nan_to_num(1.0)[..., None] * z
+def step_within(
+    J: Tensor, v: Tensor, z: Tensor, damping_sq: Tensor, limits: StepLimits, calm: Tensor
+) -> Tensor:
+    """Return steps (N, n) within limits, as `strict_step`; the box alone has a faster solver."""
+    problem = BoxProblem(J, v, z, damping_sq, limits.lower, limits.upper)
+    dq = strict_box_step(problem, calm)
+    rows = limits.broken(dq).nonzero()[:, 0]
+    if rows.numel() == 0:
+        return dq
+    damping = damping_sq[rows].sqrt()
+    inside = strict_step(J[rows], v[rows], z[rows], damping, limits.take(rows), calm[rows])
+    return dq.index_put((rows,), inside)
 
 
 def strict_step(

@@ -227,6 +227,122 @@ HK_INLINE void ik_null_projection(int m, int n, const real *J, const real *g, re
     }
 }
 
+/* t in (0, 1) where value(t) = start + t curvature + slope . (clip(y + t slope) - dq) is 0.
+
+   It grows with t, is linear between the points where a coordinate meets a bound, negative at 0
+   and positive (`end`) at 1. These points are halved until none is left between the two sides. */
+HK_INLINE real ik_line_search(int n, const real *y, const real *dq, const real *slope,
+                              const real *lower, const real *upper, real start, real curvature,
+                              real end) {
+    real points[2 * HK_MAX_N], t0 = R(0.0), t1 = R(1.0), f0 = start, f1 = end;
+    int count = 0;
+    for (int j = 0; j < n; j++) {
+        const real a = (lower[j] - y[j]) / slope[j], b = (upper[j] - y[j]) / slope[j];
+        points[count] = a;
+        count += a > R(0.0) && a < R(1.0);
+        points[count] = b;
+        count += b > R(0.0) && b < R(1.0);
+    }
+    while (count > 0) {
+        const real t = points[count / 2];
+        real value = start + t * curvature;
+        for (int j = 0; j < n; j++)
+            value += slope[j] * (ik_clip(y[j] + t * slope[j], lower[j], upper[j]) - dq[j]);
+        if (value > R(0.0))
+            t1 = t, f1 = value;
+        else
+            t0 = t, f0 = value;
+        int left = 0;
+        for (int i = 0; i < count; i++) {
+            const real a = points[i];
+            points[left] = a;
+            left += a > t0 && a < t1;
+        }
+        count = left;
+    }
+    return t0 + (t1 - t0) * (f0 < f1 ? ik_clip(f0 / (f0 - f1), R(0.0), R(1.0)) : R(1.0));
+}
+
+/* The minimiser dq of |dq - z|^2 + |J dq - v|^2 / lambda^2 in the box, and its multipliers mu.
+
+   dq(mu) = clip(z + J^T mu) with F(mu) = J dq(mu) + lambda^2 mu - v = 0: Newton's method on the
+   active pieces with an exact line search; `mu` holds its start. */
+HK_INLINE void ik_box_of(int m, int n, const real *J, const real *v, const real *z,
+                         const real *lower, const real *upper, real damping_sq, real *mu,
+                         real *dq) {
+    real y[HK_MAX_N], slope[HK_MAX_N], free[HK_MAX_N];
+    int settled = 0;
+    for (int round = 0;; round++) {
+        real residual[IK_MOST_ROWS] = {R(0.0)}, scale[IK_MOST_ROWS] = {R(0.0)};
+        real newton[IK_MOST_ROWS], g[IK_MOST_PAIRS];
+        ik_columns_of(m, n, J, mu, z, y);
+        for (int j = 0; j < n; j++) dq[j] = ik_clip(y[j], lower[j], upper[j]);
+        if (settled || round == IK_NEWTON) return;
+        int going = 0;
+        for (int j = 0; j < n; j++)
+            for (int i = 0; i < m; i++) {
+                const real part = J[n * i + j] * dq[j];
+                residual[i] += part, scale[i] += ik_abs(part);
+            }
+        for (int i = 0; i < m; i++) {
+            const real pull = damping_sq * mu[i];
+            residual[i] += pull - v[i], scale[i] += ik_abs(pull) + ik_abs(v[i]);
+            going |= ik_abs(residual[i]) > R(4.0) * HK_EPS * scale[i];
+        }
+        if (!going) return;
+        for (int j = 0; j < n; j++) free[j] = y[j] > lower[j] && y[j] < upper[j] ? R(1.0) : R(0.0);
+        ik_products(m, n, J, free, g);
+        ik_factors f;
+        ik_factor(m, g, damping_sq, &f);
+        ik_solve(m, &f, residual, newton);
+        real start = R(0.0), curvature = R(0.0);
+        for (int i = 0; i < m; i++) {
+            newton[i] = -newton[i];
+            start += newton[i] * residual[i];
+            curvature += damping_sq * newton[i] * newton[i];
+        }
+        /* A full step that stays on its linear piece has solved the problem. */
+        real end = start + curvature, length = R(1.0);
+        settled = 1;
+        for (int j = 0; j < n; j++) slope[j] = R(0.0);
+        ik_columns_of(m, n, J, newton, slope, slope);
+        for (int j = 0; j < n; j++) {
+            const real full = y[j] + slope[j];
+            settled &= (((full > lower[j]) == (y[j] > lower[j])) &
+                        ((full < upper[j]) == (y[j] < upper[j]))) |
+                       (lower[j] == upper[j]);
+            end += slope[j] * (ik_clip(full, lower[j], upper[j]) - dq[j]);
+        }
+        if (end > R(0.0) && !settled)
+            length = ik_line_search(n, y, dq, slope, lower, upper, start, curvature, end);
+        for (int i = 0; i < m; i++) mu[i] += length * newton[i];
+    }
+}
+
+static void ik_box(int m, int n, const real *J, const real *v, const real *z, const real *lower,
+                   const real *upper, real damping_sq, real *mu, real *dq) {
+    switch (HK_COMMON(100 * m + n)) { /* loops of known length */
+    case 306: ik_box_of(3, 6, J, v, z, lower, upper, damping_sq, mu, dq); break;
+    case 309: ik_box_of(3, 9, J, v, z, lower, upper, damping_sq, mu, dq); break;
+    case 606: ik_box_of(6, 6, J, v, z, lower, upper, damping_sq, mu, dq); break;
+    default: IK_OF(m, ik_box_of, n, J, v, z, lower, upper, damping_sq, mu, dq);
+    }
+}
+
+/* `ik_box` for any lambda^2 >= 0. It is solved with at least the floor; rounds on the multipliers
+   take out what is too much. */
+static void ik_proximal_box(int m, int n, const real *J, const real *v, const real *z,
+                            const real *lower, const real *upper, real damping_sq, real least,
+                            real *mu, real *dq) {
+    const real used = damping_sq < least ? least : damping_sq, excess = used - damping_sq;
+    for (int round = 0; round <= IK_PROXIMAL; round++) {
+        real wanted[IK_MOST_ROWS];
+        for (int i = 0; i < m; i++) wanted[i] = v[i] + excess * mu[i];
+        ik_box(m, n, J, wanted, z, lower, upper, used, mu, dq);
+        if (excess == R(0.0)) return;
+    }
+}
+
 #include "nearest.h"
 
 /* Shorten a step z to at most half of that of a task: else the way to a posture would go on shaking
@@ -288,4 +404,54 @@ static void ik_strict_step(int m, int n, const real *J, const real *g, const rea
         if (calm) ik_calm(n, dq, slower);
         p.v = moved, damping_sq = R(0.0); /* mu keeps the active limits, also out of reach */
     }
+}
+
+/* The step in the box whose task part does not depend on the preferred step z: near a singularity
+   the damped task is solved for z = 0 first, then z chooses among the steps that move the tip so.
+ */
+static void ik_strict_box(int m, int n, const real *J, const real *g, const real *v, const real *z,
+                          const real *lower, const real *upper, real damping_sq, int calm,
+                          real *dq) {
+    real sum = R(0.0);
+    for (int k = 0, at = 0; k < m; k++)
+        for (int i = k; i < m; i++, at++) sum += (i == k ? g[at] : R(2.0) * g[at]) * g[at];
+    const real size_sq = HK_MATH(sqrt)(sum);
+    const real rounding = HK_MATH(sqrt)(HK_EPS), relative = rounding > R(1e-6) ? rounding : R(1e-6);
+    const real least = size_sq > R(0.0) ? relative * size_sq : R(1.0);
+    real mu[IK_MOST_ROWS] = {R(0.0)}, moved[IK_MOST_ROWS], none[HK_MAX_N], slower[HK_MAX_N];
+    int preferred = 0;
+    for (int j = 0; j < n; j++) {
+        none[j] = R(0.0), slower[j] = z[j];
+        preferred |= z[j] != R(0.0);
+    }
+    if (damping_sq > R(0.0) && preferred) {
+        ik_proximal_box(m, n, J, v, none, lower, upper, damping_sq, least, mu, dq);
+        ik_rows_of(m, n, J, dq, moved);
+        if (calm) ik_calm(n, dq, slower);
+        v = moved, z = slower, damping_sq = R(0.0);
+    }
+    ik_proximal_box(m, n, J, v, z, lower, upper, damping_sq, least, mu, dq);
+}
+
+/* Whether a step goes beyond a row, by more than rounding. */
+static inline int ik_breaks(int n, const ik_rows_t *rows, const real *dq) {
+    for (int i = 0; i < rows->k; i++) {
+        real beyond = -rows->b[i], size = ik_abs(rows->b[i]);
+        for (int j = 0; j < n; j++) {
+            const real part = rows->A[n * i + j] * dq[j];
+            beyond += part, size += ik_abs(part);
+        }
+        if (beyond > R(8.0) * HK_EPS * size) return 1;
+    }
+    return 0;
+}
+
+/* The step within its limits: in its box, where no row is in its way, else the nearest one of all. */
+static HK_NOINLINE void ik_within(int m, int n, const real *J, const real *g, const real *v,
+                                  const real *z, const real *lower, const real *upper,
+                                  const ik_rows_t *rows, real damping_sq, int calm, real *work,
+                                  real *dq) {
+    ik_strict_box(m, n, J, g, v, z, lower, upper, damping_sq, calm, dq);
+    if (ik_breaks(n, rows, dq))
+        ik_strict_step(m, n, J, g, v, z, lower, upper, rows, damping_sq, calm, work, dq);
 }

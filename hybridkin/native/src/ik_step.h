@@ -260,8 +260,8 @@ static HK_NOINLINE void ik_limited_in_plane(const ik_settings *ik, const real *J
         }
     }
     ik_products(m + ik->n_normals, n, rows, NULL, g);
-    ik_strict_step(m + ik->n_normals, n, rows, g, motion, z, lower, upper, limits, damping_sq,
-                   ik->least > R(0.0), ik_strict_memory(ik), dq);
+    ik_within(m + ik->n_normals, n, rows, g, motion, z, lower, upper, limits, damping_sq,
+              ik->least > R(0.0), ik_strict_memory(ik), dq);
 }
 
 /* Fill in a step for the task v within its bounds; `slides`: with its posture step. `trust` is
@@ -316,22 +316,19 @@ HK_INLINE void ik_limited_step_of(int m, int n, const ik_settings *ik, const rea
         real *A = ik_rows_memory(ik);
         const ik_rows_t rows = {margin ? ik->n_spaces : 0, A, margin};
         for (int j = 0; j < n; j++) over |= ik_clip(dq[j], lower[j], upper[j]) != dq[j];
-        for (int i = 0; i < rows.k; i++) {
-            real along = R(0.0);
+        for (int i = 0; i < rows.k; i++)
             for (int j = 0; j < n; j++) {
                 A[n * i + j] = R(0.0);
                 for (int r = 0; r < m; r++)
                     A[n * i + j] += ik->spaces[r * rows.k + i] * J[n * r + j];
-                along += A[n * i + j] * dq[j];
             }
-            over |= along > margin[i];
-        }
+        over |= ik_breaks(n, &rows, dq);
         if (over && ik->n_normals > 0)
             ik_limited_in_plane(ik, J, v, z, slides ? s->posture : NULL, lower, upper, &rows,
                                 damping_sq, dq);
         else if (over)
-            ik_strict_step(m, n, J, g, v, z, lower, upper, &rows, damping_sq, ik->least > R(0.0),
-                           ik_strict_memory(ik), dq);
+            ik_within(m, n, J, g, v, z, lower, upper, &rows, damping_sq, ik->least > R(0.0),
+                      ik_strict_memory(ik), dq);
     }
     for (int j = 0; j < n; j++) {
         s->held[j] = (unsigned char)((dq[j] <= lower[j]) | (dq[j] >= upper[j]));
