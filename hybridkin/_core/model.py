@@ -50,7 +50,8 @@ class ForwardModel(PortableModule):
     n_outputs : int
         Length of x; 0 if unknown.
     markers : tuple of K tuples of four floats
-        Places of the points of the robot that are the outputs, see `Marker`; empty: unknown.
+        Places of the points of the robot that are the outputs, in segments and their offset [m];
+        empty: unknown.
     takes_lengths : bool
         Whether q holds lengths, or their changes, of a known geometry.
     """

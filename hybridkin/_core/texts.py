@@ -76,7 +76,7 @@ def html_text(text: object) -> str:
 
 
 def markdown(text: object) -> str:
-    """Return a text in Markdown: words that could be markup become code, as `*x*` or `log.csv`."""
+    """Return a text in Markdown; words that could be markup, as ``*x*``, become code."""
     words = visible(text).split()
     shown = []
     for k, word in enumerate(words):

@@ -93,7 +93,7 @@ def test_the_core_commands_what_torch_does(kind, limits):
     core = ik.tracker(HOME)
     reference = ik.tracker(torch.from_numpy(HOME))
     assert core.backend == "compiled"
-    for target in targets(120 if limits == "acceleration" else 80):
+    for target in targets(400 if limits == "acceleration" else 80):
         put_where(reference, core)
         before = core.q
         command = core.step(target)
