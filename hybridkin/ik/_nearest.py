@@ -95,14 +95,14 @@ class _Active(NamedTuple):
         return way, way.square().sum(-1), apply_rows(self.inverse, normal)
 
     def with_one(
-        self, adds: Tensor, way: Tensor, shares: Tensor, force: Tensor, which: Tensor
+        self, adds: Tensor, way: Tensor, multiples: Tensor, force: Tensor, which: Tensor
     ) -> _Active:
         """Return the constraints with one more in the rows `adds`, as from `along`."""
         unit = way / way.square().sum(-1, keepdim=True)
         unit = torch.where(adds[:, None], unit, 0.0)
         empty = (self.inverse == 0.0).all(-1).to(torch.uint8).argmax(-1)
         slot = one_hot(empty, self.force.shape[-1]).bool() & adds[:, None]
-        inverse = self.inverse - shares[..., None] * unit[:, None]
+        inverse = self.inverse - multiples[..., None] * unit[:, None]
         inverse = torch.where(slot[..., None], unit[:, None], inverse)
         return _Active(
             self.free - way[..., None] * unit[:, None],
@@ -116,8 +116,8 @@ class _Active(NamedTuple):
         way = (self.inverse * slot[..., None]).sum(1)
         size = way.square().sum(-1, keepdim=True)
         unit = torch.where(size > 0.0, way / size, 0.0)
-        others = apply_rows(self.inverse, unit)
-        inverse = self.inverse - others[..., None] * way[:, None]
+        along_way = apply_rows(self.inverse, unit)
+        inverse = self.inverse - along_way[..., None] * way[:, None]
         return _Active(
             self.free + unit[..., None] * way[:, None],
             torch.where(slot[..., None], 0.0, inverse),
@@ -135,15 +135,15 @@ class _Active(NamedTuple):
         force = apply_rows(self.inverse, way)
         return self._replace(force=torch.where(rows & (self.which >= 0), force, self.force))
 
-    def where(self, kept: Tensor, others: _Active) -> _Active:
-        """Return these constraints in the rows `kept`, else the other ones."""
-        square = kept[:, None, None]
-        row = kept[:, None]
+    def where(self, is_kept: Tensor, replaced: _Active) -> _Active:
+        """Return these constraints in the rows `is_kept`, else the other ones."""
+        square = is_kept[:, None, None]
+        row = is_kept[:, None]
         return _Active(
-            torch.where(square, self.free, others.free),
-            torch.where(square, self.inverse, others.inverse),
-            torch.where(row, self.force, others.force),
-            torch.where(row, self.which, others.which),
+            torch.where(square, self.free, replaced.free),
+            torch.where(square, self.inverse, replaced.inverse),
+            torch.where(row, self.force, replaced.force),
+            torch.where(row, self.which, replaced.which),
         )
 
     def take(self, rows: Tensor) -> _Active:
@@ -261,13 +261,13 @@ class _Live(NamedTuple):
         active = _Active.none(x)
         none = torch.full_like(x[:, 0], -1, dtype=torch.long)
         for normal, value in zip(within.E.unbind(1), within.e.unbind(1), strict=True):
-            way, size, shares = active.along(normal)
+            way, size, multiples = active.along(normal)
             adds = size > _rounding(x) ** 2 * normal.square().sum(-1)
             missing = value - (normal * x).sum(-1)
             length = torch.where(adds, missing / size, 0.0)
             x = x + length[:, None] * way
             force = torch.full_like(size, torch.inf)
-            active = active.with_one(adds, way, shares, force, none)
+            active = active.with_one(adds, way, multiples, force, none)
         rows = torch.arange(len(x), device=x.device)
         force = torch.zeros_like(x[:, 0])
         rounds = torch.where(excess > 0.0, IK_PROXIMAL, 0)
@@ -348,47 +348,47 @@ class _Live(NamedTuple):
         x, active = self.x, self.active
         normal = self.within.normals(self.chosen)
         missing = self.within.excess(x).gather(-1, self.chosen[:, None])[:, 0]
-        way, size, shares = active.along(normal)
+        way, size, multiples = active.along(normal)
 
         # The step at which it holds, or the first at which an active one pushes no more.
         movable = size > _rounding(x) ** 2
         full = torch.where(movable, missing / size, torch.inf)
-        pushes = shares > _rounding(x)
-        lengths = torch.where(pushes, active.force / shares, torch.inf)
+        pushes = multiples > _rounding(x)
+        lengths = torch.where(pushes, active.force / multiples, torch.inf)
         first, slot = lengths.min(-1)
         length = torch.minimum(full, first)
         stuck = torch.isinf(length)
         length = torch.where(stuck, 0.0, length)
         force = self.force + length
-        active = active._replace(force=active.force - length[:, None] * shares)
+        active = active._replace(force=active.force - length[:, None] * multiples)
         adds = ~stuck & (full <= first)
         drops = ~stuck & ~adds
         leaving = one_hot(slot, x.shape[-1]).bool() & drops[:, None]
         moved = self._replace(
             x=x + torch.where(movable, length, 0.0)[:, None] * way,
-            active=active.with_one(adds, way, shares, force, self.chosen).without(leaving),
+            active=active.with_one(adds, way, multiples, force, self.chosen).without(leaving),
             chosen=torch.where(adds, -1, self.chosen),
             force=torch.where(adds, 0.0, force),
         )
         if stuck.any():
-            moved = moved._relaxed(stuck, missing, shares)
+            moved = moved._relaxed(stuck, missing, multiples)
         return moved._replace(x=moved._refined())
 
-    def _relaxed(self, stuck: Tensor, missing: Tensor, shares: Tensor) -> _Live:
+    def _relaxed(self, stuck: Tensor, missing: Tensor, multiples: Tensor) -> _Live:
         """Return the same with a row relaxed where constraints contradict: these start anew.
 
-        The chosen normal is a sum of active ones with factors `shares` (N, n), none positive.
+        The chosen normal is a sum of active ones with factors `multiples` (N, n), none positive.
         """
         n = self.x.shape[-1]
         first_row = 2 * n
-        which = torch.where(shares < -_rounding(shares), self.active.which, -1)
+        which = torch.where(multiples < -_rounding(multiples), self.active.which, -1)
         which = torch.cat([which, self.chosen[:, None]], dim=-1)
         room = self.within.most - self.within.b
         every = torch.cat(
             [torch.zeros_like(self.within.excess(self.x))[:, :first_row], room], dim=-1
         )
         which = torch.where(every.gather(-1, which.clamp_min(0)) > 0.0, which, -1)
-        factors = torch.cat([-shares, torch.ones_like(missing)[:, None]], dim=-1)
+        factors = torch.cat([-multiples, torch.ones_like(missing)[:, None]], dim=-1)
         least, slot = which.max(-1)
         has_row = stuck & (least >= first_row)
         by = missing / factors.gather(-1, slot[:, None])[:, 0]
