@@ -54,7 +54,7 @@ class Polyhedron(NamedTuple):
         unit = torch.eye(n, dtype=self.lower.dtype, device=self.lower.device)
         sides = torch.cat([unit, -unit]).expand(len(which), -1, -1)
         every = torch.cat([sides, -self.A], dim=1)
-        return every[torch.arange(len(which)), which]
+        return every[torch.arange(len(which), device=which.device), which]
 
     def take(self, rows: Tensor) -> Polyhedron:
         """Return the polyhedra of some rows."""
