@@ -452,6 +452,6 @@ static HK_NOINLINE void ik_within(int m, int n, const real *J, const real *g, co
                                   const ik_rows_t *rows, real damping_sq, int calm, real *work,
                                   real *dq) {
     ik_strict_box(m, n, J, g, v, z, lower, upper, damping_sq, calm, dq);
-    if (ik_breaks(n, rows, dq))
+    if (HK_SPACES && ik_breaks(n, rows, dq))
         ik_strict_step(m, n, J, g, v, z, lower, upper, rows, damping_sq, calm, work, dq);
 }

@@ -31,7 +31,8 @@ enum { IK_WEIGHTED, IK_IN_PLANE, IK_TAUT, IK_WISHED, IK_END, IK_SLOTS = IK_END +
 
 /* Numbers of these matrices. */
 #define IK_SLOTS_WORK(n, m, normals)                                                               \
-    (IK_SLOTS * (n) * ((m) + (normals)) + IK_STRICT_WORK(n, (m) + (normals)) + HK_MAX_N * (n))
+    (IK_SLOTS * (n) * ((m) + (normals)) +                                                          \
+     HK_SPACES * (IK_STRICT_WORK(n, (m) + (normals)) + HK_MAX_N * (n)))
 
 static inline real *ik_slot(const ik_settings *ik, int which) {
     return ik->slots + which * ik->n * (ik->m + ik->n_normals);
@@ -316,13 +317,13 @@ HK_INLINE void ik_limited_step_of(int m, int n, const ik_settings *ik, const rea
         real *A = ik_rows_memory(ik);
         const ik_rows_t rows = {margin ? ik->n_spaces : 0, A, margin};
         for (int j = 0; j < n; j++) over |= ik_clip(dq[j], lower[j], upper[j]) != dq[j];
-        for (int i = 0; i < rows.k; i++)
+        for (int i = 0; HK_SPACES && i < rows.k; i++)
             for (int j = 0; j < n; j++) {
                 A[n * i + j] = R(0.0);
                 for (int r = 0; r < m; r++)
                     A[n * i + j] += ik->spaces[r * rows.k + i] * J[n * r + j];
             }
-        over |= ik_breaks(n, &rows, dq);
+        over |= HK_SPACES && ik_breaks(n, &rows, dq);
         if (over && ik->n_normals > 0)
             ik_limited_in_plane(ik, J, v, z, slides ? s->posture : NULL, lower, upper, &rows,
                                 damping_sq, dq);
