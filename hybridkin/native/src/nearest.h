@@ -16,10 +16,10 @@ typedef struct {
     const real *J, *v, *z, *lower, *upper, *A;
     real *b;          /* relaxed where rows contradict the bounds or more important ones, */
     const real *most; /* at most to these (NULL: no limit) */
-    real damping;   /* lambda > 0 */
-    real excess;    /* what has been added to lambda^2: proximal rounds take its effect out, */
-    real *mu;       /* from these multipliers (m) on, (v - J dq) / lambda^2, which they improve */
-    real *work;     /* NEAR_WORK(n, m) numbers */
+    real damping;     /* lambda > 0 */
+    real excess;      /* what has been added to lambda^2: proximal rounds take its effect out, */
+    real *mu;         /* from these multipliers (m) on, (v - J dq) / lambda^2, which they improve */
+    real *work;       /* NEAR_WORK(n, m) numbers */
 } near_problem;
 
 /* The active constraints: inequality j is the lower bound of x_j, N + j the upper one and 2 N + i
@@ -28,7 +28,8 @@ enum { NEAR_EQUATION = -1, NEAR_NONE = -2 };
 typedef struct {
     int count, rounds, refined, chosen, which[NEAR_MOST];
     real close; /* what rounding of all that led to x may be, once it has been seen */
-    real x[NEAR_MOST], first[IK_MOST_ROWS], e[IK_MOST_ROWS], force[NEAR_MOST], pushed; /* pushed: by the one chosen */
+    real x[NEAR_MOST], first[IK_MOST_ROWS], e[IK_MOST_ROWS], force[NEAR_MOST];
+    real pushed;   /* by the one chosen */
     real *free;    /* projector (N, N) onto the directions that they leave */
     real *inverse; /* rows (N) of the pseudo-inverse of their normals */
 } near_state;
@@ -263,7 +264,8 @@ HK_INLINE int near_change(int n, int m, const near_problem *p, near_state *s) {
         else normal[j] = j < n ? -p->A[n * (which - 2 * N) + j] : R(0.0);
     }
     const int unit = which < N ? which : which < 2 * N ? which - N : -1;
-    const real size = near_along(n, m, s, normal, unit, way, shares), missing = near_beyond(n, m, p, s, which);
+    const real size = near_along(n, m, s, normal, unit, way, shares);
+    const real missing = near_beyond(n, m, p, s, which);
     const int movable = size > NEAR_ROUNDING * NEAR_ROUNDING;
     real length = movable ? missing / size : R(INFINITY);
     int slot = -1;
