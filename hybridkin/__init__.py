@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from hybridkin.hybrid.held_out import CrossFit
     from hybridkin.hybrid.model_description import ModelDescription
     from hybridkin.hysteresis.value import Hysteresis
-    from hybridkin.ik import tasks, trajectories
+    from hybridkin.ik import obstacles, tasks, trajectories
     from hybridkin.ik.results import IKSolution, IKStatus, Step, Track
     from hybridkin.ik.solver import InverseKinematics
     from hybridkin.ik.tracker import Tracker
@@ -67,6 +67,7 @@ __all__ = [
     "jacobian",
     "load_model",
     "native",
+    "obstacles",
     "open_model",
     "plots",
     "robots",
@@ -103,6 +104,7 @@ _NAMES_OF = {
 _FOLDER_OF = {
     "datasets": "",
     "native": "",
+    "obstacles": "ik.",
     "plots": "",
     "robots": "chains.",
     "tasks": "ik.",

@@ -93,6 +93,13 @@ IK_JUMP = 0.5  # of an error: a step says nothing about a target that moved more
 # share of a range; then the motion of the tip that J promised, and the error that it was made for.
 IK_BENT, IK_WAY_SQ, IK_SHARE, IK_PROMISED = 0, 1, 2, 3
 
+# Obstacles, and points of the body that keep clear of them.
+IK_OBSTACLE = 19  # numbers of one: center, axes, sides of its box, radius
+IK_PAIRS_MOST = 32  # pairs of a point and an obstacle, or of two points, in the law of a step
+IK_NEARER = 0.5  # of a gap: the largest part of it that one step takes, to first order
+IK_AROUND = 4  # steps that are tried where the curvature of the model would lead into an obstacle
+IK_SHORTER = 5  # halvings of a step after that; then it brakes
+
 # The way out of a singular configuration, eq. (22).
 IK_STUCK = 0.01  # of a motion: a step that promises less does not get there
 IK_FLAT = 1e-3  # sine of the angle between error and motion: less changes no error to first order
