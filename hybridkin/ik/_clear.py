@@ -34,6 +34,7 @@ BodyPoints: TypeAlias = "int | Sequence[tuple[float, float]] | None"
 
 _SPACING = 1.5  # of two points in radii of the body: their balls are 25 % larger than the body
 _MOST_POINTS = 24
+_TOUCHING = 1e-4  # a gap that stops the body [m]
 _AROUND = 4  # rounds that bring a configuration out of obstacles
 _AROUND_POINT = 30  # and a point
 
@@ -132,6 +133,14 @@ class KeptClear(Portable):
     def is_inside(self, q: Tensor, scene: Tensor) -> Tensor:
         """Return whether the body is in an obstacle of a scene, or in itself, bool (N,)."""
         return self.smallest(q, scene) < -IK_INSIDE_OBSTACLE
+
+    def stops(self, q: Tensor, way: Tensor) -> Tensor:
+        """Return whether a body at q touches what is in its way (N, n), bool (N,)."""
+        if not self:
+            return torch.zeros_like(q[:, 0], dtype=torch.bool)
+        near = self.near(q, torch.full_like(q, math.inf), self.scene)
+        towards = apply_rows(near.A, way) > 0.0
+        return (towards & (near.gap <= _TOUCHING)).any(-1)
 
     def near(self, q: Tensor, change: Tensor, scene: Tensor) -> Near:
         """Return what is near the body at q (N, n); steps can change by `change` per period."""
