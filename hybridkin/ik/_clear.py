@@ -300,12 +300,21 @@ def kept_clear(
         places = [place for place, _ in wanted]
         radii = torch.tensor([radius for _, radius in wanted], dtype=torch.float64, device="cpu")
     models = [robot.with_tip(place) for place in places[:-1]]
-    tip = model.tip_model
+    tip = _end_of(model, len(lengths) - 1)
     body = (robot.joined(models), tip) if models else (tip,)
     along = torch.stack([_length_up_to(lengths, place) for place in places])
     keep = radii + clearance + _expected_error(task)
     base = robot.origin.detach().cpu().double()
     return KeptClear((*models, tip), body, radii, along, keep, base, scene)
+
+
+def _end_of(model: ForwardModel, n_segments: int) -> ForwardModel:
+    """Return the model of the robot's end: of the tip, unless that is another point of the body."""
+    tip = model.tip_model
+    place = max((at for at, *_ in tip.markers), default=float(n_segments))
+    if place < n_segments:
+        return model.robot.with_tip(n_segments)
+    return tip
 
 
 def body_points(value: BodyPoints) -> BodyPoints:

@@ -48,7 +48,8 @@ def test_a_row_of_the_tip_equals_a_half_space():
     spaces = InverseKinematics(TRUNK, tip_limits=([[0.0, 0.0, 1.0]], [0.7]), **BOX)
     below = TRUNK(torch.from_numpy(Q))[:, 2].numpy() < 0.7
     np.testing.assert_allclose(own.step(Q, X).dq, spaces.step(Q, X).dq, atol=1e-12)
-    assert below.any() and not below.all()
+    assert below.any()
+    assert not below.all()
 
 
 def test_bounds_hold_and_the_others_move():
