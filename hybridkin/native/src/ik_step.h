@@ -24,7 +24,8 @@ typedef struct {
 #if HK_OBSTACLES
     int n_obstacles;
     const int32_t *body;           /* entries of its node: points that keep clear of obstacles, */
-    const real *keep;              /* how far they do, and pairs of them that can meet [m] */
+    const real *keep;              /* distances: of points, of pairs of them that can meet, along the
+                                      body up to points [m]; then the place of its base */
     const real *scene;             /* the obstacles, where they are now */
 #endif
     hk_hysteresis hysteresis;
@@ -100,6 +101,8 @@ static inline ik_settings ik_settings_of(const int32_t *code, const real *data, 
 #if HK_OBSTACLES
     const int32_t *body = ik_body_of(code, at);
     const int n_points = body[IK_N_POINTS], n_pairs = IK_PAIRS_OF(body, more[IK_N_OBSTACLES]);
+#else
+    enum { n_points = 0, n_pairs = 0 };
 #endif
     const ik_settings ik = {
         .plan = {code, data, R(0.0)},
@@ -620,11 +623,11 @@ static void ik_arrive(const ik_settings *ik, const real *q, const real *x, const
    J is that of taut tendons alone. */
 typedef struct {
     const real *q, *x, *J, *e, *v, *allowed;
-} ik_wish;
+} ik_wish_t;
 
 /* Propose a step within its bounds and rows: with the way out of a singular configuration, and where
    tendons can only pull it arrives. */
-static HK_NOINLINE void ik_propose(const ik_settings *ik, const ik_wish *wish,
+static HK_NOINLINE void ik_propose(const ik_settings *ik, const ik_wish_t *wish,
                                    const ik_rows_t *limits, ik_step_t *s) {
     const real *J = wish->J;
     ik_limited_step(ik, J, wish->v, ik->flags & IK_POSTURE, NULL, limits, s);
@@ -698,20 +701,20 @@ static HK_NOINLINE void ik_control(const ik_settings *ik, const real *q, const r
             for (int i = 0; i < m; i++)
                 v[i] = (share < gain ? share : gain) * e[i] + (feed ? feed[i] : R(0.0));
         }
-        ik_wish wish = {q, x, J, e, v, v};
+        ik_wish_t wish = {q, x, J, e, v, v};
         ik_rows_t limits = ik_no_rows;
-        real *A = ik_rows_memory(ik);
-        (void)allowed, (void)whole, (void)A, (void)b;
-        if (HK_LIMITS) limits.A = A, limits.b = b;
+        if (HK_LIMITS) limits.A = ik_rows_memory(ik), limits.b = b;
         if (IK_IN_SPACES(ik)) {
-            ik_space_rows(ik, J, tip, seconds, s, A, b);
             limits.k = ik->n_spaces;
+            ik_space_rows(ik, J, tip, seconds, s, ik_rows_memory(ik), b);
             s->stopped = ik_leaves(ik, b, v);
             if (s->stopped) ik_allowed(ik, b, v, allowed), wish.allowed = allowed;
         }
         ik_bound(ik, q, seconds, last, ends, s);
+        (void)whole;
 #if HK_OBSTACLES
-        if (IK_KEEPS_CLEAR(ik)) ik_step_clear(ik, &wish, whole, seconds, &limits, A, b, s);
+        if (IK_KEEPS_CLEAR(ik))
+            ik_step_clear(ik, &wish, whole, seconds, &limits, ik_rows_memory(ik), b, s);
         else
 #endif
             ik_propose(ik, &wish, &limits, s);

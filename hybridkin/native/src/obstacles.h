@@ -89,15 +89,25 @@ static HK_NOINLINE void ik_find_gaps(const ik_settings *ik, const real *q, const
     const int n = ik->n, n_points = near->n_points, n_meeting = ik->body[IK_N_MEETING];
     const int known = ik_is_tip(ik), last = n_points - 1;
     const int32_t *meeting = ik->body + IK_POINTS + n_points;
+    const real *along = ik->keep + n_points + n_meeting, *base = along + n_points;
     real *gap = near->gap, *normal = near->normal, largest = R(0.0);
     ik_points(ik, known, q, near->x, near->J);
     for (int i = 0; known && i < 3; i++) near->x[3 * last + i] = x[i];
     for (int i = 0; known && i < 3 * n; i++) near->J[3 * n * last + i] = J[i];
     for (int i = 0; i < 3 * n_points; i++) largest = hk_larger(ik_abs(near->x[i]), largest);
     near->rounding = R(32.0) * HK_EPS * largest;
-    for (int i = 0; i < n_points; i++)
-        for (int k = 0; k < ik->n_obstacles; k++, gap++, normal += 3)
-            *gap = ik_obstacle(ik->scene + IK_OBSTACLE * k, near->x + 3 * i, normal) - ik->keep[i];
+    for (int k = 0; k < ik->n_obstacles; k++) {
+        const real *obstacle = ik->scene + IK_OBSTACLE * k;
+        real aside[3];
+        const real at_base = ik_obstacle(obstacle, base, aside);
+        for (int i = 0; i < n_points; i++) {
+            const int pair = ik->n_obstacles * i + k;
+            gap[pair] = ik_obstacle(obstacle, near->x + 3 * i, normal + 3 * pair) - ik->keep[i];
+            /* No configuration is free: the robot is mounted there. */
+            if (ik->keep[i] - along[i] > at_base) gap[pair] = R(INFINITY);
+        }
+    }
+    gap += n_points * ik->n_obstacles, normal += 3 * n_points * ik->n_obstacles;
     for (int k = 0; k < n_meeting; k++, gap++, normal += 3) {
         const real *one = near->x + 3 * meeting[k], *other = near->x + 3 * meeting[n_meeting + k];
         for (int i = 0; i < 3; i++) normal[i] = other[i] - one[i];
@@ -169,7 +179,7 @@ static inline void ik_reaches(const ik_settings *ik, const ik_step_t *s, ik_near
     }
 }
 
-/* Whether steps within their bounds leave a pair its limit b, for certain. */
+/* Whether steps within their bounds leave a pair its limit b for certain. */
 static inline int ik_is_far(const ik_settings *ik, const ik_near_t *near, int pair, real b) {
     const real *normal = near->normal + 3 * pair;
     int one, other;
@@ -179,13 +189,13 @@ static inline int ik_is_far(const ik_settings *ik, const ik_near_t *near, int pa
         way += ik_abs(normal[i]) * near->reach[3 * other + i];
         if (one >= 0) way += ik_abs(normal[i]) * near->reach[3 * one + i];
     }
-    return way < b;
+    return way < b || b == R(INFINITY);
 }
 
 /* Write rows A (k, n) and limits b (k) of the pairs that are near, the nearest first, in the unit in
    which weights are 1; return k. */
-static HK_NOINLINE int ik_gap_rows(const ik_settings *ik, ik_near_t *near, real seconds,
-                                   const ik_step_t *s, real *A, real *b) {
+static HK_NOINLINE int ik_gap_rows(const ik_settings *ik, ik_near_t *near, real seconds, real *A,
+                                   real *b) {
     const int n = ik->n;
     int k = 0;
     ik_choose_nearest(near);
@@ -286,7 +296,7 @@ static inline void ik_tighten(const ik_settings *ik, const real *dq, real second
 /* The step after which the body is clear of obstacles, and can stop before them. Where the model bends
    its way into one, rows are tightened by what it took too much; where that does not help, the step
    is shortened towards the hardest braking. `rows` holds those of other limits. */
-static HK_NOINLINE void ik_step_clear(const ik_settings *ik, const ik_wish *wish, const real *J,
+static HK_NOINLINE void ik_step_clear(const ik_settings *ik, const ik_wish_t *wish, const real *J,
                                       real seconds, ik_rows_t *rows, real *A, real *b,
                                       ik_step_t *s) {
     const int n = ik->n, first = rows->k;
@@ -295,7 +305,7 @@ static HK_NOINLINE void ik_step_clear(const ik_settings *ik, const ik_wish *wish
     ik_find_gaps(ik, wish->q, wish->x, J, &near);
     ik_reaches(ik, s, &near);
     for (int round = 0; round <= IK_AROUND; round++) {
-        rows->k = first + ik_gap_rows(ik, &near, seconds, s, A + n * first, b + first);
+        rows->k = first + ik_gap_rows(ik, &near, seconds, A + n * first, b + first);
         ik_propose(ik, wish, rows, s);
         if (round == 0) s->blocked = ik_meets(ik, rows, first, s->dq);
         if (!ik_check_gaps(ik, wish->q, s->dq, seconds, &near)) return;
