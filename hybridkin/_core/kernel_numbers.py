@@ -60,8 +60,8 @@ HK_LONGEST = 1.5  # bound of a correction, relative to the longest one of a trai
 HK_J, HK_DISTANCE = 1, 2  # asked for besides x
 HK_IF_SAME = 4  # only if what the plan was made of has not changed
 
-# Entries of a step: its model, flags, normals of a plane, half-spaces, obstacles, the body that keeps
-# clear of them (-1: none), then the stages of hysteresis, and rows of their state.
+# Entries of a step: its model, flags, normals of a plane, half-spaces, obstacles, the body that
+# keeps clear of them (-1: none), then the stages of hysteresis, and rows of their state.
 IK_MODEL, IK_FLAGS, IK_N_NORMALS, IK_N_SPACES, IK_N_OBSTACLES, IK_BODY = 0, 1, 2, 3, 4, 5
 IK_STAGES, IK_STATE_ROWS = 6, 7
 # Entries of a body: its points, pairs of them that can meet, then the models of the points, and the
@@ -107,7 +107,9 @@ IK_OBSTACLE = 19  # numbers of one: center, axes, sides of its box, radius
 IK_PAIRS_MOST = 32  # pairs of a point and an obstacle, or of two points, in the law of a step
 IK_NEARER = 0.5  # of a gap: the largest part of it that one step takes, to first order
 IK_AROUND = 4  # steps that are tried where the curvature of the model would lead into an obstacle
-IK_BENT = 0.25  # of a way towards an obstacle, by the curvature of the model: the most in one step
+IK_BENT_WAY = (
+    0.25  # of a way towards an obstacle, by the curvature of the model: the most in one step
+)
 IK_SHORTER = 5  # halvings of a step after that; then it brakes
 IK_INSIDE_OBSTACLE = 1e-6  # a body so far in an obstacle has not reached its target [m]
 

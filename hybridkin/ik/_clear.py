@@ -17,7 +17,7 @@ from torch import Tensor
 
 from hybridkin._core.arrays import as_array, number, whole
 from hybridkin._core.kernel_numbers import (
-    IK_BENT,
+    IK_BENT_WAY,
     IK_INSIDE_OBSTACLE,
     IK_NEARER,
     IK_OBSTACLE,
@@ -262,18 +262,16 @@ class Near(NamedTuple):
         rounding = 32.0 * torch.finfo(size.dtype).eps * size
         return ~(taken <= self.gap.clamp_min(0.0) + rounding)
 
-    def tightened(
-        self, b: Tensor, dq: Tensor, way: Tensor, taken: Tensor
-    ) -> tuple[Tensor, Tensor]:
+    def tightened(self, b: Tensor, dq: Tensor, way: Tensor, taken: Tensor) -> tuple[Tensor, Tensor]:
         """Return tighter limits b (N, p), and which part of the step to try, (N, 1).
 
         Steps dq, on the ways to a stop, have taken too much of some gaps. What the curvature of the
-        model took is to be at most IK_BENT of the way; it shrinks with the square of the step.
+        model took is to be at most IK_BENT_WAY of the way; it shrinks with the square of the step.
         """
         broken = self.is_broken(taken)
         bent = taken - apply_rows(self.A, way)
         longest = self.A.norm(dim=-1) * way.norm(dim=-1, keepdim=True)
-        straight = torch.where(broken & (bent > 0.0), IK_BENT * longest / bent, 1.0)
+        straight = torch.where(broken & (bent > 0.0), IK_BENT_WAY * longest / bent, 1.0)
         part = straight.amin(-1, keepdim=True).clamp_max(1.0)
         beyond = (taken - apply_rows(self.A, dq)) * part.square()
         less = IK_NEARER * self.gap.clamp_min(0.0) - beyond

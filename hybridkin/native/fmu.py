@@ -113,10 +113,10 @@ def export_fmu(
     limits, 1 limits restricted it, 2 held, because an input is not finite) and rejected (1 if the
     measurement was not used, as it cannot be), with hysteresis effective (what the actuators do),
     with obstacles the input obstacles (their centers now) and the output blocked (1 if they changed
-    the step), and as parameters the start, the limits, gain, beta, fraction (of what a measurement shows
-    beyond the offset between robot and model, by default 0.2, and 1 with a `gain`), delay (age of
-    measurements) and memory (0: the offset stays). A step of the simulation must be a multiple of
-    its period; in several periods a measurement is that of the first.
+    the step), and as parameters the start, the limits, gain, beta, fraction (of what a measurement
+    shows beyond the offset between robot and model, by default 0.2, and 1 with a `gain`), delay
+    (age of measurements) and memory (0: the offset stays). A step of the simulation must be a
+    multiple of its period; in several periods a measurement is that of the first.
 
     Parameters are checked as in Python. All but the start may change between steps. A call that is
     refused returns fmi3Error, logs the reason (category logStatusError), and changes nothing.

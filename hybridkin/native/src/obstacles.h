@@ -246,6 +246,15 @@ static inline int ik_is_broken(const ik_near_t *near, int pair) {
     return !(near->taken[pair] <= left + near->rounding);
 }
 
+/* The way (n) of a step and of the hardest braking after it. */
+static inline void ik_way_after(const ik_settings *ik, const real *dq, real seconds, real *way) {
+    for (int j = 0; j < ik->n; j++) {
+        way[j] = dq[j];
+        if (ik->flags & IK_ACCELERATES)
+            way[j] += ik_way_to_stop(dq[j], ik->accel[j] * seconds * seconds);
+    }
+}
+
 /* Evaluate what a step, with the way to a stop after it, really takes of all gaps, and return whether
    that is too much of any. */
 static HK_NOINLINE int ik_check_gaps(const ik_settings *ik, const real *q, const real *dq,
@@ -255,12 +264,8 @@ static HK_NOINLINE int ik_check_gaps(const ik_settings *ik, const real *q, const
     real at[HK_MAX_N], *taken = near->taken;
     const real *normal = near->normal;
     int any = 0;
-    for (int j = 0; j < ik->n; j++) {
-        at[j] = dq[j];
-        if (ik->flags & IK_ACCELERATES)
-            at[j] += ik_way_to_stop(dq[j], ik->accel[j] * seconds * seconds);
-        at[j] += q[j];
-    }
+    ik_way_after(ik, dq, seconds, at);
+    for (int j = 0; j < ik->n; j++) at[j] += q[j];
     ik_points(ik, 0, at, near->moved, NULL);
     for (int i = 0; i < 3 * n_points; i++) near->moved[i] -= near->x[i];
     for (int i = 0; i < n_points; i++)
@@ -279,38 +284,58 @@ static HK_NOINLINE int ik_check_gaps(const ik_settings *ik, const real *q, const
     return any;
 }
 
-/* Tighten the limits of pairs of which a step took too much, by what it took beyond first order. */
-static inline void ik_tighten(const ik_settings *ik, const real *dq, real seconds,
-                              ik_near_t *near) {
-    real row[HK_MAX_N];
+/* Tighten the limits of pairs of which a step took too much, and return which part of it to try. What
+   the curvature of the model took is to be at most IK_BENT_WAY of the way; it shrinks with the square of
+   the step. */
+static HK_NOINLINE real ik_tighten(const ik_settings *ik, const real *dq, real seconds,
+                                   ik_near_t *near) {
+    const int n = ik->n;
+    real row[HK_MAX_N], way[HK_MAX_N], part = R(1.0);
+    ik_way_after(ik, dq, seconds, way);
+    const real length = ik_norm(n, way);
     for (int p = 0; p < near->n_pairs; p++) {
         if (!ik_is_broken(near, p)) continue;
-        real less = IK_NEARER * hk_larger(near->gap[p], R(0.0)) - near->taken[p];
+        real bent = near->taken[p];
         ik_gap_row(ik, near, p, row);
-        for (int j = 0; j < ik->n; j++) less += row[j] * dq[j];
+        for (int j = 0; j < n; j++) bent -= row[j] * way[j];
+        const real straight = bent > R(0.0) ? IK_BENT_WAY * (ik_norm(n, row) * length) / bent : R(1.0);
+        part = straight < part ? straight : part;
+    }
+    for (int p = 0; p < near->n_pairs; p++) {
+        if (!ik_is_broken(near, p)) continue;
+        real beyond = near->taken[p];
+        ik_gap_row(ik, near, p, row);
+        for (int j = 0; j < n; j++) beyond -= row[j] * dq[j];
+        const real less = IK_NEARER * hk_larger(near->gap[p], R(0.0)) - beyond * (part * part);
         if (less < ik_gap_limit(ik, near, p, seconds) && less < near->tight[p])
             near->tight[p] = less;
     }
+    return part;
 }
 
 /* The step after which the body is clear of obstacles, and can stop before them. Where the model bends
-   its way into one, rows are tightened by what it took too much; where that does not help, the step
-   is shortened towards the hardest braking. `rows` holds those of other limits. */
+   its way into one, rows are tightened by what it took too much, for a shorter way if that is much;
+   where that does not help, the step is shortened towards the hardest braking. `rows` holds those of other limits. */
 static HK_NOINLINE void ik_step_clear(const ik_settings *ik, const ik_wish_t *wish, const real *J,
                                       real seconds, ik_rows_t *rows, real *A, real *b,
                                       ik_step_t *s) {
-    const int n = ik->n, first = rows->k;
-    real wanted[HK_MAX_N], part = R(1.0);
+    const int n = ik->n, m = ik->m, first = rows->k;
+    real wanted[HK_MAX_N], v[IK_ROWS], allowed[IK_ROWS], part = R(1.0);
+    ik_wish_t shorter = *wish;
+    shorter.v = v, shorter.allowed = allowed;
+    for (int i = 0; i < m; i++) v[i] = wish->v[i], allowed[i] = wish->allowed[i];
     ik_near_t near = ik_near_of(ik);
     ik_find_gaps(ik, wish->q, wish->x, J, &near);
     ik_reaches(ik, s, &near);
     for (int round = 0; round <= IK_AROUND; round++) {
         rows->k = first + ik_gap_rows(ik, &near, seconds, A + n * first, b + first);
-        ik_propose(ik, wish, rows, s);
+        ik_propose(ik, &shorter, rows, s);
         if (round == 0) s->blocked = ik_meets(ik, rows, first, s->dq);
         if (!ik_check_gaps(ik, wish->q, s->dq, seconds, &near)) return;
         s->blocked = 1;
-        ik_tighten(ik, s->dq, seconds, &near);
+        const real less = ik_tighten(ik, s->dq, seconds, &near);
+        for (int i = 0; i < m; i++) v[i] *= less, allowed[i] *= less;
+        for (int j = 0; j < n; j++) s->posture[j] *= less;
     }
     for (int j = 0; j < n; j++) wanted[j] = s->dq[j];
     for (int halving = 0; halving <= IK_SHORTER; halving++) {
