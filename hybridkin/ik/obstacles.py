@@ -52,7 +52,7 @@ class Obstacle(Portable):
     low: Tensor
     high: Tensor
     radius: float
-    name: str
+    name: str = ""
 
     def __repr__(self) -> str:
         """Return the kind, the place and the name."""

@@ -8,6 +8,7 @@ every figure: that of `model_color` for its name.
 """
 
 from hybridkin.plots._canvas import model_color, new_figure
+from hybridkin.plots._obstacles import obstacle_surface
 from hybridkin.plots.animation import TrackAnimation
 from hybridkin.plots.errors import ErrorBoxDisplay, ErrorHistogramDisplay
 from hybridkin.plots.space import BackboneDisplay, WorkspaceDisplay
@@ -23,4 +24,5 @@ __all__ = [
     "WorkspaceDisplay",
     "model_color",
     "new_figure",
+    "obstacle_surface",
 ]
