@@ -1,0 +1,147 @@
+"""The obstacles around a robot, and how near a track comes to each of them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+import hybridkin
+from hybridkin import InverseKinematics, obstacles
+from hybridkin.app.workflow.report import Report, millimetres
+from hybridkin.plots import BackboneDisplay
+
+_BODIES = 7  # of a track that a figure shows
+_ROOM = 1e-6  # less than this below the clearance is rounding [m]
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """What the body of a robot keeps clear of.
+
+    Attributes
+    ----------
+    obstacles : tuple of Obstacle
+        The obstacles.
+    clearance : float
+        Least distance between body and obstacles [m].
+    """
+
+    obstacles: Sequence[obstacles.Obstacle] = ()
+    clearance: float = 0.0
+
+    def __bool__(self) -> bool:
+        """Return whether there are any obstacles."""
+        return len(self.obstacles) > 0
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the obstacles, no two the same."""
+        names = []
+        counts = Counter[str]()
+        for k, obstacle in enumerate(self.obstacles):
+            name = obstacle.name or f"obstacle {k + 1}"
+            counts[name] += 1
+            if counts[name] > 1:
+                name = f"{name} ({counts[name]})"
+            names.append(name)
+        return names
+
+
+@dataclass(frozen=True)
+class ObstacleDistance:
+    """How near the body comes to an obstacle, by the model.
+
+    Attributes
+    ----------
+    name : str
+        The obstacle.
+    path, lead_in : float
+        Least distance along the path, and on the way to it [m]; negative inside the obstacle.
+        Without a way to the path `lead_in` is infinite.
+    """
+
+    name: str
+    path: float
+    lead_in: float
+
+
+def nearest_distances(
+    surroundings: Surroundings, ik: InverseKinematics, effective: NDArray, n_lead: int
+) -> list[ObstacleDistance]:
+    """Return how near motions (T, n) come to every obstacle; the first `n_lead` lead to a path."""
+    if not surroundings:
+        return []
+    distances = np.asarray(ik.body_distances(effective))
+    on_way = distances[:n_lead].min(axis=0, initial=np.inf)
+    on_path = distances[n_lead:].min(axis=0)
+    rows = zip(surroundings.names, on_path.tolist(), on_way.tolist(), strict=True)
+    return [ObstacleDistance(*row) for row in rows]
+
+
+def add_distances(
+    report: Report, surroundings: Surroundings, nearest: Sequence[ObstacleDistance], blocked: int
+) -> None:
+    """Add to a report how near a track comes to obstacles, and whether it enters one."""
+    if not surroundings:
+        return
+    has_way = np.isfinite([row.lead_in for row in nearest]).all()
+    header = ["smallest distance of the body [mm]", "path"]
+    if has_way:
+        header.append("lead-in")
+    rows = []
+    for row in nearest:
+        cells = [row.name, f"{1e3 * row.path:.2f}"]
+        if has_way:
+            cells.append(f"{1e3 * row.lead_in:.2f}")
+        rows.append(cells)
+    report.table(header, rows)
+    report.text(
+        f"Distances are those of the model. Clearance: {millimetres(surroundings.clearance)}. "
+        f"BLOCKED: {blocked} points, where an obstacle is in the way."
+    )
+    least = surroundings.clearance - _ROOM
+    too_near = [row.name for row in nearest if row.lead_in < least]
+    if too_near:
+        report.text(
+            "The lead-in does not keep clear of {names}: it goes straight from the start to the "
+            "path. Move the robot to the path by another way, and give --from path.",
+            names=", ".join(too_near),
+        )
+    too_near = [row.name for row in nearest if row.path < least]
+    if too_near:
+        report.text("The path does not keep clear of {names}.", names=", ".join(too_near))
+
+
+def add_bodies(
+    report: Report,
+    surroundings: Surroundings,
+    model: hybridkin.HybridForwardModel,
+    ik: InverseKinematics,
+    t: NDArray,
+    effective: NDArray,
+    target: NDArray,
+) -> None:
+    """Add a figure of the body among its obstacles, and of its distances to them."""
+    if not surroundings:
+        return
+    figure = hybridkin.plots.new_figure(10.0, 4.6)[0]
+    figure.clear()
+    space, ax = figure.add_subplot(1, 2, 1, projection="3d"), figure.add_subplot(1, 2, 2)
+    rows = np.unique(np.linspace(0, len(t) - 1, _BODIES).astype(int))
+    display = BackboneDisplay.from_estimator(
+        model.module_.robot, effective[rows], obstacles=surroundings.obstacles
+    )
+    display.plot(space, unit="mm")
+    space.plot(*(1e3 * target.T), color="black", linewidth=1.0)
+    distances = 1e3 * np.asarray(ik.body_distances(effective))
+    for name, values in zip(surroundings.names, distances.T, strict=True):
+        ax.plot(t, values, label=name)
+    ax.axhline(1e3 * surroundings.clearance, color="black", linewidth=1.0, label="clearance")
+    ax.set(xlabel="time [s]", ylabel="distance of the body [mm]")
+    ax.legend(frameon=False, fontsize="small")
+    caption = "The body by the model among its obstacles, and its distance to each."
+    report.figure("obstacles", figure, caption)
