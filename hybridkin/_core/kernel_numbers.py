@@ -99,6 +99,7 @@ IK_PAIRS_MOST = 32  # pairs of a point and an obstacle, or of two points, in the
 IK_NEARER = 0.5  # of a gap: the largest part of it that one step takes, to first order
 IK_AROUND = 4  # steps that are tried where the curvature of the model would lead into an obstacle
 IK_SHORTER = 5  # halvings of a step after that; then it brakes
+IK_INSIDE_OBSTACLE = 1e-6  # a body so far in an obstacle has not reached its target [m]
 
 # The way out of a singular configuration, eq. (22).
 IK_STUCK = 0.01  # of a motion: a step that promises less does not get there

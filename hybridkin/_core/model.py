@@ -193,9 +193,43 @@ class ForwardModel(PortableModule):
 
     def with_tip(self, at: float) -> ForwardModel:
         """Return a model of another point of the robot, `at` in segments from the base."""
-        raise TypeError(
-            f"`chain` must have with_tip(at), e.g. a chain of arcs, got {type(self).__name__}."
-        )
+        raise TypeError(_without_body("have with_tip(at)", self))
+
+    def body_lengths(self, q: Tensor) -> Tensor:
+        """Return the length of the body from its start to the end of every segment [m].
+
+        Parameters
+        ----------
+        q : Tensor of shape (..., n_actuators)
+            Actuator vectors.
+
+        Returns
+        -------
+        Tensor of shape (..., S + 1)
+            Cumulative lengths at the places 0, 1, ..., S of `with_tip`; the first one is 0.
+
+        Raises
+        ------
+        TypeError
+            For models whose body is not known, e.g. functions.
+
+        Examples
+        --------
+        >>> import torch
+        >>> from hybridkin import ConstantCurvatureChain
+        >>> chain = ConstantCurvatureChain([0.01] * 2, lengths=[0.1, 0.2], offsets=[0.05, 0.0])
+        >>> chain.body_lengths(torch.zeros(6, dtype=torch.float64))
+        tensor([0.0000, 0.1500, 0.3500], dtype=torch.float64)
+        """
+        raise TypeError(_without_body("have body_lengths(q)", self))
+
+    @property
+    def body_radii(self) -> Tensor:
+        """Radius of the body in every segment, shape (S,) [m]; infinite where it is unknown.
+
+        Models whose body is not known raise a TypeError.
+        """
+        raise TypeError(_without_body("have body_radii", self))
 
     def joined(self, tips: list[ForwardModel]) -> ForwardModel:
         """Return the model of all markers of models of one marker each, as from `each_tip`."""
@@ -473,6 +507,19 @@ class Wrapped(PoseModel):
         """The model of actuators that do what they are commanded."""
         return self.around(self.model.without_hysteresis)
 
+    def with_tip(self, at: float) -> ForwardModel:
+        """Return a model of another point of the robot, changed like this one."""
+        return self.around(self.model.with_tip(at))
+
+    def body_lengths(self, q: Tensor) -> Tensor:
+        """Return the cumulative lengths (..., S + 1) of the other model's body [m]."""
+        return self.model.body_lengths(self._inner(q))
+
+    @property
+    def body_radii(self) -> Tensor:
+        """Radius of the other model's body in every segment, shape (S,) [m]."""
+        return self.model.body_radii
+
     def around(self, model: ForwardModel) -> ForwardModel:
         """Return another model, changed like this one."""
         raise NotImplementedError
@@ -598,6 +645,14 @@ class Moved(Wrapped):
         """Return by how much targets before T are out of reach of f, shape (...) [m]."""
         before = moved_points(x, torch.linalg.inv(self.motion))
         return self.model.misses(before, largest)
+
+
+def _without_body(need: str, model: ForwardModel) -> str:
+    """Return the message of a model that knows no body."""
+    return (
+        f"`chain` must {need}, e.g. a chain of arcs or a RigidChain, got {type(model).__name__}; "
+        "pass the chain, or of a hybrid its `robot`."
+    )
 
 
 def is_at_rest(motion: Tensor) -> bool:

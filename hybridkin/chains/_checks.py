@@ -16,6 +16,7 @@ from hybridkin._core.arrays import (
     Numbers,
     Transform,
     identity,
+    number,
     real_array,
     shaped,
 )
@@ -36,6 +37,16 @@ def float_dtype(dtype: object) -> torch.dtype:
         if dtype is supported:
             return supported
     raise ValueError(f"`dtype` must be torch.float64 or torch.float32, got {dtype!r}.")
+
+
+def place_on_body(at: float, n_segments: int) -> float:
+    """Return a place on a body, in segments from its start."""
+    place = number(at, "at")
+    if not 0.0 < place <= n_segments:
+        raise ValueError(
+            f"`at` must lie in (0, {n_segments}], in segments from the base, got {at}."
+        )
+    return place
 
 
 def lengths_of(value: Numbers, name: str, dtype: torch.dtype, size: int | None = None) -> Tensor:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 from hybridkin._core.actuators import ActuatorLayout
 from hybridkin._core.arrays import as_array, identity, whole
@@ -172,6 +172,24 @@ class ArcChain(MarkedChain):
     def least_radius(self) -> float:
         """Smallest radius of an actuator circle [m]."""
         return float(self.radii.detach().min())
+
+    def body_lengths(self, q: Tensor) -> Tensor:
+        """Return the length (..., S + 1) of the backbone up to the end of every segment [m].
+
+        Rigid offsets count.
+        """
+        arcs, _ = self.arcs(q)
+        with_offsets = arcs + self.arc_offsets.to(arcs)
+        segments = with_offsets.unflatten(-1, (self.n_segments, -1)).sum(-1)
+        return nn.functional.pad(segments.cumsum(-1), (1, 0))
+
+    @property
+    def body_radii(self) -> Tensor:
+        """Radius of the circle of all actuators in every segment, shape (S,) [m]."""
+        if self.routing == "segment":
+            return self.radii
+        largest, _ = self.radii.flip(0).cummax(0)  # actuators of later segments run through
+        return largest.flip(0)
 
     @property
     def rest(self) -> Tensor:
@@ -487,9 +505,7 @@ class ArcChain(MarkedChain):
             passed = slice(self.starts[s], s + 1)
             actuators.append(actuator_path(frames, passed, radii[s], angle))
         disks = [disk(frames[:, 0, 0], radii[0])]
-        for s, radius in enumerate(radii):
-            if self.routing == "base":
-                radius = max(radii[s:])
+        for s, radius in enumerate(self.body_radii.tolist()):
             disks.append(disk(frames[:, s, -1], radius))
         return Body(
             points=as_array(self.backbone(q, n_points)),

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from hybridkin._core.arrays import number
 from hybridkin._core.frames import Marker
 from hybridkin._core.model import ForwardModel
-from hybridkin.chains._checks import filled
+from hybridkin.chains._checks import filled, place_on_body
 from hybridkin.chains.chain import Chain
 
 if TYPE_CHECKING:
@@ -67,11 +67,7 @@ class MarkedChain(Chain):
         >>> chain(torch.zeros(6, dtype=torch.float64))
         tensor([0.0000, 0.0000, 0.1500], dtype=torch.float64)
         """
-        if not 0.0 < number(at, "at") <= self.n_segments:
-            raise ValueError(
-                f"`at` must lie in (0, {self.n_segments}], in segments from the base, got {at}."
-            )
-        return self._marked([(at, 0.0, 0.0, 0.0)])
+        return self._marked([(place_on_body(at, self.n_segments), 0.0, 0.0, 0.0)])
 
     def with_markers(self, markers: Sequence[Sequence[Any]]) -> Self:
         """Return a chain whose outputs are several points of the same robot.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from os import PathLike
 from typing import TYPE_CHECKING, NamedTuple
@@ -26,6 +27,7 @@ from hybridkin.chains._checks import (
     float_dtype,
     joint_limits,
     numeric,
+    place_on_body,
     pose,
     rigid_pose,
 )
@@ -52,16 +54,18 @@ _KINDS = ("revolute", "prismatic")
 
 
 def _write_plan(plan: Plan, stored: Stored) -> int:
-    """Write the node of an arm: the frame of every joint relative to the one before."""
-    slides = [kind == "prismatic" for kind in stored.list_of(str, "kinds")]
-    n_joints = len(slides)
+    """Write the node of an arm up to its tip: frames of joints relative to those before."""
+    couplings = stored.derived["couplings_to_tip"]
+    n_joints, n = couplings.shape
+    slides = [kind == "prismatic" for kind in stored.list_of(str, "kinds")][:n_joints]
     if not slides:
         raise NoKernel("an arm without moving joints is a constant")
     plan.limit("actuators", n_joints)
     before = stored.array("base")
     numbers = []
-    origins = stored.derived["origins_at_zero"]
-    for origin, axis in zip(origins, stored.derived["unit_axes"], strict=True):
+    origins = stored.derived["origins_to_tip"]
+    axes = stored.derived["unit_axes"][:n_joints]
+    for origin, axis in zip(origins, axes, strict=True):
         farthest = np.eye(3)[np.abs(axis).argmin()]
         side = np.cross(axis, farthest)
         side = side / np.linalg.norm(side)
@@ -72,11 +76,9 @@ def _write_plan(plan: Plan, stored: Stored) -> int:
         before = turn.T
     end = before @ stored.derived["end"]
     numbers += [end[:3, 3], end[:3, :3]]
-    couplings = stored.array("couplings")
     coupled = not np.array_equal(couplings, np.eye(n_joints))
     if coupled:
         numbers.append(couplings)
-    n = couplings.shape[1]
     return plan.node("rigid", n, 3, numbers, n_joints, coupled, *slides)
 
 
@@ -167,18 +169,19 @@ class RigidChain(Chain):
 
     kinds: tuple[str, ...]
     names: tuple[str, ...]
+    tip_at: float
 
     _entries = ("base", "joint_zeros", "tool")
     _zeros = "joint_zeros"
-    _structure = ("n_actuators", "kinds", "names")
+    _structure = ("n_actuators", "kinds", "names", "tip_at")
     _limits = ("q_min", "q_max", "dq_max", "ddq_max")
     _arrays = ("origins", "axes", "tip", "tool", *_limits, "base")
     _arrays += ("joint_zeros", "couplings")
     layout = Layout(
         "rigid",
         dict.fromkeys(_arrays, ""),
-        {"kinds": list, "names": list},
-        derived=("origins_at_zero", "unit_axes", "end"),
+        {"kinds": list, "names": list, "tip_at": float},
+        derived=("origins_to_tip", "unit_axes", "end", "couplings_to_tip"),
         write_plan=_write_plan,
     )
     computed = ("origins_at_zero", "end", "motions", "slides")
@@ -219,6 +222,7 @@ class RigidChain(Chain):
         self.n_actuators = n
         self.kinds = _strings(kinds, "kinds", ["revolute"] * n_joints)
         self.names = _strings(names, "names", [f"joint_{k + 1}" for k in range(n)])
+        self.tip_at = float(n_joints)
         if not set(self.kinds) <= set(_KINDS):
             raise ValueError(f"`kinds` must be among {_KINDS}, got {self.kinds}.")
         if tip is None:
@@ -438,7 +442,7 @@ class RigidChain(Chain):
     @classmethod
     def from_stored(cls, stored: Stored, restore: Restore) -> RigidChain:
         """Return the arm built from a description."""
-        settings = {key: stored.list_of(str, key) for key in cls.layout.settings}
+        settings = {key: stored.list_of(str, key) for key in ("kinds", "names")}
         arrays = {}
         for name in cls.layout.arrays:
             if name in stored.arrays:
@@ -448,7 +452,9 @@ class RigidChain(Chain):
         # The constructor rounds poses and axes; the state is what the file holds.
         for name, array in arrays.items():
             arm._set_geometry({name: torch.tensor(array, dtype=dtype, device="cpu")})
-        return arm
+        if not arm.kinds or "tip_at" not in stored.settings:  # an earlier file
+            return arm
+        return arm.with_tip(stored.value("tip_at", float))
 
     def geometry(self) -> dict[str, Tensor]:
         """Return the geometry by name.
@@ -465,11 +471,16 @@ class RigidChain(Chain):
             entries["origins"] = _with_positions(self.origins, links)
         super()._set_geometry(entries)
 
-    @derived("origins", "axes", "tip", "tool")
     def _links(self) -> _Links:
-        slides = self.slides
-        axes = self.unit_axes
-        motions = joint_motions(self.origins, axes, slides)
+        """Return the joints up to the tip."""
+        return self._links_to(self.tip_at)
+
+    @derived("origins", "axes", "tip", "tool")
+    def _links_to(self, tip_at: float) -> _Links:
+        m = self._joints_to_tip
+        slides = self.slides[:m]
+        axes = self.unit_axes[:m]
+        motions = joint_motions(self.origins[:m], axes, slides)
         return _Links(motions, axes, self.end, slides)
 
     @property
@@ -485,18 +496,108 @@ class RigidChain(Chain):
 
     @property
     def end(self) -> Tensor:
-        """Pose of the tip in the moving frame of the last joint, shape (4, 4)."""
-        tool = self.tip[:3, :3] @ self.tool + self.tip[:3, 3]
-        return _with_positions(self.tip, tool)
+        """Pose of the tip in the moving frame of the last joint before it, shape (4, 4)."""
+        m = self._joints_to_tip
+        if m < len(self.kinds):
+            turned, link = self.origins[m], self.origins[m, :3, 3]
+        else:
+            turned, link = self.tip, self.tip[:3, :3] @ self.tool + self.tip[:3, 3]
+        return _with_positions(turned, self._part_of_link * link)
 
     @property
     def origins_at_zero(self) -> Tensor:
         """Poses of the frames of the joints at q = 0, shape (n_joints, 4, 4)."""
+        return self._whole.origins_to_tip
+
+    @property
+    def origins_to_tip(self) -> Tensor:
+        """Poses of the frames of the m joints before the tip at q = 0, shape (m, 4, 4)."""
         motions, _, _, slides = self._links()
-        z = -self.couplings @ self.joint_zeros
+        z = -self.couplings_to_tip @ self.joint_zeros
         u1, u2 = joint_coefficients(z[:, None, None], slides[:, None, None])
         still, by_u1, by_u2 = motions.unbind(1)
         return still + u1 * by_u1 + u2 * by_u2
+
+    def with_tip(self, at: float) -> RigidChain:
+        """Return an arm whose tip is another point of the same arm.
+
+        Parameters
+        ----------
+        at : float
+            Place on the straight lines from joint to joint, in joints: 0.5 is the middle between
+            the origins of the first and of the second joint, 1.0 the origin of the second joint,
+            n_joints (the default) the arm's end. The origin of a prismatic joint does not slide
+            with it.
+
+        Returns
+        -------
+        RigidChain
+            Tip, Jacobians and tip transform belong to that point, which turns like the end of its
+            link; actuators, poses and backbone still belong to the whole arm.
+
+        Raises
+        ------
+        ValueError
+            For a place that is not on the arm.
+
+        Examples
+        --------
+        The middle of the second of two links of 0.3 m and 0.2 m:
+
+        >>> import numpy as np
+        >>> import torch
+        >>> from hybridkin import RigidChain
+        >>> origins = np.stack([np.eye(4), np.eye(4)])
+        >>> origins[1, 0, 3] = 0.3
+        >>> arm = RigidChain(origins, [[0, 0, 1], [0, 0, 1]], tool=[0.2, 0, 0])
+        >>> arm.with_tip(1.5)(torch.tensor([0.0, torch.pi / 2]))
+        tensor([0.3000, 0.1000, 0.0000])
+        """
+        arm = self.with_geometry()  # shares the buffers
+        arm.tip_at = place_on_body(at, len(self.kinds))
+        return arm
+
+    @property
+    def _whole(self) -> RigidChain:
+        """The arm up to its end."""
+        end = float(len(self.kinds))
+        return self if self.tip_at == end else self.with_tip(end)
+
+    @property
+    def _joints_to_tip(self) -> int:
+        """Number of joints before the tip."""
+        return math.ceil(self.tip_at)
+
+    @property
+    def _part_of_link(self) -> float:
+        """The part of the link with the tip that lies before it."""
+        return 1.0 + self.tip_at - self._joints_to_tip
+
+    @property
+    def couplings_to_tip(self) -> Tensor:
+        """Motion of the m joints before the tip per motion of every actuator, shape (m, n)."""
+        m = self._joints_to_tip
+        reached = torch.ones_like(self.couplings[:m])
+        if m and self.kinds[m - 1] == "prismatic":  # the stroke is a part of the link
+            reached[-1] = self._part_of_link
+        return reached * self.couplings[:m]
+
+    def body_lengths(self, q: Tensor) -> Tensor:
+        """Return the length (..., n_joints + 1) of the lines up to every joint and the end [m].
+
+        The first joint is at 0. The places are those of `with_tip`.
+        """
+        arm = self._whole
+        frames = arm._joint_poses(q)[..., :3, :]
+        next_joints = torch.cat([arm.origins[:, :, 3], arm.end[None, :, 3]]).to(q)
+        places = (frames @ next_joints[..., None])[..., 0]
+        links = places.diff(dim=-2).norm(dim=-1)
+        return nn.functional.pad(links.cumsum(-1), (1, 0))
+
+    @property
+    def body_radii(self) -> Tensor:
+        """Infinite radii of the links, shape (n_joints,) [m]: a description does not hold them."""
+        return torch.full_like(self.axes[:, 0], torch.inf)
 
     @property
     def default_parameters(self) -> tuple[str, ...]:
@@ -547,19 +648,22 @@ class RigidChain(Chain):
         return Scale(units, kinds)
 
     def coordinates(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        """Return joint positions from the origins at rows q (N, n), and dz/dq (n_joints, n)."""
-        couplings = self.couplings.to(q)
+        """Return positions of the m joints before the tip at rows q (N, n), and dz/dq (m, n).
+
+        They are counted from the origins.
+        """
+        couplings = self.couplings_to_tip.to(q)
         moved = q - self.joint_zeros.to(q)
         return moved @ couplings.mT, couplings
 
     def from_coordinates(self, z: Tensor) -> Tensor:
-        """Return the tip (N, 3) at joint positions z (N, n_joints)."""
+        """Return the tip (N, 3) at joint positions z (N, m)."""
         links = self._links().to(z)
         u1, u2 = joint_coefficients(z, links.slides)
         return carried_tip(u1, u2, links.motions, links.end[:, 3], self.base.to(z)).T
 
     def from_coordinates_and_jacobian(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the tip (N, 3) and its Jacobian by the joint positions (N, 3, n_joints)."""
+        """Return the tip (N, 3) and its Jacobian by the joint positions (N, 3, m)."""
         links = self._links().to(z)
         tip, linear, _ = links.columns(self._frames(z, links))
         return tip.T, linear.permute(2, 1, 0)
@@ -586,12 +690,12 @@ class RigidChain(Chain):
         In closed form, in [m/rad] for revolute joints and [-] for prismatic ones.
         """
         x, J = self.by_rows(lambda rows: self.from_coordinates_and_jacobian(self._joints(rows)), q)
-        return x, J @ self.couplings.to(q)
+        return x, J @ self.couplings_to_tip.to(q)
 
     def pose_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return the tip's pose (..., 4, 4) in the measuring frame, and `pose_jacobian(q)`."""
         pose, J = self.by_rows(self._pose_and_columns, q)
-        return pose, J @ self.couplings.to(q)
+        return pose, J @ self.couplings_to_tip.to(q)
 
     def _pose_and_columns(self, rows: Tensor) -> tuple[Tensor, Tensor]:
         z = self._joints(rows)
@@ -614,14 +718,15 @@ class RigidChain(Chain):
         Returns
         -------
         Tensor of shape (..., n_joints + 1, 4, 4)
-            Homogeneous transforms into the measuring frame; the last one is that of the tip: the
-            end link's frame, shifted to the tool.
+            Homogeneous transforms into the measuring frame; the last one is that of the arm's end:
+            the end link's frame, shifted to the tool.
         """
-        *links, last = self._joint_poses(q).unbind(-3)
-        return torch.stack([*links, last @ self.end.to(q)], dim=-3)
+        arm = self._whole
+        *links, last = arm._joint_poses(q).unbind(-3)
+        return torch.stack([*links, last @ arm.end.to(q)], dim=-3)
 
     def _joint_poses(self, q: Tensor) -> Tensor:
-        """Return the poses (..., n_joints + 1, 4, 4) of the base and of all joints' frames."""
+        """Return the poses (..., m + 1, 4, 4) of the base and of joints' frames up to the tip."""
 
         def of_rows(rows: Tensor) -> tuple[Tensor]:
             z = self._joints(rows)
@@ -632,10 +737,10 @@ class RigidChain(Chain):
 
     def pose(self, q: Tensor) -> Tensor:
         """Return the tip's pose in the measuring frame, shape (..., 4, 4)."""
-        return self.poses(q)[..., -1, :, :]
+        return self._joint_poses(q)[..., -1, :, :] @ self.end.to(q)
 
     def backbone(self, q: Tensor, n_points: int = 1) -> Tensor:
-        """Return points along the straight lines from the base through all joints to the tip.
+        """Return points along the straight lines from the base through all joints to the end.
 
         Parameters
         ----------
@@ -651,8 +756,9 @@ class RigidChain(Chain):
         """
         if n_points < 1:
             raise ValueError(f"`n_points` must be at least 1, got {n_points}.")
-        joints = self._joint_poses(q)[..., :3, 3]
-        corners = torch.cat([joints, self(q)[..., None, :]], dim=-2)
+        arm = self._whole
+        joints = arm._joint_poses(q)[..., :3, 3]
+        corners = torch.cat([joints, arm(q)[..., None, :]], dim=-2)
         start = corners[..., :-1, None, :]
         end = corners[..., 1:, None, :]
         places = torch.arange(1, n_points + 1, dtype=q.dtype, device=q.device)
@@ -671,18 +777,21 @@ class RigidChain(Chain):
 
     def extra_repr(self) -> str:
         """Return the summary shown by repr()."""
-        return f"{len(self.kinds)} joints: {', '.join(self.names)}"
+        summary = f"{len(self.kinds)} joints: {', '.join(self.names)}"
+        if self.tip_at == len(self.kinds):
+            return summary
+        return f"{summary}, tip at {self.tip_at:g}"
 
     def _why_shape(self) -> str:
         return f"this arm has {self.n_actuators} moving joints"
 
     def _joints(self, rows: Tensor) -> Tensor:
-        """Return the joint positions (N, n_joints) from the origins at rows q (N, n)."""
+        """Return positions (N, m) of the joints before the tip from the origins, at rows (N, n)."""
         z, _ = self.coordinates(rows)
         return z
 
     def _frames(self, z: Tensor, links: _Links) -> Tensor:
-        """Return the `moving_frames` at joint positions (N, n_joints), (n_joints + 1, 4, 3, N)."""
+        """Return the `moving_frames` at joint positions (N, m), (m + 1, 4, 3, N)."""
         u1, u2 = joint_coefficients(z, links.slides)
         return moving_frames(u1, u2, links.motions, self.base.to(z))
 

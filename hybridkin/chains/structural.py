@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from hybridkin._core.arrays import identity
 from hybridkin._core.frames import Frames
@@ -231,6 +231,23 @@ class StructuralChain(ForwardModel):
     def with_tip(self, at: float) -> StructuralChain:
         """Return a model of another point of the same robot, see `MarkedChain.with_tip`."""
         return self._around(self.chain.with_tip(at))
+
+    def body_lengths(self, q: Tensor) -> Tensor:
+        """Return the length (..., S + 1) of the backbone up to the end of every segment [m]."""
+
+        def longer(rows: Tensor) -> tuple[Tensor]:
+            frames = self.chain.frames_and_moves(rows)
+            change, _, _ = (self._changed(frames) - frames.arcs).chunk(3)
+            return (change.mT,)
+
+        (change,) = self.chain.by_rows(longer, q, _BLOCK)
+        up_to_end = nn.functional.pad(change.cumsum(-1), (1, 0))
+        return self.chain.body_lengths(q) + up_to_end
+
+    @property
+    def body_radii(self) -> Tensor:
+        """Radius of the circle of all actuators in every segment, shape (S,) [m]."""
+        return self.chain.body_radii
 
     def each_tip(self) -> list[StructuralChain]:
         """Return one model per marker, each mapping q (..., n) to x (..., 3)."""

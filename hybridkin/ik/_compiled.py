@@ -254,6 +254,7 @@ class Core:
             reached=result & IK_REACHED > 0,
             stationary=result & IK_AT_REST > 0,
             held=result & IK_HELD > 0,
+            blocked=torch.zeros_like(iterations, dtype=torch.bool),
             n_iter=iterations,
             n_starts=torch.ones_like(iterations),
         )
@@ -319,6 +320,7 @@ class Follower:
             state = np.zeros(int(places[last].stop))
         self.state = state
         self.task = core.settings.task
+        self.scene = core.settings.clear.scene
         self._dt = state[IK_PERIOD] = core.settings.dt
         state[IK_MEMORY] = feedback.memory
         self._parts = {name: state[place] for name, place in places.items()}

@@ -11,7 +11,8 @@ from torch import Tensor
 from hybridkin._core.actuation import Actuation
 from hybridkin._core.kernel_numbers import IK_AT_REST_SHARE
 from hybridkin.ik._gram import apply_rows
-from hybridkin.ik._settings import Bounds, StepSettings, stopping
+from hybridkin.ik._rates import stopping
+from hybridkin.ik._settings import Bounds, StepSettings
 from hybridkin.ik._step import StepRows
 
 

@@ -1,9 +1,12 @@
-"""Rates of the law of a step: of the feedback of the error, and of the posture."""
+"""Rates of the law of a step, of its feedback and its posture, and the way to a stop."""
 
 from __future__ import annotations
 
 import math
 from typing import NamedTuple
+
+import torch
+from torch import Tensor
 
 from hybridkin._core.arrays import number
 
@@ -52,3 +55,23 @@ def beta_of(value: object) -> Rate:
     if not beta.per_second >= 0.0:
         raise ValueError(f"`beta` must not be negative [1/s], got {beta.per_second!r}.")
     return beta
+
+
+def stopping(way: Tensor, change: Tensor) -> Tensor:
+    """Return the largest first step for which steps that shrink by `change` stop within `way`."""
+    n_changes = way.clamp_min(0.0) / change
+    stops = way / (0.5 + 0.5 * (1.0 + 2.0 * n_changes).sqrt())
+    return torch.where((way > 0.0) & torch.isfinite(way), stops, way)
+
+
+def way_to_stop(dq: Tensor, change: Tensor) -> Tensor:
+    """Return what follows steps dq (N, n) when every actuator stops, (N, n).
+
+    Every step is then shorter by `change`, until it is zero; infinite: nothing follows.
+    """
+    size = dq.abs()
+    n_steps = torch.floor(size / change)
+    n_steps = torch.where(torch.isfinite(n_steps), n_steps, 0.0)
+    less = 0.5 * n_steps * (n_steps + 1.0) * change
+    way = n_steps * size - torch.where(n_steps > 0.0, less, 0.0)
+    return torch.copysign(way, dq)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TypeVar
@@ -11,6 +12,7 @@ from torch import Tensor
 
 from hybridkin._core.kernel_numbers import (
     IK_INSIDE,
+    IK_INSIDE_OBSTACLE,
     IK_LAST_DAMPING,
     IK_NULL_GAIN,
     IK_NULL_SLIP,
@@ -22,7 +24,7 @@ from hybridkin._core.kernel_numbers import (
 from hybridkin.ik._gram import apply_columns, apply_rows, row_gram
 from hybridkin.ik._settings import Bounds, StepSettings
 from hybridkin.ik._starts import even_starts, nearest_starts
-from hybridkin.ik._step import limited_step, null_step
+from hybridkin.ik._step import StepRows, limited_step, null_step
 from hybridkin.ik._strict import StepLimits
 from hybridkin.ik.tasks import Tolerance
 
@@ -72,6 +74,7 @@ class Found(Point):
     reached: Tensor
     stationary: Tensor
     held: Tensor
+    blocked: Tensor
     n_iter: Tensor
     n_starts: Tensor
 
@@ -106,7 +109,7 @@ class Search:
     def solve(self, q: Tensor, target: Tensor, cold: bool, restarts: int) -> Found:
         """Return the best points from starts q (N, n), and from further starts if these fail."""
         settings = self.settings
-        q = settings.start_at(q)
+        q = self._free(settings.start_at(q))
         target = settings.allowed(target)
         if cold and len(q) > 0:
             q = self._beside_singular_start(q, target)
@@ -226,7 +229,7 @@ class Search:
 
     def _from(self, starts: Tensor, target: Tensor) -> Found:
         """Return the results of several starts (N, s, n) for each target, row by row."""
-        rows = self.settings.start_at(starts.flatten(0, 1))
+        rows = self._free(self.settings.start_at(starts.flatten(0, 1)))
         return self._attempt(rows, target.repeat_interleave(starts.shape[1], 0))
 
     def _to_posture(self, ends: Found) -> None:
@@ -277,13 +280,14 @@ class Search:
     def _start(self, q: Tensor, target: Tensor) -> Found:
         point = self._point(q, target)
         copies = [part.clone() for part in vars(point).values()]
-        reached = self._within(point.e)
+        reached = self._reached(point)
         n_iter = torch.zeros_like(reached, dtype=torch.long)
         return Found(
             *copies,
             reached=reached,
             stationary=torch.zeros_like(reached),
             held=torch.zeros_like(reached),
+            blocked=torch.zeros_like(reached),
             n_iter=n_iter,
             n_starts=n_iter + 1,
         )
@@ -298,7 +302,7 @@ class Search:
         none = torch.zeros_like(damping)
         live = _Descent(**vars(state), start=state.error, nu=damping, growth=2.0 + none, slow=none)
         for iteration in range(self.max_iter + 1):
-            live.reached = self._within(live.e)
+            live.reached = self._reached(live)
             live.stationary = (
                 self._blocked(live) | (live.nu > IK_LAST_DAMPING) | (live.slow >= IK_SLOW_STEPS)
             )
@@ -328,8 +332,8 @@ class Search:
         upper = upper.where(stays, half_turn)
         limits = StepLimits.of_bounds(lower, upper, live.q)
         still = torch.zeros_like(live.q)
-        step = limited_step(settings, live.J, live.e, still, limits, trust * size)
-        new = self._point(settings.inside(live.q + step.dq), live.target)
+        step = self._step(live, still, limits, trust * size)
+        new = self._point(self._free(settings.inside(live.q + step.dq)), live.target)
         error_new = new.error
         predicted = (live.e - apply_rows(live.J, step.dq)).norm(dim=-1)
 
@@ -338,17 +342,48 @@ class Search:
         predicted_gain = error.square() - predicted.square()
         quality = gain / predicted_gain.clamp_min(1e-30)
         factor = (1.0 - (2.0 * quality - 1.0) ** 3).clamp(1.0 / 3.0, 2.0)
-        better = error_new < error
+        better = (error_new < error) & self._stays_free(live.q, new.q)
         live.nu = live.nu * torch.where(better, factor, live.growth)
         live.growth = torch.where(better, 2.0, 2.0 * live.growth)
         metres = self.tol[0] if isinstance(self.tol, tuple) else self.tol
         little = better & (error - error_new < IK_SLOW * metres)
         live.slow = torch.where(little, live.slow + 1.0, 0.0)
         live.held = step.saturated.any(-1)
+        live.blocked = step.blocked | torch.zeros_like(live.held)
         live.put(better, new.take(better))
 
     def _within(self, e: Tensor) -> Tensor:
         return self.settings.task.reached(e, self.tol)
+
+    def _reached(self, at: Point) -> Tensor:
+        """Return whether errors are within tol and the body is free."""
+        clear = self.settings.clear
+        return self._within(at.e) & ~clear.is_inside(at.q, clear.scene)
+
+    def _step(
+        self, at: Point, posture: Tensor, limits: StepLimits, damping_sq: Tensor | None = None
+    ) -> StepRows:
+        """Return steps within limits, which take of the gaps to obstacles at most what there is."""
+        clear = self.settings.clear
+        if not clear:
+            return limited_step(self.settings, at.J, at.e, posture, limits, damping_sq)
+        near = clear.near(at.q, torch.full_like(at.q, math.inf), clear.scene)
+        limits = limits.with_rows(*near.rows(near.gap))
+        step = limited_step(self.settings, at.J, at.e, posture, limits, damping_sq)
+        return step._replace(blocked=near.is_active(step.dq))
+
+    def _free(self, q: Tensor) -> Tensor:
+        """Return configurations moved out of obstacles, within the limits."""
+        box = self.settings.box(q)
+        return self.settings.clear.freed(q, box.lower.expand_as(q), box.upper.expand_as(q))
+
+    def _stays_free(self, q: Tensor, q_new: Tensor) -> Tensor:
+        """Return whether the body is as free as before, or free, bool (N,)."""
+        clear = self.settings.clear
+        if not clear:
+            return torch.ones_like(q[:, 0], dtype=torch.bool)
+        allowed = clear.smallest(q, clear.scene).clamp_max(0.0)
+        return clear.smallest(q_new, clear.scene) >= allowed - 0.5 * IK_INSIDE_OBSTACLE
 
     def _blocked(self, at: Point) -> Tensor:
         """Return whether no motion within the limits lowers the error to first order."""
@@ -418,6 +453,7 @@ class Search:
             small = reached_new | (new.error <= IK_NULL_SLIP * unprojected)
             corrects = ~reached & (new.error < 0.5 * live.error)
             stays_inside = task.in_domain(new.q) | ~was_inside[rows]
+            stays_inside &= self._stays_free(live.q, new.q)
             taken = ((small & (gain > 0.0)) | corrects | last) & stays_inside
             recorded = taken & reached_new
             ends.put(rows[recorded], point.take(recorded))
@@ -443,7 +479,7 @@ class Search:
         # A step of the free actuators removes what is left of the error.
         best = ends.take(all_rows)
         corrected = self._after_step(best, torch.zeros_like(best.q), hold=True)
-        better = (corrected.error < best.error) & self._within(corrected.e)
+        better = (corrected.error < best.error) & self._reached(corrected)
         ends.put(all_rows[better], corrected.take(better))
 
     def _slide(self, at: Point, wanted: Callable[[Tensor], Tensor], fraction: Tensor) -> _Slide:
@@ -458,7 +494,7 @@ class Search:
             held = bounds.held(torch.zeros_like(at.q))
             bounds = Bounds(*(end.where(~held, 0.0) for end in bounds))
         limits = StepLimits.of_bounds(*bounds, at.q)
-        step = limited_step(self.settings, at.J, at.e, posture, limits)
+        step = self._step(at, posture, limits)
         return self._point(at.q + step.dq, at.target)
 
     def _nudged(self, at: Found) -> Tensor:

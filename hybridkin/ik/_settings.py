@@ -36,10 +36,12 @@ from hybridkin._core.named_rows import without_warnings
 from hybridkin._core.plan import NoKernel, Plan
 from hybridkin._core.planes import PlaneOfQ
 from hybridkin._core.portable import Portable
+from hybridkin.ik._clear import BodyPoints, KeptClear, kept_clear, nowhere
 from hybridkin.ik._feedback import expected_innovation
 from hybridkin.ik._half_spaces import HalfSpaces
 from hybridkin.ik._posture import FixedPosture, Function, NoPosture, PostureFunction
-from hybridkin.ik._rates import Rate
+from hybridkin.ik._rates import Rate, stopping
+from hybridkin.ik.obstacles import Obstacle, as_numbers
 from hybridkin.ik.tasks import (
     AxisTask,
     PointsTask,
@@ -107,13 +109,6 @@ def limits_of(task: Task, names: Iterable[str]) -> dict[str, Tensor]:
     return {name: bound(limits[name], name, positive=name in RATES) for name in names}
 
 
-def stopping(way: Tensor, change: Tensor) -> Tensor:
-    """Return the largest first step for which steps that shrink by `change` stop within `way`."""
-    n_changes = way.clamp_min(0.0) / change
-    stops = way / (0.5 + 0.5 * (1.0 + 2.0 * n_changes).sqrt())
-    return torch.where((way > 0.0) & torch.isfinite(way), stops, way)
-
-
 def _in_words(limits: Tensor) -> str:
     """Return a number, or the smallest and the largest one; None if all are infinite."""
     if torch.isinf(limits).all():
@@ -147,7 +142,11 @@ class StepSettings(Portable):
     weights: Tensor
     of_model: tuple[str, ...]
     tip_limits: HalfSpaces
+    obstacles: tuple[Obstacle, ...]
+    clearance: float
+    body_points: BodyPoints
     posture: NoPosture = field(init=False)
+    clear: KeptClear = field(init=False)
     periods: Tensor = field(init=False)
     pulls: Tensor = field(init=False)
     n_actuators: int | None = field(init=False)
@@ -188,6 +187,7 @@ class StepSettings(Portable):
         periods = torch.where(turns & full, self.q_max.new_tensor(_TURN), math.inf)
         vars(self).update(
             posture=self._posture(),
+            clear=self._clear(),
             periods=periods,
             pulls=bound(model.robot.pulls, "pulls"),
             n_actuators=next(iter(sizes), None),
@@ -205,6 +205,14 @@ class StepSettings(Portable):
         if torch.isfinite(wanted).all():
             return FixedPosture(self.plane.nearest(wanted))
         return NoPosture()
+
+    def _clear(self) -> KeptClear:
+        """Return the body and what it keeps clear of; without limits, nothing."""
+        scene = as_numbers(self.obstacles)
+        longest = torch.where(torch.isfinite(self.q_max), self.q_max, 0.0)
+        if self.limits == "off":
+            return nowhere()
+        return kept_clear(self.task, scene, self.clearance, self.body_points, longest)
 
     def present(self) -> StepSettings:
         """Return the settings for the model that the estimator of the task has now."""
@@ -315,6 +323,8 @@ class StepSettings(Portable):
         posture = self.posture.numbers
         if n is None:
             raise TypeError("the number of actuators is unknown; give one limit for each")
+        if self.clear:
+            raise TypeError("obstacles have no kernel")
         model = plan.stack([model.stored() for model in self.task.steered])
         scale = np.repeat(self.task.units, self.task.parts)
         plan.limit("rows of a task", len(scale))
@@ -441,11 +451,19 @@ class StepSettings(Portable):
         return self.inside(q)
 
     def allowed(self, x: Tensor) -> Tensor:
-        """Return the points nearest to x within the tip limits."""
+        """Return the points nearest to x within the tip limits, and outside obstacles."""
         limits = self.tip_limits
-        if limits.n == 0:
-            return x
-        return x + limits.way_in(limits.margin(x))
+        if limits.n > 0:
+            x = x + limits.way_in(limits.margin(x))
+        if self.is_in_obstacle(x).any():
+            x = self.clear.freed_tip(x)
+        return x
+
+    def is_in_obstacle(self, x: Tensor) -> Tensor:
+        """Return whether points that are steered (N, ...) are in an obstacle, bool (N,)."""
+        if not self.clear or self.task.shape != (3,):
+            return torch.zeros(len(x), dtype=torch.bool, device=x.device)
+        return (self.clear.freed_tip(x) != x).any(-1)
 
     def change(self, q: Tensor, period: float) -> Tensor:
         """Return the largest difference between consecutive steps."""

@@ -9,7 +9,7 @@ from hybridkin.ik._settings import StepSettings
 
 _SHARED = 2048  # configurations within the limits, the same for every row
 _OWN = 64  # around a row's start, if an actuator has no limits
-_OUTSIDE = 4.0  # factor on the distance of starts outside the domain of the models
+_OUTSIDE = 4.0  # factor on the distance of starts outside the domain, or in obstacles
 
 
 def nearest_starts(
@@ -44,12 +44,13 @@ def nearest_starts(
     sample = even_starts(settings, q, size, n_sample)
     sample = settings.start_at(sample)
 
-    # Tips outside the domain count as farther away than they are.
+    # Tips outside the domain, or of a body in an obstacle, count as farther away than they are.
     rows = sample.flatten(0, 1)
     x, _ = settings.evaluate(rows)
     tips = x.unflatten(0, (-1, n_sample))
     distance = task.distances(tips, target)
-    inside = task.in_domain(rows).view(-1, n_sample)
+    usable = task.in_domain(rows) & ~settings.clear.is_inside(rows, settings.clear.scene)
+    inside = usable.view(-1, n_sample)
     distance = torch.where(inside, distance, _OUTSIDE * distance)
     distance = distance.nan_to_num(torch.inf)
 

@@ -12,10 +12,12 @@ import torch
 from torch import Tensor
 
 from hybridkin._core.kernel_numbers import (
+    IK_AROUND,
     IK_BALANCE,
     IK_CORRECTIONS,
     IK_LEAST_PULL,
     IK_PULL_RATIO,
+    IK_SHORTER,
     IK_SLACK,
     IK_SLIP,
     IK_STUCK,
@@ -31,7 +33,8 @@ from hybridkin.ik._gram import (
     row_gram,
     solve_rows,
 )
-from hybridkin.ik._settings import Bounds, StepSettings, stopping
+from hybridkin.ik._rates import stopping, way_to_stop
+from hybridkin.ik._settings import Bounds, StepSettings
 from hybridkin.ik._strict import StepLimits, step_within
 
 
@@ -44,6 +47,7 @@ class StepRows(NamedTuple):
     saturated: Tensor
     promised: Tensor  # motion of the tip to first order
     stopped: Tensor | bool = False  # by a tip limit
+    blocked: Tensor | bool = False  # by an obstacle
 
     @property
     def held(self) -> Tensor:
@@ -78,6 +82,7 @@ def control_step(
     last: Tensor | float = 0.0,
     bounds: Bounds | None = None,
     least: Tensor | float = 0.0,
+    scene: Tensor | None = None,
 ) -> StepRows:
     """Return the step of eq. (1) for one period, with v = dx dt + gain dt e.
 
@@ -106,6 +111,8 @@ def control_step(
         Bounds of the step. Default: the limits.
     least : Tensor of shape (N,) or float
         Least lambda^2, in the unit in which weights are 1.
+    scene : Tensor of shape (K, IK_OBSTACLE), optional
+        Where the obstacles are now. Default: where they are in the settings.
 
     Returns
     -------
@@ -134,7 +141,9 @@ def control_step(
     if settings.has_posture:
         posture = beta * (settings.preferred(at) - at)
         posture = torch.where(fine, posture, 0.0)
-    change = settings.change(q, seconds)
+    change = settings.change(q, seconds).expand_as(q)
+    if scene is None:
+        scene = settings.clear.scene
     if settings.accelerates:
         brake = _braking(law, J, e, change)
         fastest_gain = stopping(torch.ones_like(brake), brake)
@@ -143,31 +152,30 @@ def control_step(
             fastest = stopping((posture / beta).abs(), change)
             posture = torch.clamp(posture, -fastest, fastest)
 
-    # Eq. (17), within the limits of q, of its speed and acceleration, and of the tip.
+    # Eq. (17), within the limits of q, of its speed and acceleration, of the tip, and of the body.
     v = feed_forward + gain * e
     if bounds is None:
         bounds = settings.step_bounds(q, seconds, last)
+    wish = _Wish(law, at, J, v, v, e, posture, bounds)
     limits = StepLimits.of_bounds(*bounds, q)
     spaces = settings.tip_limits
-    if spaces.n == 0:
-        step = law.step(J, v, posture, limits)
-        if not settings.pulls.any():
-            step = _escaping(law, at, J, v, e, step, bounds)
-    else:
+    stopped = torch.zeros_like(fine[:, 0])
+    if spaces.n > 0:
         margin = spaces.margin(torch.where(fine, tip, 0.0))
         if settings.accelerates:
             normals = spaces.normals.to(J)[:, None].expand(-1, len(J), -1)
             brakes = [_braking(law, J, normal, change) for normal in normals]
             margin = stopping(margin, torch.stack(brakes, dim=-1))
-        limits = limits._replace(A=spaces.normals.to(J) @ J, b=margin)
-        step = law.step(J, v, posture, limits)
+        limits = limits.with_rows(spaces.normals.to(J) @ J, margin)
         left = margin - spaces.along(v)
         rounding = 32.0 * torch.finfo(v.dtype).eps  # of a motion [m]
-        step = step._replace(stopped=(left < -rounding).any(-1))
-        v = v + spaces.way_in(left)
-    step = step._replace(promised=apply_rows(J, step.dq))
-    if settings.pulls.any():
-        step = _arriving(law, at, J, v, step, bounds)
+        stopped = (left < -rounding).any(-1)
+        wish = wish._replace(allowed=v + spaces.way_in(left))
+    if settings.clear:
+        step = _clear_step(wish, limits, change, scene)
+    else:
+        step = wish.step(limits)
+    step = step._replace(stopped=stopped)
 
     # The other rows stay, or brake; outside the limits their finite actuators return.
     fine = fine & _finite(step.dq)
@@ -179,6 +187,69 @@ def control_step(
         damping=torch.where(fine[:, 0], step.damping, 0.0),
         saturated=torch.where(fine, step.saturated, bounds.held(still)),
     )
+
+
+class _Wish(NamedTuple):
+    """What steps are for: the task v, of which limits of the tip allow a part, and the posture."""
+
+    law: Law
+    q: Tensor
+    J: Tensor
+    v: Tensor
+    allowed: Tensor
+    e: Tensor
+    posture: Tensor
+    bounds: Bounds
+
+    def step(self, limits: StepLimits) -> StepRows:
+        """Return the step within limits, for which tendons can only pull."""
+        settings = self.law.settings
+        step = self.law.step(self.J, self.v, self.posture, limits)
+        pulls = bool(settings.pulls.any())
+        if settings.tip_limits.n == 0 and not pulls:
+            step = _escaping(self.law, self.q, self.J, self.v, self.e, step, self.bounds)
+        step = step._replace(promised=apply_rows(self.J, step.dq))
+        if pulls:
+            step = _arriving(self.law, self.q, self.J, self.allowed, step, self.bounds)
+        return step
+
+
+def _clear_step(wish: _Wish, limits: StepLimits, change: Tensor, scene: Tensor) -> StepRows:
+    """Return the step after which the body is clear of obstacles, and can stop before them.
+
+    The rows of the gaps hold to first order. Where the model bends its way into an obstacle they
+    are tightened by what it took too much. If that does not help, the step is shortened towards the
+    hardest braking.
+    """
+    bounds = wish.bounds
+    near = wish.law.settings.clear.near(wish.q, change, scene)
+    b = near.b
+    step = wish.step(limits.with_rows(*near.rows(b)))
+    blocked = near.is_active(step.dq)
+    for _ in range(IK_AROUND):
+        taken = near.taken(step.dq + way_to_stop(step.dq, change))
+        broken = near.is_broken(taken).any(-1)
+        if not broken.any():
+            return step._replace(blocked=blocked)
+        blocked = blocked | broken
+        b = torch.where(broken[:, None], near.tightened(b, step.dq, taken), b)
+        step = wish.step(limits.with_rows(*near.rows(b)))
+
+    brake = bounds.clip(torch.zeros_like(step.dq))
+    wanted = step.dq
+    part = torch.ones_like(wanted[:, :1])
+    for halving in range(IK_SHORTER + 1):
+        dq = torch.where(part < 1.0, brake + part * (wanted - brake), wanted)
+        taken = near.taken(dq + way_to_stop(dq, change))
+        broken = near.is_broken(taken).any(-1, keepdim=True)
+        if not broken.any():
+            break
+        shorter = 0.5 * part if halving < IK_SHORTER else 0.0
+        part = torch.where(broken, shorter, part)
+    dq = torch.where(part < 1.0, brake + part * (wanted - brake), wanted)
+    held = torch.where(part < 1.0, bounds.held(dq), step.saturated)
+    promised = torch.where(part < 1.0, apply_rows(wish.J, dq), step.promised)
+    return step._replace(dq=dq, saturated=held, promised=promised, blocked=blocked)
 
 
 def limited_step(

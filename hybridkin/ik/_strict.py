@@ -39,6 +39,10 @@ class StepLimits(NamedTuple):
         upper = upper.expand_as(like)
         return cls(lower, upper, none[..., None].expand(*none.shape, like.shape[-1]), none)
 
+    def with_rows(self, A: Tensor, b: Tensor) -> StepLimits:
+        """Return the limits with further rows A (N, k, n) and b (N, k), less important ones."""
+        return self._replace(A=torch.cat([self.A, A], dim=1), b=torch.cat([self.b, b], dim=1))
+
     def clip(self, dq: Tensor) -> Tensor:
         """Return steps moved into the bounds."""
         return torch.clamp(dq, self.lower, self.upper)

@@ -49,12 +49,13 @@ def followed(
     command = as_array(start) if path.as_numpy else start
     tracker = Tracker(settings, command, path.tol, loop.readings, state)
     columns = tracker.follow(target, path.periods, loop.plant, loop.feedback, loop.progress)
-    q, effective, x, measured, e, rejected, sigma_min, held, damped = columns
+    q, effective, x, measured, e, rejected, sigma_min, held, damped, blocked = columns
     judged = e
     if loop.feedback != "measured":
         e = task.difference(task.completed(measured, x), target)
         judged = task.difference(x, target)
     error = e.norm(dim=-1)
+    scene = settings.clear.scene
     status = statuses(
         task,
         effective,
@@ -63,9 +64,12 @@ def followed(
         known=torch.isfinite(error) & ~rejected,
         held=held,
         singular=damped,
+        blocked=blocked,
+        inside=settings.clear.is_inside(effective, scene),
     )
     margin = settings.margin(q)
-    rows = (path.t, q, effective, x, measured, target, error, status, sigma_min, margin)
+    clearance = settings.clear.smallest(effective, scene)
+    rows = (path.t, q, effective, x, measured, target, error, status, sigma_min, margin, clearance)
     results = give_back((*rows, rejected), (len(target),), path.as_numpy)
     track = Track(*results)
     if loop.feedback != "measured":

@@ -11,7 +11,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from os import PathLike
-from typing import TypeAlias
 
 import torch
 from torch import Tensor
@@ -291,25 +290,26 @@ def _made(described: DescribedObstacle) -> Obstacle:
         raise ValueError(f"{described.where}: {error}") from error
 
 
-Scene: TypeAlias = Sequence[Obstacle]
-
-
-def as_numbers(scene: Scene, name: str = "obstacles") -> Tensor:
-    """Return obstacles as rows of numbers, shape (K, IK_OBSTACLE)."""
-    if isinstance(scene, Obstacle) or not isinstance(scene, Sequence):
+def as_scene(value: Sequence[Obstacle]) -> tuple[Obstacle, ...]:
+    """Return a caller's obstacles, checked."""
+    if not isinstance(value, Sequence):
         raise TypeError(
-            f"`{name}` must be a list of obstacles, e.g. [obstacles.Sphere(center, radius)], got "
-            f"{scene!r:.200}."
+            "`obstacles` must be a list of obstacles, e.g. [obstacles.Sphere(center, radius)], got "
+            f"{value!r:.200}."
         )
-    rows = [torch.empty(0, IK_OBSTACLE, dtype=torch.float64, device="cpu")]
-    for i, obstacle in enumerate(scene):
+    for i, obstacle in enumerate(value):
         if not isinstance(obstacle, Obstacle):
             raise TypeError(
-                f"`{name}[{i}]` must be an obstacle, e.g. obstacles.Sphere(center, radius), got "
+                f"`obstacles[{i}]` must be an obstacle, e.g. obstacles.Sphere(center, radius), got "
                 f"{obstacle!r:.200}."
             )
-        rows.append(obstacle.numbers[None])
-    return torch.cat(rows)
+    return tuple(value)
+
+
+def as_numbers(scene: Sequence[Obstacle]) -> Tensor:
+    """Return obstacles as rows of numbers, shape (K, IK_OBSTACLE)."""
+    none = torch.empty(0, IK_OBSTACLE, dtype=torch.float64, device="cpu")
+    return torch.cat([none, *(obstacle.numbers[None] for obstacle in scene)])
 
 
 def distances(x: Tensor, scene: Tensor) -> tuple[Tensor, Tensor]:

@@ -48,6 +48,9 @@ class IKStatus(IntEnum):
     tip was rejected."""
     NO_FURTHER = 7
     """No further one of the requested configurations (`n_solutions`) was found."""
+    BLOCKED = 8
+    """Not converged; obstacles, or the body itself, restricted the last step. A target inside an
+    obstacle is BLOCKED too: the nearest free point found is returned."""
 
 
 def statuses(
@@ -59,6 +62,8 @@ def statuses(
     known: Tensor,
     held: Tensor,
     singular: Tensor,
+    blocked: Tensor | bool,
+    inside: Tensor,
     resting: Tensor | bool = False,
     beyond: Tensor | bool = False,
 ) -> Tensor:
@@ -76,9 +81,11 @@ def statuses(
         Errors of the task there [m].
     tol : float or tuple of floats
         Largest error of a reached target.
-    known, held, singular : bool Tensor of shape (N,)
+    known, held, singular, blocked : bool Tensor of shape (N,)
         Whether all inputs are finite; limits restricted the motion; it was damped, or the Jacobian
-        has lost a direction.
+        has lost a direction; obstacles restricted it.
+    inside : bool Tensor of shape (N,)
+        Whether the body is in an obstacle, or in itself, at q.
     resting, beyond : bool Tensor of shape (N,), optional
         Whether no motion lowers the error; whether the target is out of reach for certain. Default:
         nobody knows.
@@ -87,8 +94,9 @@ def statuses(
     status[singular] = IKStatus.SINGULAR
     status[held] = IKStatus.AT_LIMITS
     status[torch.zeros_like(known) | resting] = IKStatus.MAX_ITER
+    status[torch.zeros_like(known) | blocked | inside] = IKStatus.BLOCKED
     status[torch.zeros_like(known) | beyond] = IKStatus.UNREACHABLE
-    reached = task.reached(e, tol)
+    reached = task.reached(e, tol) & ~inside
     status[reached] = IKStatus.CONVERGED
     status[reached & ~task.in_domain(q)] = IKStatus.OUT_OF_DOMAIN
     status[~(known & torch.isfinite(e.norm(dim=-1)))] = IKStatus.INVALID_INPUT
@@ -220,6 +228,9 @@ class Track(Generic[ArrayT]):
     rejected : bool array of shape (T,) or None
         Readings that were not used because they cannot be, see `Tracker.rejected`; None without
         feedback="measured".
+    clearance : array of shape (T,)
+        Smallest gap between the body, with its clearance, and obstacles or itself [m]; inf without
+        obstacles.
     """
 
     t: ArrayT
@@ -232,6 +243,7 @@ class Track(Generic[ArrayT]):
     status: ArrayT
     sigma_min: ArrayT
     limit_margin: ArrayT
+    clearance: ArrayT
     rejected: ArrayT | None = None
 
     @property
@@ -266,6 +278,7 @@ class Track(Generic[ArrayT]):
             "largest step of an actuator": f"{self.largest_step:.3g} (unit of q)",
             "smallest distance to a limit": f"{margin:.3g} (unit of q)",
             "smallest singular value": f"{as_array(self.sigma_min).min(initial=np.inf):.3g}",
+            "smallest gap to obstacles": f"{as_array(self.clearance).min(initial=np.inf):.3g} m",
             "commands": {"": ("least", "largest"), **commands},
         }
         if self.rejected is not None:

@@ -27,6 +27,8 @@ from hybridkin._core.arrays import (
 )
 from hybridkin._core.html import html_table
 from hybridkin._core.progress import quiet
+from hybridkin.ik._clear import BodyPoints
+from hybridkin.ik._clear import body_points as body_points_of
 from hybridkin.ik._compiled import Core, core_of
 from hybridkin.ik._feedback import MOST_PERIODS, Feedback
 from hybridkin.ik._gram import row_gram
@@ -46,6 +48,7 @@ from hybridkin.ik._settings import (
 from hybridkin.ik._starts import nearest_starts
 from hybridkin.ik._step import control_step
 from hybridkin.ik._tracks import Loop, Path, followed
+from hybridkin.ik.obstacles import Obstacle, as_numbers, as_scene
 from hybridkin.ik.results import IKSolution, IKStatus, Step, Track, statuses
 from hybridkin.ik.tasks import as_task
 from hybridkin.ik.tracker import Plant, Tracker
@@ -106,6 +109,17 @@ class InverseKinematics:
         Half-spaces (A, b) in which the tip must stay, ``A x <= b`` [m], in the frame of x; for
         position tasks only. A box ``low <= x <= high`` is
         ``(np.vstack([np.eye(3), -np.eye(3)]), np.concatenate([high, -low]))``.
+    obstacles : sequence of Obstacle, default=()
+        What the whole body keeps clear of, in the frame of x: `obstacles.Sphere`, `HalfSpace`,
+        `Capsule`, `Box`.
+    clearance : float, default=0.0
+        Least distance between the body and obstacles [m]. The expected error of the model comes on
+        top where its estimator knows it (`radius_`).
+    body_points : int or sequence of (place, radius), optional
+        Points along the body whose balls keep clear of obstacles and of each other: their number,
+        or for each its place in segments from the base, the last one the tip, and the radius of its
+        ball [m]. Default: so many that their balls are 25 % larger than the body, at most 24. With
+        `body_points` and without obstacles the body only keeps clear of itself.
 
     Attributes
     ----------
@@ -165,6 +179,9 @@ class InverseKinematics:
         dt: float = 0.01,
         weights: Array | None = None,
         tip_limits: Sequence[Array] | None = None,
+        obstacles: Sequence[Obstacle] = (),
+        clearance: float = 0.0,
+        body_points: BodyPoints = None,
     ) -> None:
         self.model = model
         task = as_task(model)
@@ -200,6 +217,9 @@ class InverseKinematics:
             weights=bound(weights, "weights", finite=True, positive=True),
             of_model=of_model,
             tip_limits=spaces,
+            obstacles=as_scene(obstacles),
+            clearance=_length(clearance, "clearance"),
+            body_points=body_points_of(body_points),
         )
         for message in self.settings.unit_messages():
             warnings.warn(message, stacklevel=2)
@@ -453,6 +473,10 @@ class InverseKinematics:
         as_numpy = is_numpy(x_target)
         places = self._places(n_solutions, differentiable)
         require(
+            not (differentiable and settings.clear),
+            "`differentiable` must be False with obstacles: they change which solution is found.",
+        )
+        require(
             isinstance(x_target, Tensor) or not differentiable,
             "`x_target` must be a torch tensor for differentiable=True.",
         )
@@ -470,7 +494,7 @@ class InverseKinematics:
         search = Search(settings, tolerance, max_iter)
         if as_numpy and start.dtype == torch.float64:
             core = core_of(settings)
-            if core is not None:
+            if core is not None and not settings.clear:
                 search = core.search(tolerance, max_iter)
                 settings = core.settings
                 task = settings.task
@@ -479,7 +503,8 @@ class InverseKinematics:
             solution = search.several(solution, start, restarts, places)
             lead = (*lead, places)
             target = target.repeat_interleave(places, 0)
-        # Tip limits have moved these targets.
+        # Tip limits or obstacles have moved these targets.
+        in_obstacle = settings.is_in_obstacle(target)
         moved = (solution.target != target).flatten(1).any(-1)
         q = solution.q
         if differentiable:
@@ -502,8 +527,10 @@ class InverseKinematics:
             known=torch.isfinite(error),
             held=solution.held,
             singular=singular.is_singular,
+            blocked=solution.blocked | in_obstacle,
+            inside=settings.clear.is_inside(q_plain, settings.clear.scene),
             resting=solution.stationary,
-            beyond=moved | (settings.misses(target) > np.max(tolerance)),
+            beyond=(moved & ~in_obstacle) | (settings.misses(target) > np.max(tolerance)),
         )
         place = torch.arange(len(q), device=q.device) % places
         status[(place > 0) & q.isnan().all(-1)] = IKStatus.NO_FURTHER
@@ -674,6 +701,7 @@ class InverseKinematics:
         x = as_tensor(track.x, "x")
         target = as_tensor(track.target, "target")
         before = as_tensor(track.status, "status")
+        clear = self.settings.clear
         e = task.difference(x, target)
         status = statuses(
             task,
@@ -683,9 +711,57 @@ class InverseKinematics:
             known=before != IKStatus.INVALID_INPUT,
             held=before == IKStatus.AT_LIMITS,
             singular=before == IKStatus.SINGULAR,
+            blocked=before == IKStatus.BLOCKED,
+            inside=clear.is_inside(motion, clear.scene),
         )
-        error, status = give_back([e.norm(dim=-1), status], (len(e),), is_numpy(track.q))
-        return replace(track, error=error, status=status)
+        clearance = clear.smallest(motion, clear.scene)
+        rows = [e.norm(dim=-1), status, clearance]
+        error, status, clearance = give_back(rows, (len(e),), is_numpy(track.q))
+        return replace(track, error=error, status=status, clearance=clearance)
+
+    @torch.no_grad()
+    def body_distances(self, q: Array, obstacles: Sequence[Obstacle] | None = None) -> Array:
+        """Return the distance from the body to every obstacle.
+
+        Parameters
+        ----------
+        q : array-like of shape (..., n)
+            Configurations; with hysteresis, what the actuators do.
+        obstacles : sequence of K Obstacle, optional
+            Default: those of the solver.
+
+        Returns
+        -------
+        array of shape (..., K)
+            Least distances [m] from the balls along the body to the surfaces, negative inside. They
+            are those of the model, without `clearance` and expected error. Balls that no
+            configuration can free, where the robot is mounted, do not count.
+
+        Raises
+        ------
+        ValueError
+            If the solver was made without obstacles: it then has no points along the body.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from hybridkin import InverseKinematics, obstacles, robots
+        >>> wall = obstacles.HalfSpace([-1.0, 0.0, 0.0], -0.3)
+        >>> trunk = robots.bionic_handling_assistant()
+        >>> ik = InverseKinematics(trunk, q_min=0.1, q_max=0.4, obstacles=[wall])
+        >>> ik.body_distances(np.full(9, 0.25)).round(2)
+        array([0.18])
+        """
+        settings = self.settings
+        require(
+            bool(settings.clear),
+            "`obstacles` or `body_points` must be given to the solver itself; without them it has "
+            "no points along the body.",
+        )
+        rows = settings.configurations(q, "q")
+        scene = settings.clear.scene if obstacles is None else as_numbers(as_scene(obstacles))
+        distances = settings.clear.distances(rows.reshape(-1, rows.shape[-1]), scene)
+        return give_back([distances], rows.shape[:-1], is_numpy(q))[0]
 
     def _starts(self, target: Tensor, q0: Tensor | None, as_numpy: bool) -> Iterator[Tensor]:
         """Yield two configurations (n,) at a target (1, ...): of the first start, a regular one."""
@@ -747,3 +823,13 @@ class InverseKinematics:
         for message in settings.posture_messages(start, "q0"):
             warnings.warn(message, stacklevel=2)
         return tracker
+
+
+def _length(value: float, name: str) -> float:
+    """Return a caller's length that is not negative [m]."""
+    length = number(value, name)
+    require(
+        0.0 <= length < math.inf,
+        f"`{name}` must be a length that is not negative [m], got {length!r}.",
+    )
+    return length

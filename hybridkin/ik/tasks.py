@@ -542,9 +542,9 @@ class PointsTask(Task):
     Parameters
     ----------
     chain : chain
-        A chain with the method ``with_tip(at)``, e.g. a chain of arcs.
+        A chain with the method ``with_tip(at)``: a chain of arcs or a `RigidChain`.
     at : sequence of float
-        Places on the backbone, in segments from the base.
+        Places on the backbone, in segments from the base; of a rigid arm in joints.
     weights : sequence of float, optional
         Factor on the error of every point, a compromise if not all points can be reached. Default:
         1 each.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from threading import Lock
@@ -24,6 +24,7 @@ from hybridkin.ik._hysteresis import lead_of
 from hybridkin.ik._rest import Rest
 from hybridkin.ik._settings import Array, StepSettings, require
 from hybridkin.ik._step import StepRows, control_step
+from hybridkin.ik.obstacles import Obstacle, as_numbers, as_scene
 from hybridkin.ik.results import IKStatus, statuses
 from hybridkin.ik.tasks import Tolerance
 
@@ -78,6 +79,8 @@ class Tracker(Portable):
         Smallest singular value of the Jacobian there, NaN if an input was not finite.
     damping : float
         Damping lambda of the last step, in the unit of `sigma_min`.
+    obstacles : tuple of Obstacle
+        The obstacles where they are now. Set as many others before a `step` to move them.
     backend : str
         "compiled" for NumPy and models that have kernels, else "torch: " and the reason.
 
@@ -105,6 +108,7 @@ class Tracker(Portable):
         self._tol = tol
         self._feedback = feedback
         self._as_numpy = is_numpy(q0)
+        self._obstacles = settings.obstacles
         self._lock = Lock()  # of the state, for threads that share the tracker
         self._reset(q0, state)
 
@@ -175,6 +179,29 @@ class Tracker(Portable):
         """Damping lambda of the last step, in the unit of `sigma_min`."""
         return float(self._last().step.damping)
 
+    @property
+    def obstacles(self) -> tuple[Obstacle, ...]:
+        """The obstacles where they are now; set as many others to move them."""
+        return self._obstacles
+
+    @obstacles.setter
+    def obstacles(self, value: Sequence[Obstacle]) -> None:
+        obstacles = as_scene(value)
+        before = len(self._settings.obstacles)
+        require(
+            len(obstacles) == before,
+            f"`obstacles` must be as many as before, {before}, got {len(obstacles)}; give "
+            "InverseKinematics as many as there may be, those not needed far away.",
+        )
+        with self._lock:
+            self._place(obstacles)
+
+    def _place(self, obstacles: tuple[Obstacle, ...]) -> None:
+        """Take obstacles to where they are now."""
+        self._obstacles = obstacles
+        self._scene = as_numbers(obstacles)
+        self._robot.scene = self._scene
+
     def _last(self) -> Tick:
         with self._lock:
             return self._robot.last()
@@ -201,6 +228,8 @@ class Tracker(Portable):
                 known=known,
                 held=step.held,
                 singular=step.damped,
+                blocked=step.blocked,
+                inside=self._settings.clear.is_inside(last.q, self._scene),
             )
         return IKStatus(int(status))
 
@@ -256,6 +285,7 @@ class Tracker(Portable):
         self._estimator = task.estimator
         self._module = task.module
         self._robot = robot
+        self._place(self._obstacles)
 
     def step(
         self,
@@ -374,8 +404,8 @@ class Tracker(Portable):
         """Return columns with a row for every point of the path (T, ...).
 
         They are the command, what the actuators do, x, the measured tip, the error of the loop,
-        whether the reading was rejected, sigma_min, and whether the step to the point was held or
-        damped; all others refer to the state at the point.
+        whether the reading was rejected, sigma_min, and whether the step to the point was held,
+        damped or blocked; all others refer to the state at the point.
         """
         task = self._settings.task
         n = len(targets)
@@ -384,7 +414,7 @@ class Tracker(Portable):
         countable = torch.isfinite(ahead).all(-1, keepdim=True)
         ahead = torch.where(countable, ahead, 0.0)
         finite = torch.isfinite(targets.flatten(1)).all(-1).tolist()
-        held = damped = torch.zeros(1, dtype=torch.bool, device=targets.device)
+        held = damped = blocked = torch.zeros(1, dtype=torch.bool, device=targets.device)
         rows = []
         for i, target in enumerate(targets.split(1)):
             progress(i, n)
@@ -404,11 +434,12 @@ class Tracker(Portable):
                 tip = tick.x
             rejected = torch.full_like(held, tick.rejected)
             state = command, tick.q, tick.x, tip, tick.e, rejected
-            rows.append((*state, tick.J, held, damped))
+            rows.append((*state, tick.J, held, damped, blocked))
             held = tick.step.held
             damped = tick.step.damped
-        *states, J, held, damped = map(torch.cat, zip(*rows, strict=True))
-        return [*states, row_gram(J, task.n_free).sigma_min, held, damped]
+            blocked = held.new_zeros(1) | tick.step.blocked
+        *states, J, held, damped, blocked = map(torch.cat, zip(*rows, strict=True))
+        return [*states, row_gram(J, task.n_free).sigma_min, held, damped, blocked]
 
     def _measured(self, plant: Plant, i: int) -> Tensor:
         """Return the plant's tip (1, ...), NaN if the plant raises.
@@ -435,6 +466,7 @@ class _InTorch:
         self.backend = f"torch: {reason}"
         self.task = settings.task.frozen()
         self._settings = replace(settings, task=self.task)
+        self.scene = settings.clear.scene
 
     @property
     def hysteresis(self) -> Any:
@@ -509,6 +541,7 @@ class _InTorch:
             feed_forward,
             last,
             least=rest.least(used),
+            scene=self.scene,
         )
         step = self._lead.step(control, J, seconds, last)
         readings.passed(seconds)

@@ -20,6 +20,7 @@ def track(**changed):
         "target": np.zeros((5, 3)),
     }
     parts |= {"error": error, "status": np.array([0, 0, 1, 6, 6]), "sigma_min": np.ones(5)}
+    parts["clearance"] = np.full(5, np.inf)
     return Track(**{**parts, "limit_margin": margin, **changed})
 
 

@@ -7,7 +7,9 @@ from hybridkin.ik.results import IKStatus, Track
 def a_track(q, error):
     x, status = np.zeros((len(error), 3)), np.full(len(error), IKStatus.CONVERGED.value)
     ones = np.ones(len(error))
-    return Track(ones, np.array(q), np.array(q), x, None, x, np.array(error), status, ones, ones)
+    return Track(
+        ones, np.array(q), np.array(q), x, None, x, np.array(error), status, ones, ones, ones
+    )
 
 
 def test_figures_of_a_track_leave_out_what_is_not_known():

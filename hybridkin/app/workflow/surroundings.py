@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,12 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 import hybridkin
-from hybridkin import InverseKinematics, obstacles
+from hybridkin import InverseKinematics, Track, obstacles
 from hybridkin.app.workflow.report import Report, millimetres
-from hybridkin.plots import BackboneDisplay
 
 _BODIES = 7  # of a track that a figure shows
-_ROOM = 1e-6  # less than this below the clearance is rounding [m]
+_ROUNDING = 1e-6  # less than this below the clearance is rounding [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,12 +83,12 @@ def nearest_distances(
 
 
 def add_distances(
-    report: Report, surroundings: Surroundings, nearest: Sequence[ObstacleDistance], blocked: int
+    report: Report, nearest: Sequence[ObstacleDistance], clearance: float, blocked: int
 ) -> None:
     """Add to a report how near a track comes to obstacles, and whether it enters one."""
-    if not surroundings:
+    if not nearest:
         return
-    has_way = np.isfinite([row.lead_in for row in nearest]).all()
+    has_way = all(math.isfinite(row.lead_in) for row in nearest)
     header = ["smallest distance of the body [mm]", "path"]
     if has_way:
         header.append("lead-in")
@@ -100,48 +100,43 @@ def add_distances(
         rows.append(cells)
     report.table(header, rows)
     report.text(
-        f"Distances are those of the model. Clearance: {millimetres(surroundings.clearance)}. "
-        f"BLOCKED: {blocked} points, where an obstacle is in the way."
+        f"Distances are those of the model; clearance {millimetres(clearance)}. BLOCKED: {blocked} "
+        "points, where an obstacle is in the way."
     )
-    least = surroundings.clearance - _ROOM
-    too_near = [row.name for row in nearest if row.lead_in < least]
-    if too_near:
+    on_way = [row.name for row in nearest if row.lead_in < clearance - _ROUNDING]
+    if on_way:
         report.text(
-            "The lead-in does not keep clear of {names}: it goes straight from the start to the "
-            "path. Move the robot to the path by another way, and give --from path.",
-            names=", ".join(too_near),
+            "**The lead-in does not keep clear** of {names}: it goes straight from the start to "
+            "the path. Move the robot to the path by another way, and give --from path.",
+            names=", ".join(on_way),
         )
-    too_near = [row.name for row in nearest if row.path < least]
-    if too_near:
-        report.text("The path does not keep clear of {names}.", names=", ".join(too_near))
+    on_path = [row.name for row in nearest if row.path < clearance - _ROUNDING]
+    if on_path:
+        report.text("**The path does not keep clear** of {names}.", names=", ".join(on_path))
 
 
 def add_bodies(
-    report: Report,
-    surroundings: Surroundings,
-    model: hybridkin.HybridForwardModel,
-    ik: InverseKinematics,
-    t: NDArray,
-    effective: NDArray,
-    target: NDArray,
+    report: Report, surroundings: Surroundings, ik: InverseKinematics, track: Track
 ) -> None:
     """Add a figure of the body among its obstacles, and of its distances to them."""
     if not surroundings:
         return
-    figure = hybridkin.plots.new_figure(10.0, 4.6)[0]
-    figure.clear()
-    space, ax = figure.add_subplot(1, 2, 1, projection="3d"), figure.add_subplot(1, 2, 2)
-    rows = np.unique(np.linspace(0, len(t) - 1, _BODIES).astype(int))
-    display = BackboneDisplay.from_estimator(
-        model.module_.robot, effective[rows], obstacles=surroundings.obstacles
+    plots = hybridkin.plots
+    figure, (ax, corner) = plots.new_figure(10.0, 4.6, 1, 2)
+    corner.remove()
+    space = figure.add_subplot(1, 2, 2, projection="3d")
+    rows = np.unique(np.linspace(0, len(track.t) - 1, _BODIES).astype(int))
+    bodies = plots.BackboneDisplay.from_estimator(
+        ik.model.module_.robot, track.effective[rows], obstacles=surroundings.obstacles
     )
-    display.plot(space, unit="mm")
-    space.plot(*(1e3 * target.T), color="black", linewidth=1.0)
-    distances = 1e3 * np.asarray(ik.body_distances(effective))
+    space.plot(*(1e3 * track.target.T), color="black", linewidth=1.0)
+    bodies.plot(space, unit="mm")
+    distances = 1e3 * np.asarray(ik.body_distances(track.effective))
     for name, values in zip(surroundings.names, distances.T, strict=True):
-        ax.plot(t, values, label=name)
-    ax.axhline(1e3 * surroundings.clearance, color="black", linewidth=1.0, label="clearance")
+        ax.plot(track.t, values, label=plain_label(name))
+    level = 1e3 * surroundings.clearance
+    ax.axhline(level, color="black", linewidth=1.0, label="clearance")
     ax.set(xlabel="time [s]", ylabel="distance of the body [mm]")
     ax.legend(frameon=False, fontsize="small")
-    caption = "The body by the model among its obstacles, and its distance to each."
+    caption = "Distances of the body to the obstacles, and the body along the path, by the model."
     report.figure("obstacles", figure, caption)

@@ -1,0 +1,374 @@
+"""The body of a robot that keeps clear of obstacles, and of itself.
+
+Points along the backbone carry balls that cover the body. A gap is what lies between such a ball
+and an obstacle, or between two balls. Obstacles are convex: a point at a distance d from one, with
+the direction n out of it, stays free on every way whose component along n is at least -d.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, TypeAlias
+
+import torch
+from torch import Tensor
+
+from hybridkin._core.arrays import number, whole
+from hybridkin._core.kernel_numbers import (
+    IK_INSIDE_OBSTACLE,
+    IK_NEARER,
+    IK_OBSTACLE,
+    IK_PAIRS_MOST,
+)
+from hybridkin._core.model import ForwardModel
+from hybridkin._core.portable import Portable
+from hybridkin.ik._gram import apply_rows
+from hybridkin.ik._nearest import Polyhedron, nearest
+from hybridkin.ik._rates import stopping
+from hybridkin.ik.obstacles import distances
+from hybridkin.ik.tasks import Task
+
+BodyPoints: TypeAlias = "int | Sequence[tuple[float, float]] | None"
+
+_SPACING = 1.5  # of two points in radii of the body: their balls are 25 % larger than the body
+_MOST_POINTS = 24
+_AROUND = 8  # rounds that bring a configuration out of obstacles
+_AROUND_POINT = 30  # and a point
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class KeptClear(Portable):
+    """Points of the body, and what they keep clear of; without points everything is free.
+
+    Attributes
+    ----------
+    models : tuple of P ForwardModels
+        Models of the points (3 outputs each), the last one of the tip.
+    radii : Tensor of shape (P,)
+        Radii of the balls that cover the body [m].
+    along : Tensor of shape (P,)
+        Length of the backbone up to the points [m].
+    keep : Tensor of shape (P,)
+        The least distances of the points to obstacles [m].
+    base : Tensor of shape (3,)
+        Where the base of the robot is [m].
+    scene : Tensor of shape (K, IK_OBSTACLE)
+        The obstacles.
+    """
+
+    models: tuple[ForwardModel, ...]
+    radii: Tensor
+    along: Tensor
+    keep: Tensor
+    base: Tensor
+    scene: Tensor
+
+    def __bool__(self) -> bool:
+        """Return whether there is anything to keep clear of."""
+        return len(self.models) > 0
+
+    @property
+    def meeting(self) -> Tensor:
+        """The pairs of points (2, p) that can meet: farther along the body than a half circle.
+
+        Points nearer than that would meet only where the backbone bends more sharply than its body
+        allows.
+        """
+        reach = self.radii[:, None] + self.radii
+        apart = self.along - self.along[:, None]
+        return (apart > 0.5 * math.pi * reach).nonzero().T
+
+    def points(self, q: Tensor) -> Tensor:
+        """Return the points (N, P, 3) at q (N, n) [m]."""
+        return torch.stack([model(q) for model in self.models], dim=1).to(q)
+
+    def points_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the points (N, P, 3) at q (N, n) [m], and their derivatives (N, P, 3, n)."""
+        pairs = [model.forward_and_jacobian(q) for model in self.models]
+        x = torch.stack([x for x, _ in pairs], dim=1)
+        J = torch.stack([J for _, J in pairs], dim=1)
+        return x.to(q), J.to(q)
+
+    def gaps(self, x: Tensor, scene: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the gaps (N, p) of points (N, P, 3) [m], and the directions (N, p, 3) out of them.
+
+        The pairs of every point and every obstacle of a scene come first, then the pairs of points.
+        The gap is infinite where no configuration makes it positive: the robot is mounted there.
+        """
+        scene = scene.to(x)
+        keep = self.keep.to(x)[:, None]
+        distance, normal = distances(x, scene)
+        free = torch.where(self._is_never_free(scene), math.inf, distance - keep).flatten(1)
+        one, other = self.meeting.to(x.device)
+        apart = x[:, other] - x[:, one]
+        size = apart.norm(dim=-1)
+        away = apart / torch.where(size > 0.0, size, 1.0)[..., None]
+        between = size - (self.radii[one] + self.radii[other]).to(x)
+        gaps = torch.cat([free, between], dim=1)
+        return gaps, torch.cat([normal.flatten(1, 2), away], dim=1)
+
+    def _is_never_free(self, scene: Tensor) -> Tensor:
+        """Return which points (P, K) no configuration frees: the robot is mounted there."""
+        at_base, _ = distances(self.base.to(scene), scene)
+        return self.keep.to(scene)[:, None] > at_base + self.along.to(scene)[:, None]
+
+    def distances(self, q: Tensor, scene: Tensor) -> Tensor:
+        """Return the distances (N, K) of the body at q (N, n) to every obstacle of a scene [m].
+
+        Those of points that are never free do not count.
+        """
+        scene = scene.to(q)
+        distance, _ = distances(self.points(q), scene)
+        distance = distance - self.radii.to(q)[:, None]
+        return torch.where(self._is_never_free(scene), math.inf, distance).amin(1)
+
+    def relative(self, rows: Tensor, n_obstacles: int) -> Tensor:
+        """Return values of points (N, P, ...) for the pairs of `gaps`, (N, p, ...)."""
+        one, other = self.meeting.to(rows.device)
+        of_obstacles = rows.repeat_interleave(n_obstacles, 1)
+        return torch.cat([of_obstacles, rows[:, other] - rows[:, one]], dim=1)
+
+    def smallest(self, q: Tensor, scene: Tensor) -> Tensor:
+        """Return the smallest gaps (N,) to a scene at q (N, n) [m]; infinite without any."""
+        if not self or len(q) == 0:
+            return torch.full_like(q[:, 0], math.inf)
+        gaps, _ = self.gaps(self.points(q), scene)
+        none = torch.full_like(gaps[:, :1], math.inf)
+        return torch.cat([gaps, none], dim=1).amin(-1)
+
+    def is_inside(self, q: Tensor, scene: Tensor) -> Tensor:
+        """Return whether the body is in an obstacle of a scene, or in itself, bool (N,)."""
+        return self.smallest(q, scene) < -IK_INSIDE_OBSTACLE
+
+    def near(self, q: Tensor, change: Tensor, scene: Tensor) -> Near:
+        """Return what is near the body at q (N, n); steps can change by `change` per period."""
+        x, J = self.points_and_jacobian(q)
+        gap, normal = self.gaps(x, scene)
+        A = -(normal[:, :, None] @ self.relative(J, len(scene)))[:, :, 0]
+        b = IK_NEARER * gap
+        brake = torch.where(A == 0.0, 0.0, A.abs() * change[:, None]).sum(-1)
+        b = torch.where(gap > 0.0, torch.minimum(b, stopping(gap, brake)), b)
+        return Near(self, q, x, gap, normal, A, b, len(scene))
+
+    def freed(self, q: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
+        """Return q (N, n) moved out of obstacles by short steps, within bounds of q.
+
+        Rows that cannot be free stay in them.
+        """
+        none = q.new_zeros(len(q), 0)
+        E = q.new_zeros(len(q), 0, q.shape[1])
+        for _ in range(_AROUND):
+            inside = self.smallest(q, self.scene) < 0.0
+            if not inside.any():
+                break
+            near = self.near(q, torch.full_like(q, math.inf), self.scene)
+            A, b = near.rows(near.gap)
+            size = A.norm(dim=-1)
+            size = torch.where(size > 0.0, size, 1.0)
+            still = torch.zeros_like(q)
+            b = b / size
+            within = Polyhedron(
+                E, none, lower - q, upper - q, A / size[..., None], b, b.clamp_min(0.0)
+            )
+            way, _ = nearest(still, within)
+            moved = torch.maximum(torch.minimum(q + way, upper), lower)
+            q = torch.where(inside[:, None], moved, q)
+        return q
+
+    def freed_tip(self, x: Tensor) -> Tensor:
+        """Return points (N, 3) of the tip moved out of obstacles, the nearest side first."""
+        keep = self.keep[-1].to(x)
+        for _ in range(_AROUND_POINT):
+            distance, normal = distances(x, self.scene.to(x))
+            depth, which = (keep - distance).max(-1)
+            if not (depth > 0.0).any():
+                break
+            out = normal[torch.arange(len(x), device=x.device), which]
+            x = torch.where((depth > 0.0)[:, None], x + depth[:, None] * (1.0 + 1e-9) * out, x)
+        return x
+
+
+class Near(NamedTuple):
+    """The gaps of the body at rows q (N, n), and one-sided limits of the step for each.
+
+    Attributes
+    ----------
+    clear : KeptClear
+        The body.
+    q : Tensor of shape (N, n)
+        Configurations.
+    x : Tensor of shape (N, P, 3)
+        Points of the body [m].
+    gap, normal : Tensor of shape (N, p) and (N, p, 3)
+        Gaps, and the directions out of them.
+    A, b : Tensor of shape (N, p, n) and (N, p)
+        To first order ``A dq`` is what a step takes of the gaps; it must be at most b.
+    n_obstacles : int
+        Number of obstacles.
+    """
+
+    clear: KeptClear
+    q: Tensor
+    x: Tensor
+    gap: Tensor
+    normal: Tensor
+    A: Tensor
+    b: Tensor
+    n_obstacles: int
+
+    def rows(self, b: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the rows A (N, k, n), and of b (N, p) their limits, of the smallest gaps first."""
+        count = min(IK_PAIRS_MOST, self.gap.shape[1])
+        # Limits that have been tightened come before others.
+        order = torch.where(b < self.b, -math.inf, self.gap)
+        chosen = order.topk(count, largest=False).indices
+        by_gap = self.gap.gather(1, chosen).argsort(dim=-1, stable=True)
+        chosen = chosen.gather(1, by_gap)
+        index = chosen[..., None].expand(-1, -1, self.q.shape[1])
+        return self.A.gather(1, index), b.gather(1, chosen)
+
+    def taken(self, way: Tensor) -> Tensor:
+        """Return what ways of the actuators (N, n) really take of the gaps, (N, p) [m]."""
+        moved = self.clear.points(self.q + way) - self.x
+        along = self.normal * self.clear.relative(moved, self.n_obstacles)
+        return -along.sum(-1)
+
+    def is_broken(self, taken: Tensor) -> Tensor:
+        """Return whether ways take more of gaps than there is, by more than rounding, (N, p)."""
+        size = self.x.abs().flatten(1).amax(-1, keepdim=True)
+        rounding = 32.0 * torch.finfo(size.dtype).eps * size
+        return ~(taken <= self.gap.clamp_min(0.0) + rounding)
+
+    def tightened(self, b: Tensor, dq: Tensor, taken: Tensor) -> Tensor:
+        """Return limits b (N, p) after steps dq that took too much of some gaps."""
+        excess = taken - IK_NEARER * self.gap.clamp_min(0.0)
+        less = torch.minimum(b, apply_rows(self.A, dq) - excess)
+        return torch.where(self.is_broken(taken), less, b)
+
+    def is_active(self, dq: Tensor) -> Tensor:
+        """Return whether steps are at a limit of the gaps, bool (N,)."""
+        used = apply_rows(self.A, dq)
+        size = apply_rows(self.A.abs(), dq.abs()) + self.b.abs()
+        rounding = 64.0 * torch.finfo(dq.dtype).eps * size
+        return (used >= self.b - rounding).any(-1)
+
+
+def nowhere() -> KeptClear:
+    """Return a body that keeps clear of nothing."""
+    none = torch.empty(0, dtype=torch.float64, device="cpu")
+    scene = torch.empty(0, IK_OBSTACLE, dtype=torch.float64, device="cpu")
+    return KeptClear((), none, none, none, none, scene)
+
+
+def kept_clear(
+    task: Task, scene: Tensor, clearance: float, wanted: BodyPoints, longest: Tensor
+) -> KeptClear:
+    """Return the body of the robot of a task, and the obstacles that it keeps clear of.
+
+    Parameters
+    ----------
+    task : Task
+        The task; its first model gives the body, and the tip.
+    scene : Tensor of shape (K, IK_OBSTACLE)
+        The obstacles.
+    clearance : float
+        Least distance between body and obstacles [m].
+    wanted : int, sequence of (place, radius), or None
+        Number of points, or their places [segments from the base] and radii [m].
+    longest : Tensor of shape () or (n,)
+        Configuration in which the robot is longest.
+    """
+    if len(scene) == 0 and wanted is None:
+        return nowhere()
+    model = task.models[0]
+    robot = model.robot
+    q = longest.expand(robot.n_actuators)
+    lengths = robot.body_lengths(q)
+    if wanted is None or isinstance(wanted, int):
+        places, radii = _evenly(lengths, robot.body_radii, wanted)
+    else:
+        places = [place for place, _ in wanted]
+        radii = torch.tensor([radius for _, radius in wanted], dtype=torch.float64, device="cpu")
+    models = [robot.with_tip(place) for place in places[:-1]]
+    along = torch.stack([_length_up_to(lengths, place) for place in places])
+    keep = radii + clearance + _expected_error(task)
+    base = robot.origin.detach().cpu().double()
+    return KeptClear((*models, model.tip_model), radii, along, keep, base, scene)
+
+
+def body_points(value: BodyPoints) -> BodyPoints:
+    """Return an argument `body_points`, checked."""
+    if value is None or isinstance(value, int):
+        return value if value is None else whole(value, "body_points", 1, 1000)
+    need = (
+        "`body_points` must be a number of points, or pairs (place, radius): the place in segments "
+        "from the base, increasing, the last one the tip, and a radius [m] that is not negative"
+    )
+    pairs: list[tuple[float, float]] = []
+    before = 0.0
+    try:
+        for place, radius in value:
+            pairs.append((number(place, "body_points"), number(radius, "body_points")))
+    except TypeError as error:
+        raise TypeError(f"{need}, got {value!r:.200}.") from error
+    for place, radius in pairs:
+        if not (before < place < math.inf and 0.0 <= radius < math.inf):
+            raise ValueError(f"{need}, got {value!r:.200}.")
+        before = place
+    if not pairs:
+        raise ValueError(f"{need}, got none.")
+    return pairs
+
+
+def _evenly(lengths: Tensor, radius: Tensor, wanted: int | None) -> tuple[list[float], Tensor]:
+    """Return places of points evenly along the body, and radii of balls that cover it."""
+    if not torch.isfinite(radius).all():
+        raise ValueError(
+            "`body_points` must give the radii of the body, which this robot does not know: pairs "
+            "(place, radius), e.g. [(1.0, 0.05), (2.0, 0.04)], places in segments from the base, "
+            "radii in metres."
+        )
+    length = float(lengths[-1])
+    if not 0.0 < length < math.inf:
+        raise ValueError(
+            f"`q_max` must be finite, so that the length of the body is known, which is {length} m."
+        )
+    count = wanted
+    if count is None:
+        count = min(_MOST_POINTS, math.ceil(length / (_SPACING * float(radius.min())) + 0.5))
+    spacing = length / (count - 0.5)
+    places = []
+    radii = []
+    for k in range(count):
+        middle = 0.5 * spacing + k * spacing
+        inside = (lengths[:-1] < middle + 0.5 * spacing) & (lengths[1:] > middle - 0.5 * spacing)
+        thickest = float(radius[inside].max())
+        places.append(_place_at(lengths, min(middle, length)))
+        radii.append(math.hypot(thickest, 0.5 * spacing))
+    return places, torch.tensor(radii, dtype=torch.float64, device="cpu")
+
+
+def _place_at(lengths: Tensor, length: float) -> float:
+    """Return the place on the body, in segments, after a length of it."""
+    ends = lengths.tolist()
+    for k in range(len(ends) - 1):
+        if length <= ends[k + 1] or k == len(ends) - 2:
+            return k + min(1.0, (length - ends[k]) / (ends[k + 1] - ends[k]))
+    raise AssertionError("a body has a segment")
+
+
+def _length_up_to(lengths: Tensor, place: float) -> Tensor:
+    """Return the length of the body up to a place, in segments."""
+    last = len(lengths) - 2
+    segment = min(int(place), last)
+    return torch.lerp(lengths[segment], lengths[segment + 1], min(place - segment, 1.0))
+
+
+def _expected_error(task: Task) -> float:
+    """Return the expected error of the tip [m], where the estimator of the model knows it."""
+    radius = getattr(task.estimator, "radius_", None)
+    if radius is None or not math.isfinite(radius.inside):
+        return 0.0
+    return float(radius.inside)
