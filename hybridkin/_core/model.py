@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, cast, runtime_checkable
 
 import numpy as np
 import torch
@@ -232,8 +232,8 @@ class ForwardModel(PortableModule):
         raise TypeError(_without_body("have body_radii", self))
 
     def joined(self, tips: list[ForwardModel]) -> ForwardModel:
-        """Return the model of all markers of models of one marker each, as from `each_tip`."""
-        raise NotImplementedError
+        """Return the model of the points of several models of one point each, side by side."""
+        return SideBySide(tips)
 
     # Other models of the same robot.
 
@@ -547,6 +547,36 @@ class Wrapped(PoseModel):
     def _inner(self, q: Tensor) -> Tensor:
         """Return what the other model gets for q."""
         return q
+
+
+class SideBySide(ForwardModel):
+    """The outputs of several models of one robot, one after another.
+
+    Parameters
+    ----------
+    models : list of ForwardModel
+        At least one.
+    """
+
+    def __init__(self, models: list[ForwardModel]) -> None:
+        super().__init__()
+        self.models = nn.ModuleList(models)
+        self.n_actuators = models[0].n_actuators
+        self.n_outputs = sum(model.n_outputs for model in models)
+
+    def forward(self, q: Tensor) -> Tensor:
+        """Return all outputs (..., m)."""
+        return torch.cat([model(q) for model in self.models], dim=-1)
+
+    def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return all outputs (..., m) and their derivatives (..., m, n)."""
+        outputs = []
+        derivatives = []
+        for model in self.models:
+            x, J = cast(ForwardModel, model).forward_and_jacobian(q)
+            outputs.append(x)
+            derivatives.append(J)
+        return torch.cat(outputs, dim=-1), torch.cat(derivatives, dim=-2)
 
 
 def _place_within(plan: Plan, stored: Stored, *before: str) -> int:

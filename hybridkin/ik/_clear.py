@@ -34,7 +34,7 @@ BodyPoints: TypeAlias = "int | Sequence[tuple[float, float]] | None"
 
 _SPACING = 1.5  # of two points in radii of the body: their balls are 25 % larger than the body
 _MOST_POINTS = 24
-_AROUND = 8  # rounds that bring a configuration out of obstacles
+_AROUND = 4  # rounds that bring a configuration out of obstacles
 _AROUND_POINT = 30  # and a point
 
 
@@ -46,6 +46,8 @@ class KeptClear(Portable):
     ----------
     models : tuple of P ForwardModels
         Models of the points (3 outputs each), the last one of the tip.
+    body : tuple of ForwardModels
+        The same points from fewer models: those of the mechanical model at once, then the tip.
     radii : Tensor of shape (P,)
         Radii of the balls that cover the body [m].
     along : Tensor of shape (P,)
@@ -59,6 +61,7 @@ class KeptClear(Portable):
     """
 
     models: tuple[ForwardModel, ...]
+    body: tuple[ForwardModel, ...]
     radii: Tensor
     along: Tensor
     keep: Tensor
@@ -82,14 +85,15 @@ class KeptClear(Portable):
 
     def points(self, q: Tensor) -> Tensor:
         """Return the points (N, P, 3) at q (N, n) [m]."""
-        return torch.stack([model(q) for model in self.models], dim=1).to(q)
+        points = torch.cat([model(q) for model in self.body], dim=-1)
+        return points.unflatten(-1, (-1, 3)).to(q)
 
     def points_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return the points (N, P, 3) at q (N, n) [m], and their derivatives (N, P, 3, n)."""
-        pairs = [model.forward_and_jacobian(q) for model in self.models]
-        x = torch.stack([x for x, _ in pairs], dim=1)
-        J = torch.stack([J for _, J in pairs], dim=1)
-        return x.to(q), J.to(q)
+        pairs = [model.forward_and_jacobian(q) for model in self.body]
+        x = torch.cat([x for x, _ in pairs], dim=-1)
+        J = torch.cat([J for _, J in pairs], dim=-2)
+        return x.unflatten(-1, (-1, 3)).to(q), J.unflatten(-2, (-1, 3)).to(q)
 
     def gaps(self, x: Tensor, scene: Tensor) -> tuple[Tensor, Tensor]:
         """Return the gaps (N, p) of points (N, P, 3) [m], and the directions (N, p, 3) out of them.
@@ -157,25 +161,33 @@ class KeptClear(Portable):
 
         Rows that cannot be free stay in them.
         """
-        none = q.new_zeros(len(q), 0)
-        E = q.new_zeros(len(q), 0, q.shape[1])
         for _ in range(_AROUND):
             inside = self.smallest(q, self.scene) < 0.0
-            if not inside.any():
+            rows = inside.nonzero()[:, 0]
+            if rows.numel() == 0:
                 break
-            near = self.near(q, torch.full_like(q, math.inf), self.scene)
-            A, b = near.rows(near.gap)
-            size = A.norm(dim=-1)
-            size = torch.where(size > 0.0, size, 1.0)
-            still = torch.zeros_like(q)
-            b = b / size
-            within = Polyhedron(
-                E, none, lower - q, upper - q, A / size[..., None], b, b.clamp_min(0.0)
-            )
-            way, _ = nearest(still, within)
-            moved = torch.maximum(torch.minimum(q + way, upper), lower)
-            q = torch.where(inside[:, None], moved, q)
+            q = q.index_put((rows,), self._freer(q[rows], lower[rows], upper[rows]))
         return q
+
+    def _freer(self, q: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
+        """Return the nearest configurations that are free to first order, within bounds of q."""
+        near = self.near(q, torch.full_like(q, math.inf), self.scene)
+        A, b = near.rows(near.gap)
+        size = A.norm(dim=-1)
+        size = torch.where(size > 0.0, size, 1.0)
+        offset = b / size
+        still = torch.zeros_like(q)
+        within = Polyhedron(
+            A[:, :0],
+            b[:, :0],
+            lower - q,
+            upper - q,
+            A / size[..., None],
+            offset,
+            offset.clamp_min(0.0),
+        )
+        way, _ = nearest(still, within)
+        return torch.maximum(torch.minimum(q + way, upper), lower)
 
     def freed_tip(self, x: Tensor) -> Tensor:
         """Return points (N, 3) of the tip moved out of obstacles, the nearest side first."""
@@ -259,7 +271,7 @@ def nowhere() -> KeptClear:
     """Return a body that keeps clear of nothing."""
     none = torch.empty(0, dtype=torch.float64, device="cpu")
     scene = torch.empty(0, IK_OBSTACLE, dtype=torch.float64, device="cpu")
-    return KeptClear((), none, none, none, none, scene)
+    return KeptClear((), (), none, none, none, none, scene)
 
 
 def kept_clear(
@@ -292,10 +304,12 @@ def kept_clear(
         places = [place for place, _ in wanted]
         radii = torch.tensor([radius for _, radius in wanted], dtype=torch.float64, device="cpu")
     models = [robot.with_tip(place) for place in places[:-1]]
+    tip = model.tip_model
+    body = (robot.joined(models), tip) if models else (tip,)
     along = torch.stack([_length_up_to(lengths, place) for place in places])
     keep = radii + clearance + _expected_error(task)
     base = robot.origin.detach().cpu().double()
-    return KeptClear((*models, model.tip_model), radii, along, keep, base, scene)
+    return KeptClear((*models, tip), body, radii, along, keep, base, scene)
 
 
 def body_points(value: BodyPoints) -> BodyPoints:
