@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import hybridkin
-from hybridkin import InverseKinematics, Track, obstacles
+from hybridkin import HybridForwardModel, InverseKinematics, Track, obstacles
 from hybridkin.app.workflow.report import Report, millimetres
 
 _BODIES = 7  # of a track that a figure shows
@@ -32,6 +32,12 @@ class Surroundings:
 
     obstacles: Sequence[obstacles.Obstacle] = ()
     clearance: float = 0.0
+
+    def distances(self, ik: InverseKinematics, q: NDArray) -> NDArray:
+        """Return the distances (T, K) of the body at motions (T, n) to every obstacle [m]."""
+        if not self:
+            return np.empty((len(q), 0))
+        return np.asarray(ik.body_distances(q))
 
     def __bool__(self) -> bool:
         """Return whether there are any obstacles."""
@@ -70,12 +76,9 @@ class ObstacleDistance:
 
 
 def nearest_distances(
-    surroundings: Surroundings, ik: InverseKinematics, effective: NDArray, n_lead: int
+    surroundings: Surroundings, distances: NDArray, n_lead: int
 ) -> list[ObstacleDistance]:
-    """Return how near motions (T, n) come to every obstacle; the first `n_lead` lead to a path."""
-    if not surroundings:
-        return []
-    distances = np.asarray(ik.body_distances(effective))
+    """Return the least of distances (T, K) to every obstacle; `n_lead` rows lead to the path."""
     on_way = distances[:n_lead].min(axis=0, initial=np.inf)
     on_path = distances[n_lead:].min(axis=0)
     rows = zip(surroundings.names, on_path.tolist(), on_way.tolist(), strict=True)
@@ -116,27 +119,26 @@ def add_distances(
 
 
 def add_bodies(
-    report: Report, surroundings: Surroundings, ik: InverseKinematics, track: Track
+    report: Report,
+    surroundings: Surroundings,
+    model: HybridForwardModel,
+    track: Track,
+    distances: NDArray,
 ) -> None:
-    """Add a figure of the body among its obstacles, and of its distances to them."""
+    """Add a figure of the body among its obstacles, and of its distances (T, K) to them."""
     if not surroundings:
         return
     plots = hybridkin.plots
-    figure, (ax, corner) = plots.new_figure(10.0, 4.6, 1, 2)
-    corner.remove()
+    figure, (ax, place) = plots.new_figure(10.0, 4.6, 1, 2)
+    place.remove()
     space = figure.add_subplot(1, 2, 2, projection="3d")
     rows = np.unique(np.linspace(0, len(track.t) - 1, _BODIES).astype(int))
     bodies = plots.BackboneDisplay.from_estimator(
-        ik.model.module_.robot, track.effective[rows], obstacles=surroundings.obstacles
+        model.module_.robot, track.effective[rows], obstacles=surroundings.obstacles
     )
     space.plot(*(1e3 * track.target.T), color="black", linewidth=1.0)
     bodies.plot(space, unit="mm")
-    distances = 1e3 * np.asarray(ik.body_distances(track.effective))
-    for name, values in zip(surroundings.names, distances.T, strict=True):
-        ax.plot(track.t, values, label=plain_label(name))
-    level = 1e3 * surroundings.clearance
-    ax.axhline(level, color="black", linewidth=1.0, label="clearance")
-    ax.set(xlabel="time [s]", ylabel="distance of the body [mm]")
-    ax.legend(frameon=False, fontsize="small")
+    by_name = dict(zip(surroundings.names, distances.T, strict=True))
+    plots.ClearanceDisplay(by_name, track.t, clearance=surroundings.clearance).plot(ax, unit="mm")
     caption = "Distances of the body to the obstacles, and the body along the path, by the model."
     report.figure("obstacles", figure, caption)

@@ -51,6 +51,7 @@ from hybridkin.formats import METRES, duration_in_words
 TARGET = ("target_x", "target_y", "target_z")
 TIME = "t"
 _REACHED = (IKStatus.CONVERGED, IKStatus.OUT_OF_DOMAIN)
+_FINAL = (IKStatus.CONVERGED, IKStatus.BLOCKED)  # smaller steps change nothing
 LEAD_IN = "LEAD_IN"  # status of the rows before the path
 _STEP = 0.002  # largest tip step between two solutions, relative to the extent of the workspace
 _PEAK = 1.875  # largest speed of `min_jerk`
@@ -237,6 +238,7 @@ def track_path(
     are all that the robot gets. Rows with the status LEAD_IN move from `start` to the path, below
     ``dq_max`` (default: a tenth of the largest range per second) and ``ddq_max``. With backlash,
     columns ``effective_NAME`` hold the motion of the actuators, half its width from the commands.
+    With obstacles the column ``distance`` is that of the body to the nearest one.
 
     Parameters
     ----------
@@ -324,6 +326,7 @@ def track_path(
     if is_fitted(model) and inside.mean() < 1.0 - _MOST_OUTSIDE:
         better = f": {better_place(free, path, tol)}"
     ik = domain.solver()
+    distances = surroundings.distances(ik, whole.effective)
     record = TrackRecord(
         model=str(model.description_.path),
         n=len(path),
@@ -344,7 +347,7 @@ def track_path(
         period=_period(whole),
         blocked=statuses.count(IKStatus.BLOCKED.name),
         clearance=clearance,
-        obstacles=nearest_distances(surroundings, ik, whole.effective, n_lead),
+        obstacles=nearest_distances(surroundings, distances, n_lead),
     )
     report = Report(f"{model.description_.name}: a path of {len(path)} points", record)
     _write(report, model, better)
@@ -353,10 +356,10 @@ def track_path(
         commands["actuator"] = whole.effective
     _add_path(report, model, track)
     _add_commands(report, domain, whole.t, commands, n_lead)
-    add_bodies(report, surroundings, ik, track)
+    add_bodies(report, surroundings, model, track, distances[n_lead:])
     statuses = [LEAD_IN] * n_lead + statuses
     digits = 15 if counts else 9
-    _add_track(report, whole, commands, statuses, model.description_.log, digits)
+    _add_track(report, whole, commands, statuses, distances, model.description_.log, digits)
     report.write(out)
     return report
 
@@ -505,7 +508,7 @@ def best_track(
         track = ik.track(fine, q0=commands, tol=tol, progress=attempts, state=state)
         # Only the points are kept, not the steps between them.
         tracks.append(_alone(_thinned(track, every), domain, tol, state))
-        if tracks[-1].score == (len(path), len(path)):
+        if np.isin(tracks[-1].status, _FINAL).all():
             break
         commands = track.q[0]
     return max(tracks, key=attrgetter("score"))  # of equal tracks the first
@@ -617,10 +620,14 @@ def _add_track(
     track: Track,
     commands: Mapping[str, NDArray],
     statuses: Sequence[str],
+    distances: NDArray,
     log: robots.LogFormat,
     digits: int,
 ) -> None:
-    """Add commands with so many digits, and with backlash what actuators do, point by point."""
+    """Add commands with so many digits, and with backlash what actuators do, point by point.
+
+    With distances (T, K) of the body to obstacles also the least of them.
+    """
     lengths = np.column_stack([track.x, track.target, track.error]) / METRES[log.x_unit]
     head = [TIME, *log.q, *log.x, *TARGET, "error", "status"]
     columns = [
@@ -632,9 +639,9 @@ def _add_track(
     if "actuator" in commands:
         head += [f"effective_{name}" for name in log.q]
         columns += [*_text(log.to_log(commands["actuator"]))]
-    if np.isfinite(track.clearance).any():
-        head.append("clearance")
-        columns.append(_text(track.clearance / METRES[log.x_unit]))
+    if distances.size:
+        head.append("distance")
+        columns.append(_text(distances.min(axis=1) / METRES[log.x_unit]))
     report.table_file("track.csv", head, zip(*columns, strict=True))
 
 
