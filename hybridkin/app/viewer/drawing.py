@@ -28,6 +28,7 @@ YELLOW = (250, 215, 70)
 GHOSTS = {"nominal model": (90, 90, 90), "calibrated model": (150, 90, 190)}
 _POINTS = 10  # drawn along a segment
 _MOST_ROWS = 2000  # of a log, drawn as a cloud
+_UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 _CLICK = 2.0  # distance of a click from a row, relative to the size of its dot
 
 
@@ -127,7 +128,7 @@ class DraggedObstacle:
     corners : ndarray of shape (2, 3)
         Least and largest corner of what is shown [m]; a half-space is cut there.
     drag : callable
-        Called with its new center (3,) [m].
+        Called with its new center (3,) [m] when the page drags it.
     """
 
     def __init__(
@@ -147,10 +148,10 @@ class DraggedObstacle:
         self._to_center = center - middle
         self._drag = drag
         size = float(np.ptp(corners, axis=0).max())
-        self.arrows = scene.add_transform_controls(
+        self._arrows = scene.add_transform_controls(
             name, scale=0.1 * size, disable_rotations=True, position=middle
         )
-        self.arrows.on_update(self._dragged)
+        self._arrows.on_update(self._dragged)
         if len(surface.faces):
             scene.add_mesh_simple(
                 f"{name}/surface",
@@ -165,8 +166,15 @@ class DraggedObstacle:
 
     def _dragged(self, event: Any) -> None:
         if event.client is not None:  # not one of our own
-            self.arrows.wxyz = (1.0, 0.0, 0.0, 0.0)  # obstacles are not turned
-            self._drag(np.array(self.arrows.position) + self._to_center)
+            self._drag(np.array(self._arrows.position) + self._to_center)
+
+    def place(self, obstacle: obstacles.Obstacle) -> None:
+        """Draw it where it is, if the page has it elsewhere; obstacles are not turned."""
+        there = obstacle.center.numpy() - self._to_center
+        if not np.allclose(self._arrows.position, there, rtol=0.0, atol=1e-9):
+            self._arrows.position = there
+        if not np.array_equal(self._arrows.wxyz, _UPRIGHT):
+            self._arrows.wxyz = _UPRIGHT
 
 
 class Ghost:

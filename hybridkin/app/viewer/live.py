@@ -190,7 +190,7 @@ class LiveView:
         ends = np.stack([corners.min(axis=0) - margin, corners.max(axis=0) + margin])
         self._obstacles = []
         for k, obstacle in enumerate(robot.obstacles):
-            drag = partial(self._move_obstacle, k)
+            drag = partial(self.move_obstacle, k)
             name = f"/obstacle {k + 1}"
             self._obstacles.append(DraggedObstacle(scene, name, obstacle, ends, drag))
         scene.add_frame("/base", axes_length=0.15 * robot.size, axes_radius=0.004 * robot.size)
@@ -263,6 +263,12 @@ class LiveView:
         self.robot.go_to(q)
         self._wake.set()
 
+    def move_obstacle(self, k: int, center: NDArray) -> None:
+        """Move an obstacle to a center (3,) [m], as if it was dragged there."""
+        self.robot.move_obstacle(k, center)
+        self._obstacles[k].place(self.robot.obstacles[k])
+        self._wake.set()
+
     def _add_panel(self, log: Log | None, path: trajectories.Trajectory | None) -> None:
         """Add words, sliders and buttons."""
         gui = self._server.gui
@@ -332,11 +338,6 @@ class LiveView:
     def _dragged(self, event: Any) -> None:
         if event.client is not None:  # not one of our own
             self.follow(np.array(self._aim.position))
-
-    def _move_obstacle(self, k: int, center: NDArray) -> None:
-        """Move an obstacle to a center (3,) [m], as if it was dragged there."""
-        self.robot.move_obstacle(k, center)
-        self._wake.set()
 
     def _slid(self, event: Any) -> None:
         if event.client is not None:
