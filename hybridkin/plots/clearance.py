@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.patches import Rectangle
 from numpy.typing import ArrayLike
 from typing_extensions import Self
 
@@ -20,6 +20,8 @@ from hybridkin.plots._canvas import (
     scale_of,
     steps_of,
 )
+
+_DEEP = 1e9  # in an obstacle, deeper than any axes
 
 
 class ClearanceDisplay(Display):
@@ -90,17 +92,18 @@ class ClearanceDisplay(Display):
         ax = axes_or_new(ax)
         steps, when = steps_of(self.t, len(next(iter(self.distances.values()))))
         looks = looks_of(self.distances)
-        lowest = [0.0]
         for (name, values), look in zip(self.distances.items(), looks, strict=True):
             ax.plot(steps, scale * values, label=plot_label(name), **look)
-            lowest.append(scale * float(np.nanmin([0.0, *values])))
         if self.clearance:
             level = scale * self.clearance
             ax.axhline(level, color="black", linewidth=1.0, linestyle=":", label="clearance")
-        top = ax.get_ylim()[1]
-        bottom = min(lowest) - 0.05 * (top - min(lowest))
-        ax.axhspan(bottom, 0.0, color="0.85", linewidth=0.0)
-        ax.set(xlabel=when, ylabel=f"distance of the body [{unit}]", ylim=(bottom, top))
+        ax.update_datalim([(steps[0], 0.0)])
+        ax.autoscale_view()
+        # Without effect on the limits of the axes, which others may share.
+        inside = Rectangle((0.0, -_DEEP), 1.0, _DEEP, color="0.9", zorder=0.0)
+        inside.set_transform(ax.get_yaxis_transform())
+        ax.add_artist(inside)
+        ax.set(xlabel=when, ylabel=f"distance of the body [{unit}]")
         if len(steps) > 1:
             ax.set_xlim(steps[0], steps[-1])
         legend_below(ax)
