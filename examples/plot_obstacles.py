@@ -41,9 +41,10 @@ for k in range(4):
 stops = np.array([[0.06, 0, 0.66], [0.06, 0, 0.75], [0.06, 0, 0.84], [0.25, 0, 0.8]])
 stops = np.vstack([stops, [[0.25, 0.15, 0.78], [0.06, 0.22, 0.8]]])
 lengths = np.linalg.norm(np.diff(stops, axis=0), axis=1)
-way = trajectories.Trajectory(np.append(0.0, lengths.cumsum()), stops)
-path = trajectories.interpolated(way, np.linspace(0.0, way.t[-1], N_TICKS))
-path = trajectories.Trajectory(0.1 * np.arange(N_TICKS), path.x)
+along = np.append(0.0, lengths.cumsum())
+places = np.linspace(0.0, along[-1], N_TICKS)
+targets = np.column_stack([np.interp(places, along, column) for column in stops.T])
+path = trajectories.Trajectory(0.1 * np.arange(N_TICKS), targets)
 
 # %%
 # Three models of the robot: the nominal and the calibrated constant-curvature chain, and a hybrid.

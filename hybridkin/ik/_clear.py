@@ -34,6 +34,7 @@ BodyPoints: TypeAlias = "int | Sequence[tuple[float, float]] | None"
 
 _SPACING = 1.5  # of two points in radii of the body: their balls are 25 % larger than the body
 _MOST_POINTS = 24
+_TOUCHING = 1e-4  # a gap that stops the body [m]
 _AROUND = 4  # rounds that bring a configuration out of obstacles
 _AROUND_POINT = 30  # and a point
 
@@ -145,6 +146,14 @@ class KeptClear(Portable):
     def is_inside(self, q: Tensor, scene: Tensor) -> Tensor:
         """Return whether the body is in an obstacle of a scene, or in itself, bool (N,)."""
         return self.smallest(q, scene) < -IK_INSIDE_OBSTACLE
+
+    def stops(self, q: Tensor, way: Tensor) -> Tensor:
+        """Return whether a body at q touches what is in its way (N, n), bool (N,)."""
+        if not self:
+            return torch.zeros_like(q[:, 0], dtype=torch.bool)
+        near = self.near(q, torch.full_like(q, math.inf), self.scene)
+        towards = apply_rows(near.A, way) > 0.0
+        return (towards & (near.gap <= _TOUCHING)).any(-1)
 
     def near(self, q: Tensor, change: Tensor, scene: Tensor) -> Near:
         """Return what is near the body at q (N, n); steps can change by `change` per period."""
@@ -304,12 +313,21 @@ def kept_clear(
         places = [place for place, _ in wanted]
         radii = torch.tensor([radius for _, radius in wanted], dtype=torch.float64, device="cpu")
     models = [robot.with_tip(place) for place in places[:-1]]
-    tip = model.tip_model
+    tip = _end_of(model, len(lengths) - 1)
     body = (robot.joined(models), tip) if models else (tip,)
     along = torch.stack([_length_up_to(lengths, place) for place in places])
     keep = radii + clearance + _expected_error(task)
     base = robot.origin.detach().cpu().double()
     return KeptClear((*models, tip), body, radii, along, keep, base, scene)
+
+
+def _end_of(model: ForwardModel, n_segments: int) -> ForwardModel:
+    """Return the model of the robot's end: of the tip, unless that is another point of the body."""
+    tip = model.tip_model
+    place = max((at for at, *_ in tip.markers), default=float(n_segments))
+    if place < n_segments:
+        return model.robot.with_tip(n_segments)
+    return tip
 
 
 def body_points(value: BodyPoints) -> BodyPoints:
