@@ -308,14 +308,15 @@ def kept_clear(
     q = longest.expand(robot.n_actuators)
     lengths = robot.body_lengths(q)
     if wanted is None or isinstance(wanted, int):
-        places, radii = _evenly(lengths, robot.body_radii, wanted)
+        along, radii = _evenly(lengths, robot.body_radii, wanted)
+        models = [robot.at_length(length, q) for length in along[:-1].tolist()]
     else:
         places = [place for place, _ in wanted]
         radii = torch.tensor([radius for _, radius in wanted], dtype=torch.float64, device="cpu")
-    models = [robot.with_tip(place) for place in places[:-1]]
+        along = torch.stack([_length_up_to(lengths, place) for place in places])
+        models = [robot.with_tip(place) for place in places[:-1]]
     tip = _end_of(model, len(lengths) - 1)
     body = (robot.joined(models), tip) if models else (tip,)
-    along = torch.stack([_length_up_to(lengths, place) for place in places])
     keep = radii + clearance + _expected_error(task)
     base = robot.origin.detach().cpu().double()
     return KeptClear((*models, tip), body, radii, along, keep, base, scene)
@@ -354,8 +355,8 @@ def body_points(value: BodyPoints) -> BodyPoints:
     return pairs
 
 
-def _evenly(lengths: Tensor, radius: Tensor, wanted: int | None) -> tuple[list[float], Tensor]:
-    """Return places of points evenly along the body, and radii of balls that cover it."""
+def _evenly(lengths: Tensor, radius: Tensor, wanted: int | None) -> tuple[Tensor, Tensor]:
+    """Return how far along the body even points are, and radii of balls that cover it."""
     if not torch.isfinite(radius).all():
         raise ValueError(
             "`body_points` must give the radii of the body, which this robot does not know: pairs "
@@ -371,24 +372,12 @@ def _evenly(lengths: Tensor, radius: Tensor, wanted: int | None) -> tuple[list[f
     if count is None:
         count = min(_MOST_POINTS, math.ceil(length / (_SPACING * float(radius.min())) + 0.5))
     spacing = length / (count - 0.5)
-    places = []
-    radii = []
-    for k in range(count):
-        middle = 0.5 * spacing + k * spacing
-        inside = (lengths[:-1] < middle + 0.5 * spacing) & (lengths[1:] > middle - 0.5 * spacing)
-        thickest = float(radius[inside].max())
-        places.append(_place_at(lengths, min(middle, length)))
-        radii.append(math.hypot(thickest, 0.5 * spacing))
-    return places, torch.tensor(radii, dtype=torch.float64, device="cpu")
-
-
-def _place_at(lengths: Tensor, length: float) -> float:
-    """Return the place on the body, in segments, after a length of it."""
-    ends = lengths.tolist()
-    for k in range(len(ends) - 1):
-        if length <= ends[k + 1] or k == len(ends) - 2:
-            return k + min(1.0, (length - ends[k]) / (ends[k + 1] - ends[k]))
-    raise AssertionError("a body has a segment")
+    along = spacing * (0.5 + torch.arange(count, dtype=torch.float64, device="cpu"))
+    below = along[:, None] - 0.5 * spacing
+    above = along[:, None] + 0.5 * spacing
+    beside = (lengths[:-1] < above) & (lengths[1:] > below)
+    thickest = torch.where(beside, radius.double(), 0.0).amax(-1)
+    return along, torch.hypot(thickest, torch.full_like(along, 0.5 * spacing))
 
 
 def _length_up_to(lengths: Tensor, place: float) -> Tensor:
