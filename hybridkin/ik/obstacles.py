@@ -179,7 +179,7 @@ class Box(Obstacle):
     size : array-like of shape (3,)
         Its whole lengths along its axes [m].
     rotation : array-like of shape (3, 3), optional
-        Rotation of its axes, one per column, in the frame of x. Default: along the axes of x.
+        Its axes, one per column, in the frame of x [1]. Default: along the axes of x.
     radius : float, default=0.0
         By how much its corners are round, beyond `size` [m].
     name : str, default=""
