@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hybridkin._core.arrays import shaped
+from hybridkin._core.arrays import Numbers, shaped
 from hybridkin._core.texts import visible
 
 COLOR = "#A67C52"  # of obstacles, which no line has
@@ -26,13 +26,13 @@ class Convex(Protocol):
     """
 
     @property
-    def center(self) -> Any: ...
+    def center(self) -> Numbers: ...
     @property
-    def axes(self) -> Any: ...
+    def axes(self) -> Numbers: ...
     @property
-    def low(self) -> Any: ...
+    def low(self) -> Numbers: ...
     @property
-    def high(self) -> Any: ...
+    def high(self) -> Numbers: ...
     @property
     def radius(self) -> float: ...
     @property
@@ -206,15 +206,13 @@ def _grid_faces(n_rows: int, n_columns: int) -> NDArray[np.intp]:
     """Return the triangles of a grid that closes around, with a fan at both ends."""
     index = np.arange(n_rows * n_columns).reshape(n_rows, n_columns)
     following = np.roll(index, -1, axis=1)
-    a, b = index[:-1], following[:-1]
-    c, d = following[1:], index[1:]
-    first, last = index[0], index[-1]
-    fans = [
-        np.stack([np.full(n_columns, first[0]), following[0], first], axis=-1),
-        np.stack([np.full(n_columns, last[0]), last, following[-1]], axis=-1),
-    ]
-    between = [np.stack([a, b, c], axis=-1), np.stack([a, c, d], axis=-1)]
-    return np.concatenate([*(part.reshape(-1, 3) for part in between), *fans])
+    below = np.stack([index[:-1], following[:-1], following[1:]], axis=-1)
+    above = np.stack([index[:-1], following[1:], index[1:]], axis=-1)
+    first = np.broadcast_to(index[0, 0], n_columns)
+    last = np.broadcast_to(index[-1, 0], n_columns)
+    start = np.stack([first, following[0], index[0]], axis=-1)
+    end = np.stack([last, index[-1], following[-1]], axis=-1)
+    return np.concatenate([below.reshape(-1, 3), above.reshape(-1, 3), start, end])
 
 
 def _without_empty(surface: Surface) -> Surface:
@@ -247,7 +245,8 @@ def _above(polygon: NDArray, height: NDArray) -> NDArray:
     """Return the part of a convex polygon (P, 3) whose height (P,) is not negative."""
     corners = []
     for k in range(len(polygon)):
-        before, here = height[k - 1], height[k]
+        before = height[k - 1]
+        here = height[k]
         if before * here < 0.0:
             share = before / (before - here)
             corners.append(polygon[k - 1] + share * (polygon[k] - polygon[k - 1]))

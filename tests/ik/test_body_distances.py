@@ -56,9 +56,7 @@ def test_a_base_that_moves_with_its_obstacles_changes_nothing():
     for obstacle in SCENE:
         center = base[:3, 3] + R @ obstacle.center
         axes = obstacle.axes @ R.T
-        moved.append(
-            obstacles.Obstacle(center, axes, obstacle.low, obstacle.high, obstacle.radius)
-        )
+        moved.append(obstacles.Obstacle(center, axes, obstacle.low, obstacle.high, obstacle.radius))
     radii = [0.1, 0.093, 0.079]
     q = random_q(5)
     plain = solver(ConstantCurvatureChain(radii)).body_distances(q)
