@@ -596,6 +596,7 @@ def _export(command: argparse.ArgumentParser) -> None:
       hybridkin export model --out robot_c --name robot --dtype float32 --dt 0.001
       hybridkin export model --fmu robot.fmu --name robot --dt 0.01
       hybridkin export model --mex --out matlab --name robot --dt 0.01
+      hybridkin export model --out robot_c --dt 0.01 --obstacles scene.toml --clearance 5mm
     """
     add = command.add_argument
     _add_model(command)
@@ -618,6 +619,7 @@ def _export(command: argparse.ArgumentParser) -> None:
     )
     add("--force", action="store_true", help=_REPLACE_OTHERS)
     _add_limits(command)
+    _add_obstacles(command)
 
 
 def _describe(command: argparse.ArgumentParser) -> None:

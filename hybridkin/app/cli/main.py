@@ -373,6 +373,8 @@ def _export(arguments: argparse.Namespace, stages: Stages) -> _Result:
         dtype=arguments.dtype,
         dt=arguments.dt,
         limits=None if arguments.dt is None else _limits(arguments, model),
+        obstacles=_scene(arguments),
+        clearance=arguments.clearance,
         force=arguments.force,
     )
     return report, 0

@@ -117,3 +117,10 @@ def test_a_wrong_scene_file_is_named(robot, tmp_path, capsys):
         code, _, err = run(capsys, *command, "--obstacles", scene)
         assert code == 2
         assert "scene.toml: `radius` is missing in [[sphere]] 1" in err.replace("\n ", "")
+
+
+def test_obstacles_of_a_controller_need_its_period(robot, scene, tmp_path, capsys):
+    export = ["export", robot, "--out", tmp_path / "c", "--obstacles", scene]
+    code, _, err = run(capsys, *export)
+    assert code == 2
+    assert "`obstacles` need `dt` (--dt)" in err
