@@ -28,6 +28,7 @@ YELLOW = (250, 215, 70)
 GHOSTS = {"nominal model": (90, 90, 90), "calibrated model": (150, 90, 190)}
 _POINTS = 10  # drawn along a segment
 _MOST_ROWS = 2000  # of a log, drawn as a cloud
+_LABEL = 0.03  # height of a name above its obstacle, relative to what is shown
 _UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 _CLICK = 2.0  # distance of a click from a row, relative to the size of its dot
 
@@ -142,9 +143,11 @@ class DraggedObstacle:
         center = obstacle.center.numpy()
         surface = obstacle_surface(obstacle, *corners)
         middle = center
+        top = 0.0
         if len(surface.faces):
             ends = np.stack([surface.vertices.min(axis=0), surface.vertices.max(axis=0)])
             middle = ends.mean(axis=0)
+            top = 0.5 * float(np.ptp(ends[:, 2]))
         self._to_center = center - middle
         self._drag = drag
         size = float(np.ptp(corners, axis=0).max())
@@ -162,7 +165,8 @@ class DraggedObstacle:
                 side="double",
             )
         if obstacle.name:
-            scene.add_label(f"{name}/label", visible(obstacle.name))
+            above = (0.0, 0.0, top + _LABEL * size)
+            scene.add_label(f"{name}/label", visible(obstacle.name), position=above)
 
     def _dragged(self, event: Any) -> None:
         if event.client is not None:  # not one of our own
