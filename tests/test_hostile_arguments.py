@@ -486,7 +486,8 @@ COSTLY = {
         workflow.track_path,
         {
             **{"model": LOADED, "path": PATH, "out": OUT, "limits": LIMITS, "start": "rest"},
-            **{"tol": 1e-3, "force": True},
+            **{"tol": 1e-3, "force": True, "obstacles": [BALL.moved([3.0, 0.0, 0.0])]},
+            "clearance": 0.01,
         },
     ),
     "fit_log": (

@@ -94,7 +94,6 @@ class SteeredRobot:
         self.size = float(np.ptp(np.vstack([tips, np.zeros(3)]), axis=0).max())
         self._close = _CLOSE * self.size
         self._largest_step = speed / RATE
-        self.obstacles = tuple(obstacles)
         self._ik = InverseKinematics(
             model.module_.tip_model.without_hysteresis,
             q_min=limits.q_min,
@@ -104,10 +103,11 @@ class SteeredRobot:
             q_pref=self.q,
             gain=_GAIN,
             dt=1.0 / RATE,
-            obstacles=self.obstacles,
+            obstacles=obstacles,
             clearance=clearance,
         )
         self._tracker = self._ik.tracker(self.q, tol=self._close)
+        self.obstacles = self._tracker.obstacles
         self._goal = self.q
         self._by_hand = False  # the actuators are set, not led by the target
         self._resting = False
@@ -147,8 +147,8 @@ class SteeredRobot:
         with self._lock:
             moved = [*self.obstacles]
             moved[k] = moved[k].moved(place)
-            self.obstacles = tuple(moved)
             self._tracker.obstacles = moved
+            self.obstacles = self._tracker.obstacles
             self._resting = False
 
     def tick(self) -> bool:

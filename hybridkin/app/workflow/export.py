@@ -70,7 +70,7 @@ def export_model(
     one_of(kind, "kind", _TITLES)
     if kind != "c" and dtype != "float64":
         raise ValueError('`dtype` must be "float64" here; "float32" is for C code.')
-    surroundings = Surroundings(tuple(obstacles), clearance)
+    surroundings = Surroundings(obstacles, clearance)
     if surroundings and dt is None:
         raise ValueError("`obstacles` need `dt` (--dt): they are limits of the step.")
     record: dict[str, object] = {"dtype": dtype, "dt": dt, "obstacles": surroundings.names}

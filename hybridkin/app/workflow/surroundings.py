@@ -24,7 +24,7 @@ class Surroundings:
 
     Attributes
     ----------
-    obstacles : tuple of Obstacle
+    obstacles : sequence of Obstacle
         The obstacles.
     clearance : float
         Least distance between body and obstacles [m].
@@ -32,6 +32,15 @@ class Surroundings:
 
     obstacles: Sequence[obstacles.Obstacle] = ()
     clearance: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check the obstacles."""
+        is_list = isinstance(self.obstacles, Sequence)
+        if not (is_list and all(map(_is_obstacle, self.obstacles))):
+            raise TypeError(
+                "`obstacles` must be a list of obstacles, as from obstacles.read_scene(path), got "
+                f"{self.obstacles!r:.200}."
+            )
 
     def distances(self, ik: InverseKinematics, q: NDArray) -> NDArray:
         """Return the distances (T, K) of the body at motions (T, n) to every obstacle [m]."""
@@ -55,6 +64,10 @@ class Surroundings:
                 name = f"{name} ({counts[name]})"
             names.append(name)
         return names
+
+
+def _is_obstacle(value: object) -> bool:
+    return isinstance(value, obstacles.Obstacle)
 
 
 @dataclass(frozen=True)

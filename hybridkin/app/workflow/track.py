@@ -287,7 +287,7 @@ def track_path(
         the largest scale in reach.
     """
     check_out(out, "track", ["track.csv", "track.png", "commands.png"], force=force)
-    surroundings = Surroundings(tuple(obstacles), clearance)
+    surroundings = Surroundings(obstacles, clearance)
     domain = Domain(model, limits or path_limits(model), surroundings)
     stands = _start(domain, start)
     free = replace(domain, surroundings=Surroundings())
