@@ -674,6 +674,7 @@ ARRAYS = {
     "ik.step x_target": ("x_target", X[:3], lambda v: IK.step(Q[:3], v).dq),
     "ik.step dx": ("dx", X[:3], lambda v: IK.step(Q[:3], X[:3], v).dq),
     "ik.step x_measured": ("x_measured", X[:3], lambda v: IK.step(Q[:3], X[:3], x_measured=v).dq),
+    "ik.body_balls": ("q", Q[:3], lambda v: AMONG.body_balls(v)),
     "ik.body_distances": ("q", Q[:3], lambda v: AMONG.body_distances(v)),
     "ik.track": ("path", X[:3], lambda v: IK.track(v, q0=Q[0]).q),
     "ik.track q0": ("q0", Q[0], lambda v: IK.track(X[:3], q0=v).q),

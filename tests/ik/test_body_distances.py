@@ -35,6 +35,21 @@ def test_a_straight_body_beside_a_wall_and_a_ball():
     np.testing.assert_allclose(distances, [0.3 - 0.1, 0.2 - 0.05 - 0.05], atol=1e-12)
 
 
+def test_balls_lie_on_the_backbone_and_the_last_one_at_the_tip():
+    ik = solver()
+    points, radii = ik.body_balls(np.full(9, 0.25))
+    np.testing.assert_allclose(radii, [0.1, 0.08, 0.06, 0.05])
+    np.testing.assert_allclose(points[:, 2], [0.125, 0.25, 0.5, 0.75], atol=1e-12)
+    q = random_q(4)
+    points, _ = ik.body_balls(q)
+    with torch.no_grad():
+        backbone = TRUNK.backbone(torch.from_numpy(q), 2).numpy()
+    np.testing.assert_allclose(points, backbone[:, [1, 2, 4, 6]], atol=1e-12)
+    nearest = [obstacle.distance(points).numpy() - radii for obstacle in SCENE]
+    expected = np.stack([distances.min(axis=1) for distances in nearest], axis=1)
+    np.testing.assert_allclose(ik.body_distances(q), expected, atol=1e-12)
+
+
 def test_a_batch_is_its_rows_in_arrays_and_tensors():
     ik = solver()
     q = random_q(6)
@@ -85,3 +100,5 @@ def test_a_solver_without_a_body_says_so():
     ik = InverseKinematics(TRUNK, q_min=0.1, q_max=0.4)
     with pytest.raises(ValueError, match="`obstacles` or `body_points` must be given"):
         ik.body_distances(np.full(9, 0.25), SCENE)
+    with pytest.raises(ValueError, match="`obstacles` or `body_points` must be given"):
+        ik.body_balls(np.full(9, 0.25))

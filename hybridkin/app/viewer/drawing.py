@@ -181,6 +181,24 @@ class DraggedObstacle:
             self._arrows.wxyz = _UPRIGHT
 
 
+class Balls:
+    """The balls along the body that keep clear of obstacles."""
+
+    def __init__(self, scene: Any, robot: SteeredRobot) -> None:
+        self.frame = scene.add_frame("/balls", show_axes=False, visible=False)
+        self._balls = []
+        for k, radius in enumerate(robot.balls[1].tolist()):
+            ball = scene.add_icosphere(f"/balls/{k + 1}", radius, BLUE, opacity=0.15)
+            self._balls.append(ball)
+
+    def move(self, robot: SteeredRobot) -> None:
+        """Draw them where they are, if they are shown."""
+        if not self.frame.visible:
+            return
+        for ball, point in zip(self._balls, robot.balls[0], strict=True):
+            ball.position = point
+
+
 class Ghost:
     """The backbone of another model at the same command."""
 

@@ -27,6 +27,7 @@ from hybridkin.app.viewer.drawing import (
     GREEN,
     ORANGE,
     RED,
+    Balls,
     Body,
     DraggedObstacle,
     Ghost,
@@ -223,11 +224,15 @@ class LiveView:
                 name = "learned error: mechanical to hybrid tip"
                 self._switched[name] = self._rows.learned
             scene.on_click()(self._clicked)
-        self._ghosts = []
+        self._moving: list[Ghost | Balls] = []
         for name, chain in _other_models(robot.model).items():
             ghost = Ghost(scene, name, chain, robot)
-            self._ghosts.append(ghost)
+            self._moving.append(ghost)
             self._switched[name] = ghost.line
+        if robot.obstacles:
+            balls = Balls(scene, robot)
+            self._moving.append(balls)
+            self._switched["body that keeps clear"] = balls.frame
         if self._expected() > 0.0:
             self._switched["expected error"] = self._radius
 
@@ -396,8 +401,8 @@ class LiveView:
         robot = self.robot
         with self._server.atomic():
             self._body.move(robot)
-            for ghost in self._ghosts:
-                ghost.move(robot)
+            for part in self._moving:
+                part.move(robot)
             if self._radius.visible:
                 self._radius.position = robot.x
                 self._radius.scale = self._expected()

@@ -204,6 +204,13 @@ class SteeredRobot:
             return np.asarray(self._ik.body_distances(self.q, self.obstacles))
 
     @property
+    def balls(self) -> tuple[NDArray, NDArray]:
+        """Middles (P, 3) and radii (P,) of the balls that keep clear of obstacles [m]."""
+        with self._lock:
+            points, radii = self._ik.body_balls(self.q)
+        return np.asarray(points), np.asarray(radii)
+
+    @property
     def held(self) -> NDArray[np.bool_]:
         """Which actuators are at a limit of position (n,)."""
         close = 1e-6 * self.span

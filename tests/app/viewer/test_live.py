@@ -165,7 +165,12 @@ def test_obstacles_are_drawn_moved_and_named():
         assert {"/obstacle 1", "/obstacle 1/surface", "/obstacle 2"} <= {*nodes}
         vertices = nodes["/obstacle 1/surface"].vertices
         np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 0.05, rtol=1e-5)
+        assert not shown._switched["body that keeps clear"].visible
+        shown._switched["body that keeps clear"].visible = True
         shown.move_obstacle(0, np.array([0.25, 0.0, 0.5]))
         assert nodes["/obstacle 1"].position == pytest.approx([0.25, 0.0, 0.5])
         until(lambda: "lamp `<img` `src=x>" in shown._words.content)
         until(lambda: shown.robot.distances[0] > -1e-6)
+        points, radii = shown.robot.balls
+        until(lambda: nodes[f"/balls/{len(radii)}"].position == pytest.approx(points[-1], abs=0.01))
+        assert nodes["/balls/1"].radius == pytest.approx(radii[0])
