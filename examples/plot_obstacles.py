@@ -132,7 +132,7 @@ def outline(body):
 # %%
 # Without obstacles the trunk is in the frame in more than half of the ticks, and the model says so.
 # With them, the calibrated and the hybrid model keep the true body clear, and the hybrid also leads
-# the tip along the path. The nominal model promises as much, and collides: its body is up to two
+# the tip along the path. The nominal model promises as much, and collides: its body is one to two
 # centimetres from the true one. A promise is worth as much as the model: the clearance must be
 # larger than the error of the body. A log of tips shows the error of the tip alone; leave more.
 
