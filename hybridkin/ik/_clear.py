@@ -15,7 +15,7 @@ from typing import NamedTuple, TypeAlias
 import torch
 from torch import Tensor
 
-from hybridkin._core.arrays import number, whole
+from hybridkin._core.arrays import as_array, number, whole
 from hybridkin._core.kernel_numbers import (
     IK_INSIDE_OBSTACLE,
     IK_NEARER,
@@ -23,6 +23,7 @@ from hybridkin._core.kernel_numbers import (
     IK_PAIRS_MOST,
 )
 from hybridkin._core.model import ForwardModel
+from hybridkin._core.plan import Plan
 from hybridkin._core.portable import Portable
 from hybridkin.ik._gram import apply_rows
 from hybridkin.ik._nearest import Polyhedron, nearest
@@ -83,6 +84,17 @@ class KeptClear(Portable):
         reach = self.radii[:, None] + self.radii
         apart = self.along - self.along[:, None]
         return (apart > 0.5 * math.pi * reach).nonzero().T
+
+    def write_plan(self, plan: Plan, n: int) -> int:
+        """Write the node of the body of a robot of n actuators, and return its place; -1: none."""
+        if not self:
+            return -1
+        places = [plan.node_of(model.stored()) for model in self.models]
+        one, other = self.meeting
+        reach = self.radii[one] + self.radii[other]
+        numbers = [as_array(part) for part in (self.keep, reach, self.along, self.base)]
+        pairs = [*one.tolist(), *other.tolist()]
+        return plan.node("body", n, 3, numbers, len(places), len(one), *places, *pairs)
 
     def points(self, q: Tensor) -> Tensor:
         """Return the points (N, P, 3) at q (N, n) [m]."""
