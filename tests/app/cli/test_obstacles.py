@@ -124,3 +124,7 @@ def test_obstacles_of_a_controller_need_its_period(robot, scene, tmp_path, capsy
     code, _, err = run(capsys, *export)
     assert code == 2
     assert "`obstacles` need `dt` (--dt)" in err
+    code, record = document(capsys, *export, "--dt", 0.01, "--clearance", "2mm")
+    assert code == 0
+    assert record["obstacles"] == ["lamp *1*", "obstacle 2"]
+    assert "double obstacles[38]" in (tmp_path / "c" / "model.h").read_text()
