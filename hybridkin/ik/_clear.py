@@ -118,9 +118,7 @@ class KeptClear(Portable):
         scene = scene.to(x)
         keep = self.keep.to(x)[:, None]
         distance, normal = distances(x, scene)
-        at_base, _ = distances(self.base.to(x), scene)
-        never = keep > at_base + self.along.to(x)[:, None]
-        free = torch.where(never, math.inf, distance - keep).flatten(1)
+        free = torch.where(self._is_never_free(scene), math.inf, distance - keep).flatten(1)
         one, other = self.meeting.to(x.device)
         apart = x[:, other] - x[:, one]
         size = apart.norm(dim=-1)
@@ -128,6 +126,21 @@ class KeptClear(Portable):
         between = size - (self.radii[one] + self.radii[other]).to(x)
         gaps = torch.cat([free, between], dim=1)
         return gaps, torch.cat([normal.flatten(1, 2), away], dim=1)
+
+    def _is_never_free(self, scene: Tensor) -> Tensor:
+        """Return which points (P, K) no configuration frees: the robot is mounted there."""
+        at_base, _ = distances(self.base.to(scene), scene)
+        return self.keep.to(scene)[:, None] > at_base + self.along.to(scene)[:, None]
+
+    def distances(self, q: Tensor, scene: Tensor) -> Tensor:
+        """Return the distances (N, K) of the body at q (N, n) to every obstacle of a scene [m].
+
+        Those of points that are never free do not count.
+        """
+        scene = scene.to(q)
+        distance, _ = distances(self.points(q), scene)
+        distance = distance - self.radii.to(q)[:, None]
+        return torch.where(self._is_never_free(scene), math.inf, distance).amin(1)
 
     def relative(self, rows: Tensor, n_obstacles: int) -> Tensor:
         """Return values of points (N, P, ...) for the pairs of `gaps`, (N, p, ...)."""
