@@ -172,9 +172,10 @@ def nearest(
         Points.
     within : Polyhedron
         Where to; its equations and bounds have a common point.
-    excess : Tensor of shape (N,)
+    excess : Tensor of shape (N, m)
         Proximal rounds move the values e of the equations by `excess` times their multipliers:
-        what has been added to lambda^2, if the points hold the slack of the equations.
+        what has been added to lambda^2, if the points hold the slack of the equations. Equations
+        with an excess come before those without, and do not depend on others.
     centre : Tensor of shape (N, m)
         Multipliers of the equations that the first round takes.
 
@@ -191,7 +192,7 @@ def nearest(
     """
     ends = x.clone()
     multipliers = torch.zeros_like(within.e)
-    excess = torch.zeros_like(x[:, 0]) + excess
+    excess = torch.zeros_like(within.e) + excess
     live = _Live.on_equations(x, within, excess, centre)
     for _ in range(IK_CHANGES):
         live = live.choosing()
@@ -221,7 +222,7 @@ class _Live(NamedTuple):
         What they go into, with relaxed rows and the values of the round.
     values, first : Tensor of shape (N, m)
         The values of the equations, as given and in the first round.
-    excess : Tensor of shape (N,)
+    excess : Tensor of shape (N, m)
         The factor of the multipliers in later rounds.
     rounds : Tensor of shape (N,)
         Rounds left.
@@ -257,7 +258,7 @@ class _Live(NamedTuple):
         """Return the points that are nearest to the origin on the equations alone."""
         x = origin
         values = within.e
-        within = within._replace(e=values + excess[:, None] * centre)
+        within = within._replace(e=values + excess * centre)
         active = _Active.none(x)
         none = torch.full_like(x[:, 0], -1, dtype=torch.long)
         for normal, value in zip(within.E.unbind(1), within.e.unbind(1), strict=True):
@@ -270,7 +271,7 @@ class _Live(NamedTuple):
             active = active.with_one(adds, way, multiples, force, none)
         rows = torch.arange(len(x), device=x.device)
         force = torch.zeros_like(x[:, 0])
-        rounds = torch.where(excess > 0.0, IK_PROXIMAL, 0)
+        rounds = torch.where((excess > 0.0).any(-1), IK_PROXIMAL, 0)
         return cls(
             rows,
             origin,
@@ -318,7 +319,7 @@ class _Live(NamedTuple):
         """Return the same with new values of the equations in the rows `ended` (N,)."""
         m = self.values.shape[-1]
         ended = ended[:, None]
-        values = self.values + self.excess[:, None] * self.multipliers
+        values = self.values + self.excess * self.multipliers
         values = torch.where(ended, values, self.within.e)
         change = values - self.within.e
         x = self.x + (change[..., None] * self.active.inverse[:, :m]).sum(1)
@@ -400,8 +401,9 @@ class _Live(NamedTuple):
             by = by + rounding * (by + b.gather(-1, row[:, None])[:, 0].abs())
             over = torch.where(has_row, by, 0.0)
             b = b.scatter_add(-1, row[:, None], over[:, None]).minimum(self.within.most)
-        # Where no row contradicts it is rounding, and nothing begins anew.
+        # Where no row contradicts it is rounding, of all that is missing; nothing begins anew.
         size = 8.0 * torch.finfo(b.dtype).eps * self.x.abs().amax(-1)
+        size = torch.maximum(size, missing)
         close = torch.where(stuck & ~has_row, size, self.close)
         chosen = torch.where(stuck, -1, self.chosen)
         force = torch.where(stuck, 0.0, self.force)
@@ -411,7 +413,7 @@ class _Live(NamedTuple):
         return self._replace(
             x=torch.where(anew, self.start, self.x),
             within=self.within._replace(b=b, e=torch.where(anew, self.first, self.within.e)),
-            rounds=torch.where(stuck & (self.excess > 0.0), IK_PROXIMAL, self.rounds),
+            rounds=torch.where(stuck & (self.excess > 0.0).any(-1), IK_PROXIMAL, self.rounds),
             active=active,
             chosen=chosen,
             force=force,

@@ -325,6 +325,8 @@ class StepSettings(Portable):
             raise TypeError("the number of actuators is unknown; give one limit for each")
         if self.clear:
             raise TypeError("obstacles have no kernel")
+        if self.task.n_levels > 1:
+            raise TypeError("a Stack of several levels has no kernel")
         model = plan.stack([model.stored() for model in self.task.steered])
         scale = np.repeat(self.task.units, self.task.parts)
         plan.limit("rows of a task", len(scale))

@@ -185,5 +185,5 @@ def damped_step(
         limits.at_rest() / length,
     )
     start = torch.cat([z, torch.zeros_like(v)], dim=-1)
-    x, multipliers = nearest(start, within, excess, centre)
+    x, multipliers = nearest(start, within, excess[:, None], centre)
     return limits.snapped(x[:, :n]), multipliers
