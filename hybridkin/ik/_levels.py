@@ -26,7 +26,7 @@ _ROUNDING = 100.0  # of a singular value, relative to those of the Jacobian [eps
 
 def uppermost(task: Task, rows: Tensor) -> Tensor:
     """Return rows of the task (N, m) or (N, m, n), zero in all levels but the first."""
-    return up_to_level(task, rows, 0)
+    return rows if task.n_levels == 1 else up_to_level(task, rows, 0)
 
 
 def up_to_level(task: Task, rows: Tensor, last: int) -> Tensor:

@@ -209,9 +209,7 @@ class _Wish(NamedTuple):
         step = self.law.step(self.J, self.v, self.posture, limits)
         pulls = bool(settings.pulls.any())
         if settings.tip_limits.n == 0 and not pulls:
-            rows = self.J, self.v, self.e
-            if settings.task.n_levels > 1:
-                rows = [uppermost(settings.task, part) for part in rows]
+            rows = (uppermost(settings.task, part) for part in (self.J, self.v, self.e))
             step = _escaping(self.law, self.q, *rows, step, self.bounds)
         step = step._replace(promised=apply_rows(self.J, step.dq))
         if pulls:
@@ -473,7 +471,8 @@ class _Arrival(NamedTuple):
         settings = self.law.settings
         tip, J = settings.evaluate(self.q + dq)
         moved = settings.task.difference(self.x, tip)
-        return _End(dq, _only_taut(settings, J), motion - moved)
+        missing = uppermost(settings.task, motion - moved)
+        return _End(dq, _only_taut(settings, J), missing)
 
     def approach(self, dq: Tensor, motion: Tensor, close: Tensor) -> _End:
         """Return the best end of Newton's method from steps dq, within the bounds."""
@@ -507,15 +506,17 @@ def _arriving(
 
     Their Jacobian jumps where a tendon gets slack or taut, so each end is evaluated by the model.
     Newton's method corrects it within the bounds. Where the result is less than half of the motion
-    v, slack tendons are pulled in, as far as the tip gets nearer to v or not away.
+    v, slack tendons are pulled in, as far as the tip gets nearer to v or not away. Of several
+    levels the first one decides.
     """
     settings = law.settings
+    v = uppermost(settings.task, v)
+    promised = uppermost(settings.task, step.promised)
     x, _ = settings.evaluate(q)
     arrival = _Arrival(law, q, x, bounds)
     eps = torch.finfo(q.dtype).eps
     smallest_step = IK_SLIP * _norm(step.dq) + 32.0 * eps * _norm(q)
     slip = _norm(J.flatten(1)) * smallest_step
-    promised = step.promised
     close = torch.maximum(0.5 * _norm(promised), slip)
     end = arrival.approach(step.dq, promised, close)
     end = end._replace(missing=v - promised + end.missing)

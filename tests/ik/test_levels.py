@@ -213,7 +213,6 @@ def test_steps_move_the_upper_task_as_it_moves_alone(control):
 
 
 def test_elastic_tendons_move_the_upper_task_first():
-    """Their steps are corrected by the model, which bends: to second order of the step."""
     chain, at, center, width, limits = ROBOTS["tendons"]
     q = center + width * random(1, chain.n_actuators)[0]
     middle = chain.with_tip(at)
@@ -221,11 +220,11 @@ def test_elastic_tendons_move_the_upper_task_first():
     target = chain(q) + torch.tensor([0.01, -0.005, 0.0]).to(q)
     aside = middle(q) + torch.tensor([0.0, 0.05, 0.0]).to(q)
     tracker = InverseKinematics(task, **limits).tracker(q)
-    for _ in range(80):
+    for _ in range(50):
         q = tracker.step(task.join(target, aside))
     assert (chain(q) - target).norm() < 1e-6
+    assert (middle(q) - aside).norm() < 0.045, "it was 0.05 m away"
     assert tracker.status != IKStatus.CONVERGED
-    assert (q[3:] != 0.0).any()
 
 
 def test_a_tracker_keeps_the_tip_while_the_middle_cannot_be_reached():
@@ -262,12 +261,12 @@ def linear_stack(levels, n=6):
     tasks = []
     for part in (A, B, C):
         tasks.append(PositionTask(lambda q, part=part: q @ part.mT.to(q), size=len(part)))
-    return Stack(tasks, levels=levels), (A, B, C)
+    return Stack(tasks, levels=levels)
 
 
 def test_solutions_of_linear_models_are_those_of_least_squares_in_order():
     """Level 2 asks for what levels 0 and 1 have fixed, and for one direction more."""
-    task, (A, B, C) = linear_stack([0, 1, 2])
+    task = linear_stack([0, 1, 2])
     ik = InverseKinematics(task, q_min=np.full(6, -9.0), q_max=np.full(6, 9.0), q_pref=0.0)
     target = 0.3 * random(4, 8, seed=4)
     solution = ik.solve(target)
@@ -338,5 +337,5 @@ def test_targets_tolerances_and_tracks_of_levels():
     ],
 )
 def test_wrong_levels_are_refused(levels, error):
-    with pytest.raises(error, match="`levels` must be whole numbers 0, 1, ... without a gap"):
+    with pytest.raises(error, match="`levels` must be whole numbers"):
         Stack(tasks_of((2, 3)), levels=levels)
