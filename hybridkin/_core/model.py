@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, cast, runtime_checkable
 
@@ -222,6 +223,16 @@ class ForwardModel(PortableModule):
         tensor([0.0000, 0.1500, 0.3500], dtype=torch.float64)
         """
         raise TypeError(_without_body("have body_lengths(q)", self))
+
+    def at_length(self, length: float, q: Tensor) -> ForwardModel:
+        """Return the model of the point of the body after a length of it [m], as long as at q (n,).
+
+        `length` is from 0, exclusive, to that of the whole body, inclusive.
+        """
+        ends = self.body_lengths(q).tolist()
+        segment = max(bisect_left(ends, length, hi=len(ends) - 1), 1) - 1
+        inside = (length - ends[segment]) / (ends[segment + 1] - ends[segment])
+        return self.with_tip(segment + min(inside, 1.0))
 
     @property
     def body_radii(self) -> Tensor:
@@ -514,6 +525,10 @@ class Wrapped(PoseModel):
     def body_lengths(self, q: Tensor) -> Tensor:
         """Return the cumulative lengths (..., S + 1) of the other model's body [m]."""
         return self.model.body_lengths(self._inner(q))
+
+    def at_length(self, length: float, q: Tensor) -> ForwardModel:
+        """Return the model of the point after a length of the other model's body [m]."""
+        return self.around(self.model.at_length(length, self._inner(q)))
 
     @property
     def body_radii(self) -> Tensor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from bisect import bisect_left
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
@@ -182,6 +183,17 @@ class ArcChain(MarkedChain):
         with_offsets = arcs + self.arc_offsets.to(arcs)
         segments = with_offsets.unflatten(-1, (self.n_segments, -1)).sum(-1)
         return nn.functional.pad(segments.cumsum(-1), (1, 0))
+
+    def at_length(self, length: float, q: Tensor) -> Self:
+        """Return the chain of the point after a length of the body [m], on an arc or an offset."""
+        ends = self.body_lengths(q).tolist()
+        segment = max(bisect_left(ends, length, hi=len(ends) - 1), 1) - 1
+        before_end = length - ends[segment + 1]
+        arc = ends[segment + 1] - ends[segment] - float(self.offsets[segment])
+        place = segment + (length - ends[segment]) / arc
+        if place < segment + 1:
+            return self.with_tip(place)
+        return self._marked([(segment + 1.0, 0.0, 0.0, min(before_end, 0.0))])
 
     @property
     def body_radii(self) -> Tensor:

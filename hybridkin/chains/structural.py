@@ -244,6 +244,10 @@ class StructuralChain(ForwardModel):
         up_to_end = nn.functional.pad(change.cumsum(-1), (1, 0))
         return self.chain.body_lengths(q) + up_to_end
 
+    def at_length(self, length: float, q: Tensor) -> StructuralChain:
+        """Return the model of the point after a length of the body of the chain [m]."""
+        return self._around(self.chain.at_length(length, q))
+
     @property
     def body_radii(self) -> Tensor:
         """Radius of the circle of all actuators in every segment, shape (S,) [m]."""

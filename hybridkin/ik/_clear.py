@@ -34,6 +34,7 @@ BodyPoints: TypeAlias = "int | Sequence[tuple[float, float]] | None"
 
 _SPACING = 1.5  # of two points in radii of the body: their balls are 25 % larger than the body
 _MOST_POINTS = 24
+_TOUCHING = 1e-4  # a gap that stops the body [m]
 _AROUND = 4  # rounds that bring a configuration out of obstacles
 _AROUND_POINT = 30  # and a point
 
@@ -132,6 +133,14 @@ class KeptClear(Portable):
     def is_inside(self, q: Tensor, scene: Tensor) -> Tensor:
         """Return whether the body is in an obstacle of a scene, or in itself, bool (N,)."""
         return self.smallest(q, scene) < -IK_INSIDE_OBSTACLE
+
+    def stops(self, q: Tensor, way: Tensor) -> Tensor:
+        """Return whether a body at q touches what is in its way (N, n), bool (N,)."""
+        if not self:
+            return torch.zeros_like(q[:, 0], dtype=torch.bool)
+        near = self.near(q, torch.full_like(q, math.inf), self.scene)
+        towards = apply_rows(near.A, way) > 0.0
+        return (towards & (near.gap <= _TOUCHING)).any(-1)
 
     def near(self, q: Tensor, change: Tensor, scene: Tensor) -> Near:
         """Return what is near the body at q (N, n); steps can change by `change` per period."""
@@ -286,17 +295,27 @@ def kept_clear(
     q = longest.expand(robot.n_actuators)
     lengths = robot.body_lengths(q)
     if wanted is None or isinstance(wanted, int):
-        places, radii = _evenly(lengths, robot.body_radii, wanted)
+        along, radii = _evenly(lengths, robot.body_radii, wanted)
+        models = [robot.at_length(length, q) for length in along[:-1].tolist()]
     else:
         places = [place for place, _ in wanted]
         radii = torch.tensor([radius for _, radius in wanted], dtype=torch.float64, device="cpu")
-    models = [robot.with_tip(place) for place in places[:-1]]
-    tip = model.tip_model
+        along = torch.stack([_length_up_to(lengths, place) for place in places])
+        models = [robot.with_tip(place) for place in places[:-1]]
+    tip = _end_of(model, len(lengths) - 1)
     body = (robot.joined(models), tip) if models else (tip,)
-    along = torch.stack([_length_up_to(lengths, place) for place in places])
     keep = radii + clearance + _expected_error(task)
     base = robot.origin.detach().cpu().double()
     return KeptClear((*models, tip), body, radii, along, keep, base, scene)
+
+
+def _end_of(model: ForwardModel, n_segments: int) -> ForwardModel:
+    """Return the model of the robot's end: of the tip, unless that is another point of the body."""
+    tip = model.tip_model
+    place = max((at for at, *_ in tip.markers), default=float(n_segments))
+    if place < n_segments:
+        return model.robot.with_tip(n_segments)
+    return tip
 
 
 def body_points(value: BodyPoints) -> BodyPoints:
@@ -323,8 +342,8 @@ def body_points(value: BodyPoints) -> BodyPoints:
     return pairs
 
 
-def _evenly(lengths: Tensor, radius: Tensor, wanted: int | None) -> tuple[list[float], Tensor]:
-    """Return places of points evenly along the body, and radii of balls that cover it."""
+def _evenly(lengths: Tensor, radius: Tensor, wanted: int | None) -> tuple[Tensor, Tensor]:
+    """Return how far along the body even points are, and radii of balls that cover it."""
     if not torch.isfinite(radius).all():
         raise ValueError(
             "`body_points` must give the radii of the body, which this robot does not know: pairs "
@@ -340,24 +359,12 @@ def _evenly(lengths: Tensor, radius: Tensor, wanted: int | None) -> tuple[list[f
     if count is None:
         count = min(_MOST_POINTS, math.ceil(length / (_SPACING * float(radius.min())) + 0.5))
     spacing = length / (count - 0.5)
-    places = []
-    radii = []
-    for k in range(count):
-        middle = 0.5 * spacing + k * spacing
-        inside = (lengths[:-1] < middle + 0.5 * spacing) & (lengths[1:] > middle - 0.5 * spacing)
-        thickest = float(radius[inside].max())
-        places.append(_place_at(lengths, min(middle, length)))
-        radii.append(math.hypot(thickest, 0.5 * spacing))
-    return places, torch.tensor(radii, dtype=torch.float64, device="cpu")
-
-
-def _place_at(lengths: Tensor, length: float) -> float:
-    """Return the place on the body, in segments, after a length of it."""
-    ends = lengths.tolist()
-    for k in range(len(ends) - 1):
-        if length <= ends[k + 1] or k == len(ends) - 2:
-            return k + min(1.0, (length - ends[k]) / (ends[k + 1] - ends[k]))
-    raise AssertionError("a body has a segment")
+    along = spacing * (0.5 + torch.arange(count, dtype=torch.float64, device="cpu"))
+    below = along[:, None] - 0.5 * spacing
+    above = along[:, None] + 0.5 * spacing
+    beside = (lengths[:-1] < above) & (lengths[1:] > below)
+    thickest = torch.where(beside, radius.double(), 0.0).amax(-1)
+    return along, torch.hypot(thickest, torch.full_like(along, 0.5 * spacing))
 
 
 def _length_up_to(lengths: Tensor, place: float) -> Tensor:

@@ -254,7 +254,6 @@ class Core:
             reached=result & IK_REACHED > 0,
             stationary=result & IK_AT_REST > 0,
             held=result & IK_HELD > 0,
-            blocked=torch.zeros_like(iterations, dtype=torch.bool),
             n_iter=iterations,
             n_starts=torch.ones_like(iterations),
         )

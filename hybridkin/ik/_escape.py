@@ -17,7 +17,8 @@ from hybridkin._core.kernel_numbers import (
     IK_WAY_OUT,
 )
 from hybridkin.ik._gram import apply_columns, apply_rows, solve_rows
-from hybridkin.ik._settings import Bounds, StepSettings
+from hybridkin.ik._settings import StepSettings
+from hybridkin.ik.limits import Bounds
 
 
 def way_out(

@@ -12,8 +12,9 @@ from hybridkin._core.actuation import Actuation
 from hybridkin._core.kernel_numbers import IK_AT_REST_SHARE
 from hybridkin.ik._gram import apply_rows
 from hybridkin.ik._rates import stopping
-from hybridkin.ik._settings import Bounds, StepSettings
+from hybridkin.ik._settings import StepSettings
 from hybridkin.ik._step import StepRows
+from hybridkin.ik.limits import Bounds
 
 
 def lead_of(settings: StepSettings, command: Tensor, state: Any) -> Lead | Direct:

@@ -94,7 +94,6 @@ class LevelSearch(Search):
             live.put(better, new.take(better))
             live.reached = self._reached(live)
             live.held = step.saturated.any(-1)
-            live.blocked = step.blocked | torch.zeros_like(live.held)
             live.n_iter = live.n_iter + 1
             damping = damping * torch.where(better, 0.25, 4.0)
             slow = torch.where(better & little, slow + 1.0, 0.0)

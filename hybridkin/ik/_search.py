@@ -22,10 +22,11 @@ from hybridkin._core.kernel_numbers import (
     IK_STATIONARY,
 )
 from hybridkin.ik._gram import apply_columns, apply_rows, row_gram
-from hybridkin.ik._settings import Bounds, StepSettings
+from hybridkin.ik._settings import StepSettings
 from hybridkin.ik._starts import even_starts, nearest_starts
 from hybridkin.ik._step import StepRows, limited_step, null_step
 from hybridkin.ik._strict import StepLimits
+from hybridkin.ik.limits import Bounds
 from hybridkin.ik.tasks import Tolerance
 
 _FIRST_DAMPING = 1.0  # lambda^2 / sigma_max^2 of the first iteration
@@ -74,7 +75,6 @@ class Found(Point):
     reached: Tensor
     stationary: Tensor
     held: Tensor
-    blocked: Tensor
     n_iter: Tensor
     n_starts: Tensor
 
@@ -287,7 +287,6 @@ class Search:
             reached=reached,
             stationary=torch.zeros_like(reached),
             held=torch.zeros_like(reached),
-            blocked=torch.zeros_like(reached),
             n_iter=n_iter,
             n_starts=n_iter + 1,
         )
@@ -349,7 +348,6 @@ class Search:
         little = better & (error - error_new < IK_SLOW * metres)
         live.slow = torch.where(little, live.slow + 1.0, 0.0)
         live.held = step.saturated.any(-1)
-        live.blocked = step.blocked | torch.zeros_like(live.held)
         live.put(better, new.take(better))
 
     def _within(self, e: Tensor) -> Tensor:
@@ -369,8 +367,7 @@ class Search:
             return limited_step(self.settings, at.J, at.e, posture, limits, damping_sq)
         near = clear.near(at.q, torch.full_like(at.q, math.inf), clear.scene)
         limits = limits.with_rows(*near.rows(near.gap))
-        step = limited_step(self.settings, at.J, at.e, posture, limits, damping_sq)
-        return step._replace(blocked=near.is_active(step.dq))
+        return limited_step(self.settings, at.J, at.e, posture, limits, damping_sq)
 
     def _free(self, q: Tensor) -> Tensor:
         """Return configurations moved out of obstacles, within the limits."""

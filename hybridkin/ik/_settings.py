@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 import torch
@@ -41,6 +41,7 @@ from hybridkin.ik._feedback import expected_innovation
 from hybridkin.ik._half_spaces import HalfSpaces
 from hybridkin.ik._posture import FixedPosture, Function, NoPosture, PostureFunction
 from hybridkin.ik._rates import Rate, stopping
+from hybridkin.ik.limits import Bounds, Limit
 from hybridkin.ik.obstacles import Obstacle, as_numbers
 from hybridkin.ik.tasks import (
     AxisTask,
@@ -62,21 +63,6 @@ PLANE_ROUNDS = 8  # of alternating projections onto a plane and a box
 
 RATES = ("dq_max", "ddq_max")
 """Limits that must be positive: of speed and of acceleration."""
-
-
-class Bounds(NamedTuple):
-    """Limits of q or of a step, each of shape () or (..., n)."""
-
-    lower: Tensor
-    upper: Tensor
-
-    def clip(self, values: Tensor) -> Tensor:
-        """Return values moved into the bounds."""
-        return torch.clamp(values, self.lower, self.upper)
-
-    def held(self, values: Tensor) -> Tensor:
-        """Return which values are at a bound."""
-        return (values <= self.lower) | (values >= self.upper)
 
 
 def require(good: bool | Tensor, message: str) -> None:
@@ -138,6 +124,7 @@ class StepSettings(Portable):
     gain: Rate
     damping: str | float
     limits: str
+    own_limits: tuple[Limit, ...]
     dt: float
     weights: Tensor
     of_model: tuple[str, ...]
@@ -234,7 +221,7 @@ class StepSettings(Portable):
         for argument in fields(self):
             name = argument.name
             value = getattr(self, name)
-            if name in ("task", "of_model") or not argument.init:
+            if name in ("task", "of_model", "own_limits") or not argument.init:
                 continue
             words[name] = repr(value)
             if isinstance(value, Tensor):
@@ -243,6 +230,8 @@ class StepSettings(Portable):
                 words[name] = "None"
             if name in self.of_model and words[name] != "None":
                 words[name] += " of the model"
+        if self.own_limits:
+            words["limits"] = f"{len(self.own_limits)} functions"
         return words
 
     def unit_messages(self) -> list[str]:
@@ -327,6 +316,8 @@ class StepSettings(Portable):
             raise TypeError("obstacles have no kernel")
         if self.task.n_levels > 1:
             raise TypeError("a Stack of several levels has no kernel")
+        if self.own_limits:
+            raise TypeError("`limits` that are functions have no kernel")
         model = plan.stack([model.stored() for model in self.task.steered])
         scale = np.repeat(self.task.units, self.task.parts)
         plan.limit("rows of a task", len(scale))

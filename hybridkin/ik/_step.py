@@ -35,8 +35,9 @@ from hybridkin.ik._gram import (
 )
 from hybridkin.ik._levels import up_to_level, uppermost, with_lower_levels
 from hybridkin.ik._rates import stopping, way_to_stop
-from hybridkin.ik._settings import Bounds, StepSettings
+from hybridkin.ik._settings import StepSettings
 from hybridkin.ik._strict import StepLimits, step_within
+from hybridkin.ik.limits import Bounds, with_limit
 
 
 class StepRows(NamedTuple):
@@ -104,7 +105,7 @@ def control_step(
     e : Tensor of shape (N, m)
         Errors of the task, to be corrected by the gain [m].
     tip : Tensor of shape (N, ...)
-        Positions of the tip where there are tip limits; else not used.
+        Where the tips are for limits of the tip and limits of the caller's own.
     seconds : float
         Time to the next step [s].
     feed_forward : Tensor of shape (N, m) or float
@@ -158,10 +159,10 @@ def control_step(
     v = feed_forward + gain * e
     if bounds is None:
         bounds = settings.step_bounds(q, seconds, last)
-    wish = _Wish(law, at, J, v, v, e, posture, bounds)
     limits = StepLimits.of_bounds(*bounds, q)
     spaces = settings.tip_limits
     stopped = torch.zeros_like(fine[:, 0])
+    allowed = v
     if spaces.n > 0:
         margin = spaces.margin(torch.where(fine, tip, 0.0))
         if settings.accelerates:
@@ -172,7 +173,11 @@ def control_step(
         left = margin - spaces.along(v)
         rounding = 32.0 * torch.finfo(v.dtype).eps  # of a motion [m]
         stopped = (left < -rounding).any(-1)
-        wish = wish._replace(allowed=v + spaces.way_in(left))
+        allowed = v + spaces.way_in(left)
+    for limit in settings.own_limits:
+        limits, known = with_limit(limit, at, tip, J, limits)
+        fine = fine & known
+    wish = _Wish(law, at, J, v, allowed, e, posture, Bounds(limits.lower, limits.upper))
     if settings.clear:
         step = _clear_step(wish, limits, change, scene)
     else:

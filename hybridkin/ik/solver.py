@@ -31,7 +31,7 @@ from hybridkin.ik._clear import BodyPoints
 from hybridkin.ik._clear import body_points as body_points_of
 from hybridkin.ik._compiled import Core, core_of
 from hybridkin.ik._feedback import MOST_PERIODS, Feedback
-from hybridkin.ik._gram import row_gram
+from hybridkin.ik._gram import apply_columns, row_gram
 from hybridkin.ik._half_spaces import everywhere, half_spaces
 from hybridkin.ik._implicit import differentiable as with_derivatives
 from hybridkin.ik._level_search import search_of
@@ -48,6 +48,7 @@ from hybridkin.ik._settings import (
 from hybridkin.ik._starts import nearest_starts
 from hybridkin.ik._step import control_step
 from hybridkin.ik._tracks import Loop, Path, followed
+from hybridkin.ik.limits import Limit, functions
 from hybridkin.ik.obstacles import Obstacle, as_scene
 from hybridkin.ik.results import IKSolution, IKStatus, Step, Track, statuses
 from hybridkin.ik.tasks import as_task
@@ -97,9 +98,11 @@ class InverseKinematics:
     damping : "adaptive" or float, default="adaptive"
         "adaptive": lambda grows smoothly from zero if sigma_min / sigma_max < 0.02. A number is
         lambda / sigma_max everywhere; 0.0 is the plain pseudo-inverse of the paper.
-    limits : {"saturate", "off"}, default="saturate"
+    limits : {"saturate", "off"} or sequence of callables, default="saturate"
         "saturate": limits are part of the step: if some actuators are at a limit, the others
-        provide the missing motion. "off": the plain law without limits.
+        provide the missing motion. "off": the plain law without limits. Functions
+        ``limit(q, x, J)`` add limits of your own to each step, see `hybridkin.ik.limits`; they
+        work in torch, and not in `solve`.
     dt : float, default=0.01
         Control period [s].
     weights : float or array-like of shape (n,), optional
@@ -175,7 +178,7 @@ class InverseKinematics:
         beta: float | None = None,
         gain: float | None = None,
         damping: str | float = "adaptive",
-        limits: str = "saturate",
+        limits: str | Sequence[Limit] = "saturate",
         dt: float = 0.01,
         weights: Array | None = None,
         tip_limits: Sequence[Array] | None = None,
@@ -201,6 +204,10 @@ class InverseKinematics:
             damping = number(damping, "damping")
         if weights is None:
             weights = 1.0
+        own_limits: tuple[Limit, ...] = ()
+        if not isinstance(limits, str):
+            own_limits = functions(limits)
+            limits = "saturate"
         one_of(limits, "limits", ("saturate", "off"))
         spaces = everywhere()
         if tip_limits is not None and limits != "off":
@@ -213,6 +220,7 @@ class InverseKinematics:
             gain=gain_of(gain),
             damping=damping,
             limits=limits,
+            own_limits=own_limits,
             dt=number(dt, "dt"),
             weights=bound(weights, "weights", finite=True, positive=True),
             of_model=of_model,
@@ -527,7 +535,7 @@ class InverseKinematics:
             known=torch.isfinite(error),
             held=solution.held,
             singular=singular.is_singular,
-            blocked=solution.blocked | in_obstacle,
+            blocked=settings.clear.stops(q_plain, apply_columns(J, e)) | in_obstacle,
             inside=settings.clear.is_inside(q_plain, settings.clear.scene),
             resting=solution.stationary,
             beyond=(moved & ~in_obstacle) | (settings.misses(target) > np.max(tolerance)),

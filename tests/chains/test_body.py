@@ -228,3 +228,18 @@ def test_a_function_has_no_body():
             ask()
     with pytest.raises(TypeError, match="`chain` must have body_radii"):
         _ = model.body_radii
+
+
+def test_points_after_a_length_lie_on_arcs_and_on_tools():
+    """A straight robot with rigid offsets: every point is as high as it is far along the body."""
+    chain = ConstantCurvatureChain(
+        [0.01, 0.01], lengths=[0.1, 0.2], offsets=[0.05, 0.15], routing="base"
+    )
+    q = torch.zeros(6, dtype=torch.float64)
+    for length in (1e-3, 0.05, 0.1, 0.12, 0.15, 0.2, 0.35, 0.4, 0.5):
+        tip = chain.at_length(length, q)(q)
+        torch.testing.assert_close(tip, torch.tensor([0.0, 0.0, length], dtype=torch.float64))
+    bent = torch.tensor([0.01, -0.005, -0.005, 0.0, 0.0, 0.0], dtype=torch.float64)
+    on_tool = chain.at_length(0.4, q).pose(bent)
+    end = chain.pose(bent)
+    torch.testing.assert_close(on_tool[:3, 3], end[:3, 3] - 0.1 * end[:3, 2])
