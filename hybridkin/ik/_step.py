@@ -214,8 +214,8 @@ class _Wish(NamedTuple):
         step = self.law.step(self.J, self.v, self.posture, limits)
         pulls = bool(settings.pulls.any())
         if settings.tip_limits.n == 0 and not pulls:
-            rows = (uppermost(settings.task, part) for part in (self.J, self.v, self.e))
-            step = _escaping(self.law, self.q, *rows, step, self.bounds)
+            J, v, e = (uppermost(settings.task, part) for part in (self.J, self.v, self.e))
+            step = _escaping(self.law, self.q, J, v, e, step, self.bounds)
         step = step._replace(promised=apply_rows(self.J, step.dq))
         if pulls:
             step = _arriving(self.law, self.q, self.J, self.allowed, step, self.bounds)
