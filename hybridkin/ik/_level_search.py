@@ -15,7 +15,7 @@ from hybridkin.ik._search import Found, Point, Search
 from hybridkin.ik._settings import StepSettings
 from hybridkin.ik._step import StepRows
 from hybridkin.ik._strict import StepLimits
-from hybridkin.ik.tasks import Stack, Tolerance
+from hybridkin.ik.tasks import Task, Tolerance
 
 _RATIO = 0.03  # of the weights of a level and of the one before it, in the search from the starts
 _FIRST_DAMPING = 1e-3  # lambda^2 / |J|^2 of the levels after the first
@@ -25,7 +25,7 @@ _RETURNS = 2  # steps that take out what a step of all levels adds to the error 
 
 def search_of(settings: StepSettings, tol: Tolerance, max_iter: int) -> Search:
     """Return the search for targets of a task."""
-    if isinstance(settings.task, Stack) and settings.task.n_levels > 1:
+    if settings.task.n_levels > 1:
         return LevelSearch(settings, tol, max_iter)
     return Search(settings, tol, max_iter)
 
@@ -34,7 +34,7 @@ def search_of(settings: StepSettings, tol: Tolerance, max_iter: int) -> Search:
 class _InOneLevel(Search):
     """The search with weights in place of levels, which fall by a ratio; `task` has the levels."""
 
-    task: Stack
+    task: Task
     ratio: float
 
     def _within(self, e: Tensor) -> Tensor:
@@ -64,7 +64,6 @@ class LevelSearch(Search):
 
     def _in_one_level(self, ratio: float) -> Search:
         task = self.settings.task
-        assert isinstance(task, Stack)
         settings = replace(self.settings, task=task.in_one_level(ratio))
         return _InOneLevel(settings, self.tol, self.max_iter, task, ratio)
 

@@ -70,6 +70,26 @@ def with_lower_levels(
     Tensor of shape (N, n)
         Steps within the limits, with the motion of every level that it has without those after it.
     """
+    # LAPACK refuses NaN; rows with one get none of these steps.
+    fine = torch.isfinite(dq + v.sum(-1, keepdim=True) + J.sum(1) + posture).all(-1, keepdim=True)
+    J = torch.where(fine[..., None], J, 0.0)
+    v = torch.where(fine, v, 0.0)
+    dq = torch.where(fine, dq, 0.0)
+    posture = torch.where(fine, posture, 0.0)
+    steps = _in_order(settings, J, v, posture, limits, dq, least)
+    return torch.where(fine, steps, math.nan)
+
+
+def _in_order(
+    settings: StepSettings,
+    J: Tensor,
+    v: Tensor,
+    posture: Tensor,
+    limits: StepLimits,
+    dq: Tensor,
+    least: Tensor,
+) -> Tensor:
+    """Return `with_lower_levels` of finite rows."""
     unit = settings.unit(v)
     if settings.limits == "off":
         infinite = torch.full_like(dq, math.inf)

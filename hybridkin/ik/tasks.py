@@ -181,6 +181,10 @@ class Task:
         """The levels of priority, the first one first; together they have all rows."""
         return (Level((*range(sum(self.parts)),), self.n_free),)
 
+    def in_one_level(self, ratio: float) -> Task:
+        """Return the task in one level, with weights that fall by a ratio from level to level."""
+        return self
+
     def misses(self, x_target: Tensor, largest: Tensor) -> Tensor:
         """Return lower bounds (N,) of errors [m], of all q with ``|q| <= largest``; 0: unknown."""
         positions = self.positions(x_target)
@@ -734,7 +738,7 @@ class Stack(Task):
             levels.append(Level(tuple(rows), n_free))
         return tuple(levels)
 
-    def in_one_level(self, ratio: float) -> Self:
+    def in_one_level(self, ratio: float) -> Stack:
         """Return the stack in one level, with weights that fall by a ratio from level to level."""
         stack = copy.copy(self)
         weighted = zip(self.weights, self.priorities, strict=True)

@@ -11,6 +11,7 @@ from torch.testing import assert_close
 from hybridkin import ElasticTendonChain, InverseKinematics, robots
 from hybridkin.ik._step import limited_step
 from hybridkin.ik._strict import StepLimits
+from hybridkin.ik.obstacles import Sphere
 from hybridkin.ik.results import IKStatus
 from hybridkin.ik.tasks import AxisTask, PointsTask, PositionTask, Stack
 
@@ -105,6 +106,36 @@ def test_rows_of_obstacles_hold_and_do_not_change_the_order():
     alone = limited_step(settings_of((2,), (0,)), J[:, :2], v[:, :2], still, limits).dq
     assert_same_motion(J[:, :2], step, alone)
     assert (moved(limits.A, step) <= limits.b + 1e-12).all()
+
+
+def test_a_row_with_nan_changes_no_other():
+    settings = settings_of((2, 3), (0, 1))
+    J = random(9, 5, 6)
+    v = 0.3 * random(9, 5, seed=1)
+    still = torch.zeros(9, 6, dtype=torch.float64)
+    limits = box(0.3, still)
+    expected = limited_step(settings, J, v, still, limits).dq
+    J[4, 3, 1] = math.nan
+    v[5, 4] = math.inf
+    step = limited_step(settings, J, v, still, limits).dq
+    good = [0, 1, 2, 3, 6, 7, 8]
+    assert_close(step[good], expected[good], rtol=0.0, atol=1e-14)
+    assert step[4:6].isnan().all()
+
+
+def test_single_precision():
+    settings = settings_of((2, 3), (0, 1))
+    J = random(40, 5, 6)
+    v = 0.3 * random(40, 5, seed=1)
+    posture = 0.2 * random(40, 6, seed=2)
+    limits = box(0.3, posture)
+    expected = limited_step(settings, J, v, posture, limits).dq
+    single = StepLimits(*(part.float() for part in limits))
+    step = limited_step(settings, J.float(), v.float(), posture.float(), single).dq
+    assert step.dtype == torch.float32
+    # The least damping of single precision is larger, which leaves 1e-3 of a weak direction.
+    assert_close(moved(J[:, :2], step.double()), moved(J[:, :2], expected), rtol=1e-3, atol=1e-3)
+    assert (step.double() - expected).norm(dim=1).median() < 1e-4
 
 
 def reference(J, v, upper_rows, limits, k):
@@ -245,6 +276,26 @@ def test_a_tracker_keeps_the_tip_while_the_middle_cannot_be_reached():
     for _ in range(120):
         at = tracker.step(task.join(tip, MIDDLE(q)))
     assert tracker.status == IKStatus.CONVERGED
+
+
+def test_an_obstacle_stops_the_lower_task_alone():
+    q = 0.25 + 0.02 * random(1, 9)[0]
+    tip = TRUNK(q)
+    far = MIDDLE(q) + torch.tensor([0.3, 0.0, 0.0]).to(q)
+    ball = Sphere((MIDDLE(q) + torch.tensor([0.22, 0.0, 0.0]).to(q)).numpy(), 0.03)
+    task = Stack([PositionTask(TRUNK), PositionTask(MIDDLE)], levels=[0, 1])
+    ik = InverseKinematics(task, q_min=0.1, q_max=0.4, dq_max=0.3, obstacles=[ball])
+    clear = ik.settings.clear
+    tracker = ik.tracker(q)
+    for _ in range(80):
+        at = tracker.step(task.join(tip, far))
+    assert (TRUNK(at) - tip).norm() < 1e-9
+    assert tracker.status == IKStatus.BLOCKED
+    assert clear.smallest(at[None], clear.scene) > -1e-9
+    found = ik.solve(task.join(tip, far))
+    assert found.status == IKStatus.BLOCKED
+    assert (TRUNK(found.q) - tip).norm() < 1e-6
+    assert_close((MIDDLE(found.q) - far).norm(), (MIDDLE(at) - far).norm(), rtol=1e-4, atol=0.0)
 
 
 @pytest.mark.needs_core
