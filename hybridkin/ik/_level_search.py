@@ -17,7 +17,7 @@ from hybridkin.ik._step import StepRows
 from hybridkin.ik._strict import StepLimits
 from hybridkin.ik.tasks import Task, Tolerance
 
-_RATIO = 0.03  # of the weights of a level and of the one before it, in the search from the starts
+_RATIO = 0.1  # of the weights of a level and of the one before it, in the search from the starts
 _FIRST_DAMPING = 1e-3  # lambda^2 / |J|^2 of the levels after the first
 _SMALL = 0.01  # of tol: smaller errors of a level count as zero where a later one gains by them
 _RETURNS = 2  # steps that take out what a step of all levels adds to the error of the first one
