@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hybridkin._core.kernel_numbers import IK_LAST_DAMPING, IK_SLOW, IK_SLOW_STEPS
-from hybridkin.ik._levels import uppermost
+from hybridkin._core.kernel_numbers import IK_SLOW, IK_SLOW_STEPS
+from hybridkin.ik._levels import up_to_level
 from hybridkin.ik._search import Found, Point, Search
 from hybridkin.ik._settings import StepSettings
 from hybridkin.ik._step import StepRows
@@ -19,8 +19,9 @@ from hybridkin.ik.tasks import Task, Tolerance
 
 _RATIO = 0.1  # of the weights of a level and of the one before it, in the search from the starts
 _FIRST_DAMPING = 1e-3  # lambda^2 / |J|^2 of the levels after the first
+_LAST_DAMPING = 1e4  # no gain even with this damping: the point is stationary
 _SMALL = 0.01  # of tol: smaller errors of a level count as zero where a later one gains by them
-_RETURNS = 2  # steps that take out what a step of all levels adds to the error of the first one
+_RETURNS = 2  # steps that take out what a step of all levels adds to errors before the last level
 
 
 def search_of(settings: StepSettings, tol: Tolerance, max_iter: int) -> Search:
@@ -96,7 +97,7 @@ class LevelSearch(Search):
             live.n_iter = live.n_iter + 1
             damping = damping * torch.where(better, 0.25, 4.0)
             slow = torch.where(better & little, slow + 1.0, 0.0)
-            live.stationary = (damping > IK_LAST_DAMPING) | (slow >= IK_SLOW_STEPS)
+            live.stationary = (damping > _LAST_DAMPING) | (slow >= IK_SLOW_STEPS)
             ends.put(rows, live)
             going = ~live.reached & ~live.stationary
             rows = rows[going]
@@ -112,9 +113,11 @@ class LevelSearch(Search):
         # The first level is damped only where it is out of reach.
         damping_sq[0] = torch.where(self._errors(at)[0] > self._tolerances[0], size, 0.0)
         new, step = self._moved(at, at, damping_sq)
+        before_last = task.n_levels - 2
         for _ in range(_RETURNS):
-            first = replace(new, J=uppermost(task, new.J), e=uppermost(task, new.e))
-            new, _ = self._moved(new, first, damping_sq)
+            J = up_to_level(task, new.J, before_last)
+            e = up_to_level(task, new.e, before_last)
+            new, _ = self._moved(new, replace(new, J=J, e=e), damping_sq)
         return new, step
 
     def _moved(self, at: Point, wish: Point, damping_sq: Tensor) -> tuple[Point, StepRows]:
