@@ -34,9 +34,9 @@ from hybridkin.ik._feedback import MOST_PERIODS, Feedback
 from hybridkin.ik._gram import apply_columns, row_gram
 from hybridkin.ik._half_spaces import everywhere, half_spaces
 from hybridkin.ik._implicit import differentiable as with_derivatives
+from hybridkin.ik._level_search import search_of
 from hybridkin.ik._posture import Function
 from hybridkin.ik._rates import beta_of, gain_of
-from hybridkin.ik._search import Search
 from hybridkin.ik._settings import (
     RATES,
     Array,
@@ -499,7 +499,7 @@ class InverseKinematics:
         start = rows_of(start, lead)
         # Limits must not make it finite.
         start = torch.where(torch.isfinite(start), start, torch.nan)
-        search = Search(settings, tolerance, max_iter)
+        search = search_of(settings, tolerance, max_iter)
         if as_numpy and start.dtype == torch.float64:
             core = core_of(settings)
             if core is not None and not settings.clear:
