@@ -95,7 +95,7 @@ def test_points_follow_each_other_without_a_jump(name, model, q):
 @pytest.mark.needs_core
 def test_the_compiled_core_has_all_points(model, q):
     if program_of(model.with_tip(1)) is None:
-        pytest.skip("torch computes this chain")
+        pytest.skip("needs a chain with kernels")
     for at in places_of(model):
         point = model.with_tip(at)
         assert program_of(point) is not None
