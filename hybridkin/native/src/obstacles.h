@@ -246,35 +246,46 @@ static inline int ik_is_broken(const ik_near_t *near, int pair) {
     return !(near->taken[pair] <= left + near->rounding);
 }
 
-/* Evaluate what a step, with the way to a stop after it, really takes of all gaps, and return whether
-   that is too much of any. */
-static HK_NOINLINE int ik_check_gaps(const ik_settings *ik, const real *q, const real *dq,
-                                     real seconds, ik_near_t *near) {
+/* What ways of the points to q really take of all gaps, if that is more than `taken`. */
+static HK_NOINLINE void ik_take_gaps(const ik_settings *ik, const real *q, ik_near_t *near) {
     const int n_points = near->n_points, n_meeting = ik->body[IK_N_MEETING];
     const int32_t *meeting = ik->body + IK_POINTS + n_points;
-    real at[HK_MAX_N], *taken = near->taken;
     const real *normal = near->normal;
-    int any = 0;
-    for (int j = 0; j < ik->n; j++) {
-        at[j] = dq[j];
-        if (ik->flags & IK_ACCELERATES)
-            at[j] += ik_way_to_stop(dq[j], ik->accel[j] * seconds * seconds);
-        at[j] += q[j];
-    }
-    ik_points(ik, 0, at, near->moved, NULL);
+    real *taken = near->taken;
+    ik_points(ik, 0, q, near->moved, NULL);
     for (int i = 0; i < 3 * n_points; i++) near->moved[i] -= near->x[i];
     for (int i = 0; i < n_points; i++)
-        for (int k = 0; k < ik->n_obstacles; k++, normal += 3) {
+        for (int k = 0; k < ik->n_obstacles; k++, normal += 3, taken++) {
             const real *way = near->moved + 3 * i;
-            *taken++ = -(normal[0] * way[0] + normal[1] * way[1] + normal[2] * way[2]);
+            const real sum = -(normal[0] * way[0] + normal[1] * way[1] + normal[2] * way[2]);
+            if (!(sum <= *taken)) *taken = sum;
         }
-    for (int k = 0; k < n_meeting; k++, normal += 3) {
+    for (int k = 0; k < n_meeting; k++, normal += 3, taken++) {
         const real *one = near->moved + 3 * meeting[k];
         const real *other = near->moved + 3 * meeting[n_meeting + k];
         real sum = R(0.0);
         for (int i = 0; i < 3; i++) sum -= normal[i] * (other[i] - one[i]);
-        *taken++ = sum;
+        if (!(sum <= *taken)) *taken = sum;
     }
+}
+
+/* Evaluate what a step really takes of all gaps, and where it leads to a stop, and return whether
+   that is too much of any. */
+static HK_NOINLINE int ik_check_gaps(const ik_settings *ik, const real *q, const real *dq,
+                                     real seconds, ik_near_t *near) {
+    real at[HK_MAX_N], way[HK_MAX_N];
+    int goes_on = 0, any = 0;
+    for (int p = 0; p < near->n_pairs; p++) near->taken[p] = -R(INFINITY);
+    for (int j = 0; j < ik->n; j++) {
+        way[j] = R(0.0);
+        if (ik->flags & IK_ACCELERATES)
+            way[j] = ik_way_to_stop(dq[j], ik->accel[j] * seconds * seconds);
+        at[j] = q[j] + dq[j];
+        goes_on |= way[j] != R(0.0);
+    }
+    ik_take_gaps(ik, at, near);
+    for (int j = 0; goes_on && j < ik->n; j++) at[j] = q[j] + (dq[j] + way[j]);
+    if (goes_on) ik_take_gaps(ik, at, near);
     for (int p = 0; p < near->n_pairs; p++) any |= ik_is_broken(near, p);
     return any;
 }
