@@ -17,17 +17,19 @@ from torch import Tensor
 
 from hybridkin._core.arrays import as_array, number, whole
 from hybridkin._core.kernel_numbers import (
+    IK_BRAKED,
     IK_INSIDE_OBSTACLE,
     IK_NEARER,
     IK_OBSTACLE,
     IK_PAIRS_MOST,
+    IK_STRAY,
 )
 from hybridkin._core.model import ForwardModel
 from hybridkin._core.plan import Plan
 from hybridkin._core.portable import Portable
 from hybridkin.ik._gram import apply_rows
 from hybridkin.ik._nearest import Polyhedron, nearest
-from hybridkin.ik._rates import stopping
+from hybridkin.ik._rates import stopping, way_to_stop
 from hybridkin.ik.obstacles import distances
 from hybridkin.ik.tasks import Task
 
@@ -255,17 +257,46 @@ class Near(NamedTuple):
         along = self.normal * self.clear.relative(moved, self.n_obstacles)
         return -along.sum(-1)
 
+    def farthest(self, dq: Tensor, change: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the first ways (N, n) after steps dq that take too much, and what they take.
+
+        The way to a stop comes first. Where gaps are not far larger than this way, it is bent: then
+        follow the step alone, and parts of the way to a stop.
+        """
+        way = dq + way_to_stop(dq, change)
+        taken = self.taken(way)
+        longest = apply_rows(self.A.abs(), way.abs())
+        watched = ~(2.0 * longest < self.gap).all(-1)
+        others = [dq + way_to_stop(dq, change, 2.0**k) for k in range(IK_BRAKED + 1)]
+        for other in (dq, *others):
+            goes_on = watched & ~self.is_broken(taken).any(-1) & (other != way).any(-1)
+            if not goes_on.any():
+                continue
+            goes_on = goes_on[:, None]
+            taken = torch.where(goes_on, self.taken(other), taken)
+            way = torch.where(goes_on, other, way)
+        return way, taken
+
     def is_broken(self, taken: Tensor) -> Tensor:
         """Return whether ways take more of gaps than there is, by more than rounding, (N, p)."""
         size = self.x.abs().flatten(1).amax(-1, keepdim=True)
         rounding = 32.0 * torch.finfo(size.dtype).eps * size
         return ~(taken <= self.gap.clamp_min(0.0) + rounding)
 
-    def tightened(self, b: Tensor, dq: Tensor, taken: Tensor) -> Tensor:
-        """Return limits b (N, p) after steps dq that took too much of some gaps."""
-        excess = taken - IK_NEARER * self.gap.clamp_min(0.0)
-        less = torch.minimum(b, apply_rows(self.A, dq) - excess)
-        return torch.where(self.is_broken(taken), less, b)
+    def tightened(self, b: Tensor, dq: Tensor, way: Tensor, taken: Tensor) -> tuple[Tensor, Tensor]:
+        """Return tighter limits b (N, p), and which part of the step to try, (N, 1).
+
+        Steps dq, on the ways to a stop, have taken too much of some gaps. What the curvature of the
+        model took is to be at most IK_STRAY of the way; it shrinks with the square of the step.
+        """
+        broken = self.is_broken(taken)
+        bent = taken - apply_rows(self.A, way)
+        longest = self.A.norm(dim=-1) * way.norm(dim=-1, keepdim=True)
+        straight = torch.where(broken & (bent > 0.0), IK_STRAY * longest / bent, 1.0)
+        part = straight.amin(-1, keepdim=True).clamp_max(1.0)
+        beyond = (taken - apply_rows(self.A, dq)) * part.square()
+        less = IK_NEARER * self.gap.clamp_min(0.0) - beyond
+        return torch.where(broken & (less < b), less, b), part
 
     def is_active(self, dq: Tensor) -> Tensor:
         """Return whether steps are at a limit of the gaps, bool (N,)."""

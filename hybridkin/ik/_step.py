@@ -33,7 +33,7 @@ from hybridkin.ik._gram import (
     row_gram,
     solve_rows,
 )
-from hybridkin.ik._rates import stopping, way_to_stop
+from hybridkin.ik._rates import stopping
 from hybridkin.ik._settings import StepSettings
 from hybridkin.ik._strict import StepLimits, step_within
 from hybridkin.ik.limits import Bounds, with_limit
@@ -206,6 +206,12 @@ class _Wish(NamedTuple):
     posture: Tensor
     bounds: Bounds
 
+    def times(self, part: Tensor) -> _Wish:
+        """Return parts (N, 1) of these wishes."""
+        return self._replace(
+            v=part * self.v, allowed=part * self.allowed, posture=part * self.posture
+        )
+
     def step(self, limits: StepLimits) -> StepRows:
         """Return the step within limits, for which tendons can only pull."""
         settings = self.law.settings
@@ -232,12 +238,13 @@ def _clear_step(wish: _Wish, limits: StepLimits, change: Tensor, scene: Tensor) 
     step = wish.step(limits.with_rows(*near.rows(b)))
     blocked = near.is_active(step.dq)
     for _ in range(IK_AROUND):
-        taken = near.taken(step.dq + way_to_stop(step.dq, change))
+        way, taken = near.farthest(step.dq, change)
         broken = near.is_broken(taken).any(-1)
         if not broken.any():
             return step._replace(blocked=blocked)
         blocked = blocked | broken
-        b = torch.where(broken[:, None], near.tightened(b, step.dq, taken), b)
+        b, part = near.tightened(b, step.dq, way, taken)
+        wish = wish.times(part)
         step = wish.step(limits.with_rows(*near.rows(b)))
 
     brake = bounds.clip(torch.zeros_like(step.dq))
@@ -245,7 +252,7 @@ def _clear_step(wish: _Wish, limits: StepLimits, change: Tensor, scene: Tensor) 
     part = torch.ones_like(wanted[:, :1])
     for halving in range(IK_SHORTER + 1):
         dq = torch.where(part < 1.0, brake + part * (wanted - brake), wanted)
-        taken = near.taken(dq + way_to_stop(dq, change))
+        _, taken = near.farthest(dq, change)
         broken = near.is_broken(taken).any(-1, keepdim=True)
         if not broken.any():
             break
