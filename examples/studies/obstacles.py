@@ -333,7 +333,8 @@ def as_row(name: str, limits: str, program: str, count: Count) -> str:
     each = 1e6 * count.seconds / count.ticks
     worst = f"{count.penetration:.1e} | {count.excess:.1e}"
     wrong = f"{count.false_converged} | {count.not_numbers}"
-    return f"| {name} | {limits} | {program} | {count.ticks} | {worst} | {wrong} | {each:.1f} | {seen} |"
+    case = f"{name} | {limits} | {program} | {count.ticks}"
+    return f"| {case} | {worst} | {wrong} | {each:.1f} | {seen} |"
 
 
 if __name__ == "__main__":

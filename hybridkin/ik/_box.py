@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from hybridkin._core.kernel_numbers import IK_NEWTON, IK_PROXIMAL
-from hybridkin.ik._calm import calmed
 from hybridkin.ik._gram import apply_columns, apply_rows, solve_rows
 
 
@@ -134,54 +133,18 @@ def box_limited_step(problem: BoxProblem, mu: Tensor | None = None) -> tuple[Ten
     return problem.clip(problem.unlimited(best)), best
 
 
-def strict_box_step(problem: BoxProblem, calm: Tensor) -> Tensor:
-    """Return the box-limited step whose task part does not depend on the preferred step z.
+def proximal_box_step(problem: BoxProblem, centre: Tensor) -> tuple[Tensor, Tensor]:
+    """Return `box_limited_step` for any lambda^2 >= 0.
 
-    Without damping, z only chooses among the steps that reach v, or come nearest to it. Damping
-    would be a compromise between v and z. Therefore the damped task is first solved in the box for
-    z = 0; z then chooses among the steps with the same tip motion.
-
-    Parameters
-    ----------
-    problem : BoxProblem
-        With lambda^2 >= 0. Below 1e-6 of sigma_max^2 (float64) the box-limited step is solved with
-        this minimum, and proximal rounds on the multipliers remove its task error.
-    calm : bool Tensor of shape (N,)
-        Where z is at most half as long as the step of the task.
-
-    Returns
-    -------
-    Tensor of shape (N, n)
-        Steps within the box.
+    Below 1e-6 of sigma_max^2 (float64) this minimum is used, and proximal rounds from the
+    multipliers `centre` (N, m) remove its effect. Every round solves
+    J dq + used mu = v + (used - lambda^2) mu_last. At the fixed point J dq + lambda^2 mu = v.
     """
     J = problem.J
     size_sq = torch.linalg.matrix_norm(J @ J.mT)  # about sigma_max^2
     # If J is zero the floor only has to be positive.
     relative = max(1e-6, math.sqrt(torch.finfo(J.dtype).eps))
     floor = torch.where(size_sq > 0.0, relative * size_sq, 1.0)
-    centre = torch.zeros_like(problem.v)
-    has_posture = (problem.z != 0.0).any(-1)
-    rows = ((problem.damping_sq > 0.0) & has_posture).nonzero()[:, 0]
-    if rows.numel() > 0:
-        # The damped task without posture; its tip motion replaces v.
-        damped = problem.take(rows)
-        damped = damped._replace(z=torch.zeros_like(damped.z))
-        dq, mu = _proximal_box_step(damped, floor[rows], centre[rows])
-        v = problem.v.index_put((rows,), apply_rows(damped.J, dq))
-        z = problem.z.index_put((rows,), calmed(problem.z[rows], dq, calm[rows]))
-        undamped = problem.damping_sq.index_fill(0, rows, 0.0)
-        problem = problem._replace(v=v, z=z, damping_sq=undamped)
-        # Start from these multipliers: they keep the active limits, also if v is out of reach.
-        centre[rows] = mu
-    return _proximal_box_step(problem, floor, centre)[0]
-
-
-def _proximal_box_step(problem: BoxProblem, floor: Tensor, centre: Tensor) -> tuple[Tensor, Tensor]:
-    """Return `box_limited_step` for any lambda^2 >= 0, without the effect of the floor.
-
-    Every round solves J dq + used mu = v + (used - lambda^2) mu_last. At the fixed point
-    J dq + lambda^2 mu = v.
-    """
     used = torch.maximum(problem.damping_sq, floor)
     excess = (used - problem.damping_sq)[:, None]
     dq = problem.z

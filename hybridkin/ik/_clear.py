@@ -17,12 +17,12 @@ from torch import Tensor
 
 from hybridkin._core.arrays import as_array, number, whole
 from hybridkin._core.kernel_numbers import (
+    IK_BENT_WAY,
     IK_BRAKED,
     IK_INSIDE_OBSTACLE,
     IK_NEARER,
     IK_OBSTACLE,
     IK_PAIRS_MOST,
-    IK_STRAY,
 )
 from hybridkin._core.model import ForwardModel
 from hybridkin._core.plan import Plan
@@ -119,9 +119,7 @@ class KeptClear(Portable):
         scene = scene.to(x)
         keep = self.keep.to(x)[:, None]
         distance, normal = distances(x, scene)
-        at_base, _ = distances(self.base.to(x), scene)
-        never = keep > at_base + self.along.to(x)[:, None]
-        free = torch.where(never, math.inf, distance - keep).flatten(1)
+        free = torch.where(self._is_never_free(scene), math.inf, distance - keep).flatten(1)
         one, other = self.meeting.to(x.device)
         apart = x[:, other] - x[:, one]
         size = apart.norm(dim=-1)
@@ -129,6 +127,21 @@ class KeptClear(Portable):
         between = size - (self.radii[one] + self.radii[other]).to(x)
         gaps = torch.cat([free, between], dim=1)
         return gaps, torch.cat([normal.flatten(1, 2), away], dim=1)
+
+    def _is_never_free(self, scene: Tensor) -> Tensor:
+        """Return which points (P, K) no configuration frees: the robot is mounted there."""
+        at_base, _ = distances(self.base.to(scene), scene)
+        return self.keep.to(scene)[:, None] > at_base + self.along.to(scene)[:, None]
+
+    def distances(self, q: Tensor, scene: Tensor) -> Tensor:
+        """Return the distances (N, K) of the body at q (N, n) to every obstacle of a scene [m].
+
+        Those of points that are never free do not count.
+        """
+        scene = scene.to(q)
+        distance, _ = distances(self.points(q), scene)
+        distance = distance - self.radii.to(q)[:, None]
+        return torch.where(self._is_never_free(scene), math.inf, distance).amin(1)
 
     def relative(self, rows: Tensor, n_obstacles: int) -> Tensor:
         """Return values of points (N, P, ...) for the pairs of `gaps`, (N, p, ...)."""
@@ -287,12 +300,12 @@ class Near(NamedTuple):
         """Return tighter limits b (N, p), and which part of the step to try, (N, 1).
 
         Steps dq, on the ways to a stop, have taken too much of some gaps. What the curvature of the
-        model took is to be at most IK_STRAY of the way; it shrinks with the square of the step.
+        model took is to be at most IK_BENT_WAY of the way; it shrinks with the square of the step.
         """
         broken = self.is_broken(taken)
         bent = taken - apply_rows(self.A, way)
         longest = self.A.norm(dim=-1) * way.norm(dim=-1, keepdim=True)
-        straight = torch.where(broken & (bent > 0.0), IK_STRAY * longest / bent, 1.0)
+        straight = torch.where(broken & (bent > 0.0), IK_BENT_WAY * longest / bent, 1.0)
         part = straight.amin(-1, keepdim=True).clamp_max(1.0)
         beyond = (taken - apply_rows(self.A, dq)) * part.square()
         less = IK_NEARER * self.gap.clamp_min(0.0) - beyond

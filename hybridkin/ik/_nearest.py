@@ -172,9 +172,10 @@ def nearest(
         Points.
     within : Polyhedron
         Where to; its equations and bounds have a common point.
-    excess : Tensor of shape (N,)
+    excess : Tensor of shape (N, m)
         Proximal rounds move the values e of the equations by `excess` times their multipliers:
-        what has been added to lambda^2, if the points hold the slack of the equations.
+        what has been added to lambda^2, if the points hold the slack of the equations. Equations
+        with an excess come before those without, and do not depend on others.
     centre : Tensor of shape (N, m)
         Multipliers of the equations that the first round takes.
 
@@ -191,21 +192,71 @@ def nearest(
     """
     ends = x.clone()
     multipliers = torch.zeros_like(within.e)
-    excess = torch.zeros_like(x[:, 0]) + excess
+    excess = torch.zeros_like(within.e) + excess
     live = _Live.on_equations(x, within, excess, centre)
     for _ in range(IK_CHANGES):
         live = live.choosing()
-        done = live.chosen < 0
+        done = live.now.chosen < 0
         if done.any():
-            ends[live.rows[done]] = live.x[done]
+            ends[live.rows[done]] = live.now.x[done]
             multipliers[live.rows[done]] = live.multipliers[done]
             live = live.take((~done).nonzero()[:, 0])
         if live.rows.numel() == 0:
             break
         live = live.after_change()
-    ends[live.rows] = live.x
+    ends[live.rows] = live.now.x
     multipliers[live.rows] = live.multipliers
     return torch.clamp(ends, within.lower, within.upper), multipliers
+
+
+class _State(NamedTuple):
+    """Where the iteration is: what begins anew when a row of A is relaxed.
+
+    Attributes
+    ----------
+    x : Tensor of shape (N, n)
+        The points.
+    e : Tensor of shape (N, m)
+        The values of the equations in this round.
+    active : _Active
+        The constraints that hold as equations.
+    rounds : Tensor of shape (N,)
+        Rounds left.
+    close : Tensor of shape (N,)
+        What rounding of all that led to x may be, once it has been seen.
+    chosen : Tensor of shape (N,)
+        The inequality on its way to be active, -1 for none.
+    force : Tensor of shape (N,)
+        Its multiplier.
+    """
+
+    x: Tensor
+    e: Tensor
+    active: _Active
+    rounds: Tensor
+    close: Tensor
+    chosen: Tensor
+    force: Tensor
+
+    def where(self, is_kept: Tensor, replaced: _State) -> _State:
+        """Return this in the rows `is_kept` (N,), else the other one."""
+        row = is_kept[:, None]
+        return _State(
+            torch.where(row, self.x, replaced.x),
+            torch.where(row, self.e, replaced.e),
+            self.active.where(is_kept, replaced.active),
+            torch.where(is_kept, self.rounds, replaced.rounds),
+            torch.where(is_kept, self.close, replaced.close),
+            torch.where(is_kept, self.chosen, replaced.chosen),
+            torch.where(is_kept, self.force, replaced.force),
+        )
+
+    def take(self, rows: Tensor) -> _State:
+        """Return the state of some rows."""
+        parts = []
+        for part in self:
+            parts.append(part[rows] if isinstance(part, Tensor) else part.take(rows))
+        return _State(*parts)
 
 
 class _Live(NamedTuple):
@@ -215,40 +266,22 @@ class _Live(NamedTuple):
     ----------
     rows : Tensor of shape (N,)
         Their places among all rows.
-    origin, start, x : Tensor of shape (N, n)
-        The points to be near to, those on the equations alone, and at present.
+    origin : Tensor of shape (N, n)
+        The points to be near to.
     within : Polyhedron
-        What they go into, with relaxed rows and the values of the round.
-    values, first : Tensor of shape (N, m)
-        The values of the equations, as given and in the first round.
-    excess : Tensor of shape (N,)
+        What they go into, with relaxed rows.
+    excess : Tensor of shape (N, m)
         The factor of the multipliers in later rounds.
-    rounds : Tensor of shape (N,)
-        Rounds left.
-    close : Tensor of shape (N,)
-        What rounding of all that led to x may be, once it has been seen.
-    equations, active : _Active
-        The constraints at the start, and at present.
-    chosen : Tensor of shape (N,)
-        The inequality on its way to be active, -1 for none.
-    force : Tensor of shape (N,)
-        Its multiplier.
+    begun, now : _State
+        The state on the equations alone, and the present one.
     """
 
     rows: Tensor
     origin: Tensor
-    start: Tensor
-    x: Tensor
     within: Polyhedron
-    values: Tensor
-    first: Tensor
     excess: Tensor
-    rounds: Tensor
-    close: Tensor
-    equations: _Active
-    active: _Active
-    chosen: Tensor
-    force: Tensor
+    begun: _State
+    now: _State
 
     @classmethod
     def on_equations(
@@ -256,11 +289,10 @@ class _Live(NamedTuple):
     ) -> _Live:
         """Return the points that are nearest to the origin on the equations alone."""
         x = origin
-        values = within.e
-        within = within._replace(e=values + excess[:, None] * centre)
+        e = within.e + excess * centre
         active = _Active.none(x)
         none = torch.full_like(x[:, 0], -1, dtype=torch.long)
-        for normal, value in zip(within.E.unbind(1), within.e.unbind(1), strict=True):
+        for normal, value in zip(within.E.unbind(1), e.unbind(1), strict=True):
             way, size, multiples = active.along(normal)
             adds = size > _rounding(x) ** 2 * normal.square().sum(-1)
             missing = value - (normal * x).sum(-1)
@@ -269,30 +301,16 @@ class _Live(NamedTuple):
             force = torch.full_like(size, torch.inf)
             active = active.with_one(adds, way, multiples, force, none)
         rows = torch.arange(len(x), device=x.device)
-        force = torch.zeros_like(x[:, 0])
-        rounds = torch.where(excess > 0.0, IK_PROXIMAL, 0)
-        return cls(
-            rows,
-            origin,
-            x,
-            x,
-            within,
-            values,
-            within.e,
-            excess,
-            rounds,
-            torch.zeros_like(force),
-            active,
-            active,
-            none,
-            force,
-        )
+        rounds = torch.where((excess > 0.0).any(-1), IK_PROXIMAL, 0)
+        zero = torch.zeros_like(x[:, 0])
+        begun = _State(x, e, active, rounds, zero, none, zero)
+        return cls(rows, origin, within, excess, begun, begun)
 
     @property
     def multipliers(self) -> Tensor:
         """Those of the equations (N, m)."""
-        m = self.values.shape[-1]
-        return apply_rows(self.active.inverse[:, :m], self.x - self.origin)
+        m = self.within.e.shape[-1]
+        return apply_rows(self.now.active.inverse[:, :m], self.now.x - self.origin)
 
     def choosing(self) -> _Live:
         """Return the same with the inequality violated most chosen where there was none.
@@ -301,14 +319,16 @@ class _Live(NamedTuple):
         """
         live = self
         for _ in range(1 + IK_PROXIMAL):
-            beyond = live.within.excess(live.x)
-            least = live.within.rounding(live.x) + live.close[:, None]
+            now = live.now
+            beyond = live.within.excess(now.x)
+            least = live.within.rounding(now.x) + now.close[:, None]
             violated = torch.where(beyond > least, beyond, 0.0)
-            violated = violated.masked_fill(live.active.chosen_of(beyond), 0.0)
+            violated = violated.masked_fill(now.active.chosen_of(beyond), 0.0)
             most, worst = violated.max(-1)
-            none = (live.chosen < 0) & (most > 0.0)
-            live = live._replace(chosen=torch.where(none, worst, live.chosen))
-            ended = (live.chosen < 0) & (live.rounds > 0)
+            none = (now.chosen < 0) & (most > 0.0)
+            chosen = torch.where(none, worst, now.chosen)
+            live = live._replace(now=now._replace(chosen=chosen))
+            ended = (chosen < 0) & (now.rounds > 0)
             if not ended.any():
                 break
             live = live._next_round(ended)
@@ -316,13 +336,13 @@ class _Live(NamedTuple):
 
     def _next_round(self, ended: Tensor) -> _Live:
         """Return the same with new values of the equations in the rows `ended` (N,)."""
-        m = self.values.shape[-1]
+        now = self.now
+        m = self.within.e.shape[-1]
         ended = ended[:, None]
-        values = self.values + self.excess[:, None] * self.multipliers
-        values = torch.where(ended, values, self.within.e)
-        change = values - self.within.e
-        x = self.x + (change[..., None] * self.active.inverse[:, :m]).sum(1)
-        active = self.active.pushing(x - self.origin, ended)
+        e = torch.where(ended, self.within.e + self.excess * self.multipliers, now.e)
+        change = e - now.e
+        x = now.x + (change[..., None] * now.active.inverse[:, :m]).sum(1)
+        active = now.active.pushing(x - self.origin, ended)
         # What pulls now is no longer active.
         while True:
             least, slot = active.force.min(-1)
@@ -335,19 +355,14 @@ class _Live(NamedTuple):
             length = torch.where(pulls, least / size, 0.0)
             x = x - length[:, None] * way
             active = active.without(leaving).pushing(x - self.origin, pulls[:, None])
-        begun = self._replace(
-            x=x,
-            active=active,
-            within=self.within._replace(e=values),
-            rounds=self.rounds - ended[:, 0].long(),
-        )
-        return begun._replace(x=begun._refined())
+        rounds = now.rounds - ended[:, 0].long()
+        return self._refined(now._replace(x=x, e=e, active=active, rounds=rounds))
 
     def after_change(self) -> _Live:
         """Return the same after one constraint more or less, or with a row that is relaxed."""
-        x, active = self.x, self.active
-        normal = self.within.normals(self.chosen)
-        missing = self.within.excess(x).gather(-1, self.chosen[:, None])[:, 0]
+        x, active, chosen = self.now.x, self.now.active, self.now.chosen
+        normal = self.within.normals(chosen)
+        missing = self.within.excess(x).gather(-1, chosen[:, None])[:, 0]
         way, size, multiples = active.along(normal)
 
         # The step at which it holds, or the first at which an active one pushes no more.
@@ -359,33 +374,35 @@ class _Live(NamedTuple):
         length = torch.minimum(full, first)
         stuck = torch.isinf(length)
         length = torch.where(stuck, 0.0, length)
-        force = self.force + length
+        force = self.now.force + length
         active = active._replace(force=active.force - length[:, None] * multiples)
         adds = ~stuck & (full <= first)
         drops = ~stuck & ~adds
         leaving = one_hot(slot, x.shape[-1]).bool() & drops[:, None]
-        moved = self._replace(
+        now = self.now._replace(
             x=x + torch.where(movable, length, 0.0)[:, None] * way,
-            active=active.with_one(adds, way, multiples, force, self.chosen).without(leaving),
-            chosen=torch.where(adds, -1, self.chosen),
+            active=active.with_one(adds, way, multiples, force, chosen).without(leaving),
+            chosen=torch.where(adds, -1, chosen),
             force=torch.where(adds, 0.0, force),
         )
+        moved = self._replace(now=now)
         if stuck.any():
             moved = moved._relaxed(stuck, missing, multiples)
-        return moved._replace(x=moved._refined())
+        return moved._refined(moved.now)
 
     def _relaxed(self, stuck: Tensor, missing: Tensor, multiples: Tensor) -> _Live:
-        """Return the same with a row relaxed where constraints contradict: these start anew.
+        """Return the same with a row relaxed where constraints contradict: these begin anew.
 
         The chosen normal is a sum of active ones with factors `multiples` (N, n), none positive.
         """
-        n = self.x.shape[-1]
+        now = self.now
+        n = now.x.shape[-1]
         first_row = 2 * n
-        which = torch.where(multiples < -_rounding(multiples), self.active.which, -1)
-        which = torch.cat([which, self.chosen[:, None]], dim=-1)
+        which = torch.where(multiples < -_rounding(multiples), now.active.which, -1)
+        which = torch.cat([which, now.chosen[:, None]], dim=-1)
         room = self.within.most - self.within.b
         every = torch.cat(
-            [torch.zeros_like(self.within.excess(self.x))[:, :first_row], room], dim=-1
+            [torch.zeros_like(self.within.excess(now.x))[:, :first_row], room], dim=-1
         )
         which = torch.where(every.gather(-1, which.clamp_min(0)) > 0.0, which, -1)
         factors = torch.cat([-multiples, torch.ones_like(missing)[:, None]], dim=-1)
@@ -393,38 +410,33 @@ class _Live(NamedTuple):
         has_row = stuck & (least >= first_row)
         by = missing / factors.gather(-1, slot[:, None])[:, 0]
         row = (least - first_row).clamp_min(0)
-        over = torch.where(has_row, by, 0.0)
         b = self.within.b
         if b.shape[-1]:
             rounding = 32.0 * torch.finfo(b.dtype).eps
             by = by + rounding * (by + b.gather(-1, row[:, None])[:, 0].abs())
             over = torch.where(has_row, by, 0.0)
             b = b.scatter_add(-1, row[:, None], over[:, None]).minimum(self.within.most)
-        # Where no row contradicts it is rounding, and nothing begins anew.
-        size = 8.0 * torch.finfo(b.dtype).eps * self.x.abs().amax(-1)
-        close = torch.where(stuck & ~has_row, size, self.close)
-        chosen = torch.where(stuck, -1, self.chosen)
-        force = torch.where(stuck, 0.0, self.force)
-        stuck = has_row
-        anew = stuck[:, None]
-        active = self.active.where(~stuck, self.equations)
-        return self._replace(
-            x=torch.where(anew, self.start, self.x),
-            within=self.within._replace(b=b, e=torch.where(anew, self.first, self.within.e)),
-            rounds=torch.where(stuck & (self.excess > 0.0), IK_PROXIMAL, self.rounds),
-            active=active,
-            chosen=chosen,
-            force=force,
-            close=torch.where(stuck, 0.0, close),
+        # Where no row contradicts it is rounding, of all that is missing; nothing begins anew.
+        size = 8.0 * torch.finfo(b.dtype).eps * now.x.abs().amax(-1)
+        size = torch.maximum(size, missing)
+        seen = now._replace(
+            close=torch.where(stuck, size, now.close),
+            chosen=torch.where(stuck, -1, now.chosen),
+            force=torch.where(stuck, 0.0, now.force),
         )
+        return self._replace(within=self.within._replace(b=b), now=seen.where(~has_row, self.begun))
 
-    def _refined(self) -> Tensor:
-        """Return x after one Newton step onto the active constraints, which takes rounding out."""
-        within, which = self.within, self.active.which
-        inequality = -within.excess(self.x).gather(-1, which.clamp_min(0))
+    def _refined(self, now: _State) -> _Live:
+        """Return this at a state after one Newton step onto the active constraints.
+
+        It takes rounding out.
+        """
+        which = now.active.which
+        inequality = -self.within.excess(now.x).gather(-1, which.clamp_min(0))
         off = torch.where(which >= 0, inequality, 0.0)
         # Row c of `inverse` moves along the inward normal c alone.
-        return self.x - (off[..., None] * self.active.inverse).sum(1)
+        x = now.x - (off[..., None] * now.active.inverse).sum(1)
+        return self._replace(now=now._replace(x=x))
 
     def take(self, rows: Tensor) -> _Live:
         """Return some rows."""

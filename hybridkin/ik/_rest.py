@@ -24,6 +24,7 @@ from hybridkin._core.kernel_numbers import (
     IK_STRAIGHT,
 )
 from hybridkin.ik._settings import StepSettings
+from hybridkin.ik.tasks import Level, Task
 
 
 class Rest(NamedTuple):
@@ -116,6 +117,44 @@ class Rest(NamedTuple):
         way_sq = _squared(dq / settings.unit(dq))
         share = (dq.abs() / span).amax(-1)
         return self._replace(way_sq=way_sq, share=share, promised=promised, error=e)
+
+
+class RestOfLevels(NamedTuple):
+    """The rest of every level of a task: a level out of reach does not damp those before it."""
+
+    levels: tuple[Level, ...]
+    rests: tuple[Rest, ...]
+
+    @classmethod
+    def at(cls, levels: tuple[Level, ...], e: Tensor) -> Self:
+        """Return what is known at the start of a motion, for errors (N, m): nothing."""
+        return cls(levels, tuple(Rest.at(e[:, level.rows]) for level in levels))
+
+    def seen(self, settings: StepSettings, before: Tensor, e: Tensor, J: Tensor) -> Self:
+        """Return this with the curvatures that the last step has shown, see `Rest.seen`."""
+        rests = []
+        for level, rest in zip(self.levels, self.rests, strict=True):
+            rows = level.rows
+            rests.append(rest.seen(settings, before[:, rows], e[:, rows], J[:, rows]))
+        return self._replace(rests=tuple(rests))
+
+    def least(self, e: Tensor) -> Tensor:
+        """Return the least lambda^2 (L, N) of the levels of a step at errors (N, m)."""
+        each = zip(self.levels, self.rests, strict=True)
+        return torch.stack([rest.least(e[:, level.rows]) for level, rest in each])
+
+    def after(self, settings: StepSettings, dq: Tensor, promised: Tensor, e: Tensor) -> Self:
+        """Return this after steps dq (N, n), see `Rest.after`."""
+        rests = []
+        for level, rest in zip(self.levels, self.rests, strict=True):
+            rows = level.rows
+            rests.append(rest.after(settings, dq, promised[:, rows], e[:, rows]))
+        return self._replace(rests=tuple(rests))
+
+
+def at_start(task: Task, e: Tensor) -> Rest | RestOfLevels:
+    """Return what is known at the start of a motion of a task, for errors (N, m): nothing."""
+    return Rest.at(e) if task.n_levels == 1 else RestOfLevels.at(task.levels, e)
 
 
 def _squared(rows: Tensor) -> Tensor:

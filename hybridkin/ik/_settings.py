@@ -312,6 +312,8 @@ class StepSettings(Portable):
         posture = self.posture.numbers
         if n is None:
             raise TypeError("the number of actuators is unknown; give one limit for each")
+        if self.task.n_levels > 1:
+            raise TypeError("a Stack of several levels has no kernel")
         if self.own_limits:
             raise TypeError("`limits` that are functions have no kernel")
         model = plan.stack([model.stored() for model in self.task.steered])

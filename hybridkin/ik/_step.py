@@ -33,6 +33,7 @@ from hybridkin.ik._gram import (
     row_gram,
     solve_rows,
 )
+from hybridkin.ik._levels import up_to_level, uppermost, with_lower_levels
 from hybridkin.ik._rates import stopping
 from hybridkin.ik._settings import StepSettings
 from hybridkin.ik._strict import StepLimits, step_within
@@ -62,7 +63,10 @@ class StepRows(NamedTuple):
 
 
 class Law(NamedTuple):
-    """The settings of steps, and the least lambda^2 (N,) of this period, zero for none."""
+    """The settings of steps, and the least lambda^2 of this period, zero for none.
+
+    That is one number for every row (N,), or for every level and row (L, N).
+    """
 
     settings: StepSettings
     least: Tensor
@@ -146,9 +150,7 @@ def control_step(
     if scene is None:
         scene = settings.clear.scene
     if settings.accelerates:
-        brake = _braking(law, J, e, change)
-        fastest_gain = stopping(torch.ones_like(brake), brake)
-        gain = fastest_gain.clamp_max(gain)[:, None]
+        gain = _gains(law, J, e, change, gain)
         if settings.has_posture:
             fastest = stopping((posture / beta).abs(), change)
             posture = torch.clamp(posture, -fastest, fastest)
@@ -218,7 +220,8 @@ class _Wish(NamedTuple):
         step = self.law.step(self.J, self.v, self.posture, limits)
         pulls = bool(settings.pulls.any())
         if settings.tip_limits.n == 0 and not pulls:
-            step = _escaping(self.law, self.q, self.J, self.v, self.e, step, self.bounds)
+            J, v, e = (uppermost(settings.task, part) for part in (self.J, self.v, self.e))
+            step = _escaping(self.law, self.q, J, v, e, step, self.bounds)
         step = step._replace(promised=apply_rows(self.J, step.dq))
         if pulls:
             step = _arriving(self.law, self.q, self.J, self.allowed, step, self.bounds)
@@ -278,7 +281,36 @@ def limited_step(
     Weights are a change of unit: in u = W^(1/2) q all weights are 1. With `damping_sq`, lambda^2 in
     this unit, singular values are not computed, and sigma_min is NaN. Else lambda^2 is at `least`
     a number; where this is positive, the posture step is at most half as long as that of the task.
+
+    Of a task of several levels sigma_min and damping are those of the first level. `least` may be a
+    number for every level (L, N); `damping_sq` (L, N) is the least lambda^2, too.
     """
+    if settings.task.n_levels == 1:
+        return _one_level(settings, settings.task.n_free, J, v, posture, limits, damping_sq, least)
+    first = settings.task.levels[0]
+    n_levels = settings.task.n_levels
+    least = least + v.new_zeros(n_levels, len(v))
+    if damping_sq is not None:
+        least = least.maximum(damping_sq)
+    still = torch.zeros_like(posture)
+    step = _one_level(
+        settings, first.n_free, J[:, first.rows], v[:, first.rows], still, limits, None, least[0]
+    )
+    dq = with_lower_levels(settings, J, v, posture, limits, step.dq, least)
+    return step._replace(dq=dq, saturated=limits.held(dq), promised=v)
+
+
+def _one_level(
+    settings: StepSettings,
+    n_free: int,
+    J: Tensor,
+    v: Tensor,
+    posture: Tensor,
+    limits: StepLimits,
+    damping_sq: Tensor | None,
+    least: Tensor | float,
+) -> StepRows:
+    """Return the step for one level, as `limited_step`; `n_free` is that of its rows."""
     unit = settings.unit(v)
     J = J * unit
     box = limits.in_unit(unit)
@@ -290,7 +322,7 @@ def limited_step(
         mu = solve_rows(J, v, damping_sq)
         sigma_min = torch.full_like(damping_sq, math.nan)
     else:
-        gram = row_gram(J, settings.task.n_free)
+        gram = row_gram(J, n_free)
         sigma_min = gram.sigma_min
         if isinstance(settings.damping, str):
             damping_sq = adaptive_damping(gram)
@@ -355,6 +387,23 @@ def _norm(rows: Tensor) -> Tensor:
     return rows.norm(dim=-1, keepdim=True)
 
 
+def _gains(law: Law, J: Tensor, e: Tensor, change: Tensor, most: float) -> Tensor:
+    """Return the gains, at most `most`, with which errors e (N, m) can be braked, (N, m) or (N, 1).
+
+    A level is not slowed down by those after it.
+    """
+    task = law.settings.task
+    if task.n_levels == 1:
+        brake = _braking(law, J, e, change)
+        return stopping(torch.ones_like(brake), brake).clamp_max(most)[:, None]
+    gains = torch.empty_like(e)
+    for k, level in enumerate(task.levels):
+        brake = _braking(law, up_to_level(task, J, k), up_to_level(task, e, k), change)
+        gain = stopping(torch.ones_like(brake), brake).clamp_max(most)
+        gains[:, level.rows] = gain[:, None]
+    return gains
+
+
 def _braking(law: Law, J: Tensor, way: Tensor, change: Tensor) -> Tensor:
     """Return the largest change of the tip's motion per period, in multiples of `way` (N,)."""
     free = torch.full_like(J[:, 0], math.inf)
@@ -373,7 +422,7 @@ def _escaping(
 ) -> StepRows:
     """Return steps that leave singular configurations in which they promise almost nothing of v."""
     promised = apply_rows(J, step.dq).norm(dim=-1)
-    damped = step.damping.square() > 1.001 * law.least
+    damped = step.damping.square() > 1.001 * torch.atleast_2d(law.least)[0]
     singular = damped | ~(step.sigma_min > 0.0)
     stuck = singular & (promised <= IK_STUCK * v.norm(dim=-1)) & (_norm(e)[:, 0] > 0.0)
     rows = stuck.nonzero()[:, 0]
@@ -434,7 +483,8 @@ class _Arrival(NamedTuple):
         settings = self.law.settings
         tip, J = settings.evaluate(self.q + dq)
         moved = settings.task.difference(self.x, tip)
-        return _End(dq, _only_taut(settings, J), motion - moved)
+        missing = uppermost(settings.task, motion - moved)
+        return _End(dq, _only_taut(settings, J), missing)
 
     def approach(self, dq: Tensor, motion: Tensor, close: Tensor) -> _End:
         """Return the best end of Newton's method from steps dq, within the bounds."""
@@ -468,15 +518,17 @@ def _arriving(
 
     Their Jacobian jumps where a tendon gets slack or taut, so each end is evaluated by the model.
     Newton's method corrects it within the bounds. Where the result is less than half of the motion
-    v, slack tendons are pulled in, as far as the tip gets nearer to v or not away.
+    v, slack tendons are pulled in, as far as the tip gets nearer to v or not away. Of several
+    levels the first one decides.
     """
     settings = law.settings
+    v = uppermost(settings.task, v)
+    promised = uppermost(settings.task, step.promised)
     x, _ = settings.evaluate(q)
     arrival = _Arrival(law, q, x, bounds)
     eps = torch.finfo(q.dtype).eps
     smallest_step = IK_SLIP * _norm(step.dq) + 32.0 * eps * _norm(q)
     slip = _norm(J.flatten(1)) * smallest_step
-    promised = step.promised
     close = torch.maximum(0.5 * _norm(promised), slip)
     end = arrival.approach(step.dq, promised, close)
     end = end._replace(missing=v - promised + end.missing)

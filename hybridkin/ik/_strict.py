@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from hybridkin._core.kernel_numbers import IK_CLOSE
-from hybridkin.ik._box import BoxProblem, strict_box_step
-from hybridkin.ik._calm import calmed
+from hybridkin.ik._box import BoxProblem, proximal_box_step
 from hybridkin.ik._gram import apply_rows
 from hybridkin.ik._nearest import Polyhedron, nearest
+from hybridkin.ik._stages import in_two_stages
 
 
 class StepLimits(NamedTuple):
@@ -79,7 +79,7 @@ class StepLimits(NamedTuple):
         """Return the limits of dq / unit."""
         return StepLimits(self.lower / unit, self.upper / unit, self.A * unit, self.b)
 
-    def take(self, rows: Tensor) -> StepLimits:
+    def take(self, rows: Tensor | slice) -> StepLimits:
         """Return the limits of some rows."""
         return StepLimits(*(a[rows] for a in self))
 
@@ -87,25 +87,9 @@ class StepLimits(NamedTuple):
 def step_within(
     J: Tensor, v: Tensor, z: Tensor, damping_sq: Tensor, limits: StepLimits, calm: Tensor
 ) -> Tensor:
-    """Return steps (N, n) within limits, as `strict_step`; the box alone has a faster solver."""
-    problem = BoxProblem(J, v, z, damping_sq, limits.lower, limits.upper)
-    dq = strict_box_step(problem, calm)
-    rows = limits.broken(dq).nonzero()[:, 0]
-    if rows.numel() == 0:
-        return dq
-    damping = damping_sq[rows].sqrt()
-    inside = strict_step(J[rows], v[rows], z[rows], damping, limits.take(rows), calm[rows])
-    return dq.index_put((rows,), inside)
+    """Return the steps (N, n) of `in_two_stages` within limits.
 
-
-def strict_step(
-    J: Tensor, v: Tensor, z: Tensor, damping: Tensor, limits: StepLimits, calm: Tensor
-) -> Tensor:
-    """Return steps within limits whose task part does not depend on preferred steps z, eq. (19).
-
-    Without damping, z only chooses among the steps that reach v, or come nearest to it. Damping
-    would be a compromise between v and z. Therefore the damped task is first solved for z = 0; z
-    then chooses among the steps with the same motion.
+    The box alone has a faster solver.
 
     Parameters
     ----------
@@ -115,41 +99,35 @@ def strict_step(
         Desired task steps J dq.
     z : Tensor of shape (N, n)
         Preferred steps.
-    damping : Tensor of shape (N,)
-        lambda, in the unit of the singular values of J.
+    damping_sq : Tensor of shape (N,)
+        lambda^2, in the unit of J J^T.
     limits : StepLimits
         The limits of the steps.
     calm : bool Tensor of shape (N,)
         Where z is at most half as long as the step of the task.
-
-    Returns
-    -------
-    Tensor of shape (N, n)
-        Steps within the limits.
     """
+    problem = BoxProblem(J, v, z, damping_sq, limits.lower, limits.upper)
+    dq = in_two_stages(problem, calm, lambda part, rows, centre: proximal_box_step(part, centre))
+    over = limits.broken(dq).nonzero()[:, 0]
+    if over.numel() == 0:
+        return dq
+    of_over = limits.take(over)
+
+    def within_all(part: BoxProblem, rows: Tensor | slice, centre: Tensor) -> tuple[Tensor, Tensor]:
+        damping = part.damping_sq.sqrt()
+        least = _least_damping(part.J)
+        return damped_step(part.J, part.v, part.z, damping, of_over.take(rows), least, centre)
+
+    inside = in_two_stages(problem.take(over), calm[over], within_all)
+    return dq.index_put((over,), inside)
+
+
+def _least_damping(J: Tensor) -> Tensor:
+    """Return the least lambda (N,) of `damped_step` for Jacobians (N, m, n)."""
     size = torch.linalg.matrix_norm(J @ J.mT).sqrt()  # about sigma_max
     relative = max(1e-3, torch.finfo(J.dtype).eps ** 0.25)
     # If J is zero it only has to be positive.
-    least = torch.where(size > 0.0, relative * size, 1.0)
-    centre = torch.zeros_like(v)
-    rows = ((damping > 0.0) & (z != 0.0).any(-1)).nonzero()[:, 0]
-    if rows.numel() > 0:
-        still = torch.zeros_like(z[rows])
-        task, mu = damped_step(
-            J[rows],
-            v[rows],
-            still,
-            damping[rows],
-            limits.take(rows),
-            least[rows],
-            centre[rows],
-        )
-        v = v.index_put((rows,), apply_rows(J[rows], task))
-        z = z.index_put((rows,), calmed(z[rows], task, calm[rows]))
-        damping = damping.index_fill(0, rows, 0.0)
-        # They keep the active limits, also where v is out of reach.
-        centre = centre.index_put((rows,), mu)
-    return damped_step(J, v, z, damping, limits, least, centre)[0]
+    return torch.where(size > 0.0, relative * size, 1.0)
 
 
 def damped_step(
@@ -185,5 +163,5 @@ def damped_step(
         limits.at_rest() / length,
     )
     start = torch.cat([z, torch.zeros_like(v)], dim=-1)
-    x, multipliers = nearest(start, within, excess, centre)
+    x, multipliers = nearest(start, within, excess[:, None], centre)
     return limits.snapped(x[:, :n]), multipliers

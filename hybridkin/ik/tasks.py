@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, TypeAlias, TypeVar, cast
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias, TypeVar, cast
 
+import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
@@ -37,6 +38,13 @@ Tolerance: TypeAlias = float | tuple[float, ...]
 _Rows = TypeVar("_Rows", Tensor, NDArray)
 
 
+class Level(NamedTuple):
+    """The rows of a task's error with the same priority."""
+
+    rows: tuple[int, ...]
+    n_free: int  # directions of these rows that no motion changes
+
+
 class Task:
     """A controlled quantity: x(q), its Jacobian, and the error of x to a target in m rows.
 
@@ -62,6 +70,8 @@ class Task:
         What a target is.
     n_free : int
         Number of directions of the m rows that the task leaves free: no motion changes them.
+    n_levels : int
+        Number of levels of priority, see `Stack`.
     """
 
     shape: tuple[int, ...]
@@ -74,6 +84,7 @@ class Task:
     of_poses = False
     about_target = "desired x now [m];"
     n_free = 0
+    n_levels = 1
 
     @property
     def hysteresis(self) -> Actuation:
@@ -164,6 +175,15 @@ class Task:
     def stacked(self) -> tuple[Task, ...]:
         """The tasks that this one consists of: itself, or those of a `Stack`."""
         return (self,)
+
+    @property
+    def levels(self) -> tuple[Level, ...]:
+        """The levels of priority, the first one first; together they have all rows."""
+        return (Level((*range(sum(self.parts)),), self.n_free),)
+
+    def in_one_level(self, ratio: float) -> Task:
+        """Return the task in one level, with weights that fall by a ratio from level to level."""
+        return self
 
     def misses(self, x_target: Tensor, largest: Tensor) -> Tensor:
         """Return lower bounds (N,) of errors [m], of all q with ``|q| <= largest``; 0: unknown."""
@@ -608,8 +628,12 @@ class Stack(Task):
     the targets of the tasks, and `split` takes an x apart. Tolerances are those of the parts of all
     tasks.
 
-    If the tasks cannot all be reached, the weights decide. Tasks of positions and points run in the
-    compiled core; with poses or axes torch computes the stack.
+    If the tasks cannot all be reached, their levels decide: a task moves the robot only in ways
+    that do not move the tasks of the levels before it, within all limits. Among tasks of one level
+    the weights decide. A target is reached if those of all levels are.
+
+    Tasks of positions and points run in the compiled core; with poses or axes, or with several
+    levels, torch computes the stack.
 
     Parameters
     ----------
@@ -618,6 +642,8 @@ class Stack(Task):
         first one.
     weights : sequence of float, optional
         Factor on the errors of every task. Default: 1 each.
+    levels : sequence of int, optional
+        Level of every task: 0 comes first, then 1, and so on. Default: 0 each.
 
     Examples
     --------
@@ -636,9 +662,23 @@ class Stack(Task):
     >>> tip, axis = task.split(solution.x)
     >>> solution.converged, bool(axis[5] > 0.9999)
     (tensor(True), True)
+
+    The tip at a point, and the end of the second segment as near to another one as that allows:
+
+    >>> task = Stack([PositionTask(trunk), PositionTask(middle)], levels=[0, 1])
+    >>> target = task.join([0.05, 0.0, 0.8], [0.2, 0.0, 0.5])
+    >>> solution = InverseKinematics(task, q_min=0.1, q_max=0.4).solve(target)
+    >>> tip, _ = task.split(solution.x)
+    >>> bool((tip - torch.tensor([0.05, 0.0, 0.8])).norm() < 1e-4)
+    True
     """
 
-    def __init__(self, tasks: Sequence[Task], weights: Sequence[float] | None = None) -> None:
+    def __init__(
+        self,
+        tasks: Sequence[Task],
+        weights: Sequence[float] | None = None,
+        levels: Sequence[int] | None = None,
+    ) -> None:
         parts = tuple(tasks)
         if len(parts) == 0 or not all(isinstance(task, Task) for task in parts):
             names = [type(task).__name__ for task in parts]
@@ -654,6 +694,7 @@ class Stack(Task):
                 "`weights` must be positive, one for every task, got "
                 f"{self.weights} for {len(parts)} tasks."
             )
+        self.priorities = _priorities(levels, len(parts))
         sizes = {task.n_actuators for task in parts if task.n_actuators}
         if len(sizes) > 1:
             raise ValueError(f"`tasks` must have the same actuators, got {sorted(sizes)} of them.")
@@ -672,6 +713,7 @@ class Stack(Task):
         self.units = tuple(units)
         self.models = tuple(model for task in tasks for model in task.models)
         self.n_free = sum(task.n_free for task in tasks)
+        self.n_levels = 1 + max(self.priorities)
         self.estimator = tasks[0].estimator
         self.module = tasks[0].module
 
@@ -679,6 +721,31 @@ class Stack(Task):
     def angular(self) -> tuple[bool, ...]:
         """Whether the parts of the error are angles, one for each part of the tasks."""
         return tuple(turns for task in self._tasks for turns in task.angular)
+
+    @property
+    def levels(self) -> tuple[Level, ...]:
+        """The levels of priority, the first one first; together they have all rows."""
+        levels = []
+        for level in range(self.n_levels):
+            rows = []
+            n_free = 0
+            start = 0
+            for task, size, priority in zip(self._tasks, self.rows, self.priorities, strict=True):
+                if priority == level:
+                    rows += range(start, start + size)
+                    n_free += task.n_free
+                start += size
+            levels.append(Level(tuple(rows), n_free))
+        return tuple(levels)
+
+    def in_one_level(self, ratio: float) -> Stack:
+        """Return the stack in one level, with weights that fall by a ratio from level to level."""
+        stack = copy.copy(self)
+        weighted = zip(self.weights, self.priorities, strict=True)
+        stack.weights = tuple(weight * ratio**priority for weight, priority in weighted)
+        stack.priorities = (0,) * len(self.priorities)
+        stack._take(self._tasks)
+        return stack
 
     @property
     def stacked(self) -> tuple[Task, ...]:
@@ -810,6 +877,20 @@ def as_task(model: object) -> Task:
             "orientation tasks.PoseTask, for anything else a subclass of tasks.Task."
         )
     return model if isinstance(model, Task) else PositionTask(model)
+
+
+def _priorities(levels: Sequence[int] | None, count: int) -> tuple[int, ...]:
+    """Return the levels of tasks, checked; 0 for all without them."""
+    if levels is None:
+        return (0,) * count
+    need = f"`levels` must be whole numbers 0, 1, ... without a gap, one for each of {count} tasks"
+    if isinstance(levels, str) or not isinstance(levels, Iterable):
+        raise TypeError(f"{need}, got {levels!r:.80}.")
+    priorities = tuple(levels)
+    good = all(isinstance(a, int | np.integer) for a in priorities) and len(priorities) == count
+    if not good or {*priorities} != {*range(1 + max(priorities))}:
+        raise ValueError(f"{need}, got {priorities}.")
+    return tuple(int(level) for level in priorities)
 
 
 def _length(value: float, name: str) -> float:

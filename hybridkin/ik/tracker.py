@@ -21,7 +21,7 @@ from hybridkin.ik._compiled import Follower, Tick, core_of, why_torch
 from hybridkin.ik._feedback import MOST_PERIODS, Feedback, Readings
 from hybridkin.ik._gram import row_gram
 from hybridkin.ik._hysteresis import lead_of
-from hybridkin.ik._rest import Rest
+from hybridkin.ik._rest import at_start
 from hybridkin.ik._settings import Array, StepSettings, require
 from hybridkin.ik._step import StepRows, control_step
 from hybridkin.ik.obstacles import Obstacle, as_numbers, as_scene
@@ -489,7 +489,7 @@ class _InTorch:
         if dq is None:
             dq = torch.zeros_like(q)
         step = StepRows(dq, unknown[:, 0], undamped, free, unknown)
-        self._rest = Rest.at(unknown)
+        self._rest = at_start(self.task, unknown)
         self._period = self._settings.dt  # of the last step
         self._last = Tick(q, x, J, unknown, step)
 

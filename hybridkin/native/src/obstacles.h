@@ -314,7 +314,7 @@ static int ik_leads_too_far(const ik_settings *ik, const real *q, const real *dq
 }
 
 /* Tighten the limits of pairs of which a step dq on its way took too much, and return which part of
-   it to try. What the curvature of the model took is to be at most IK_STRAY of the way; it shrinks
+   it to try. What the curvature of the model took is to be at most IK_BENT_WAY of the way; it shrinks
    with the square of the step. */
 static inline real ik_tighten(const ik_settings *ik, const real *dq, const real *way, real seconds,
                               ik_near_t *near) {
@@ -326,7 +326,7 @@ static inline real ik_tighten(const ik_settings *ik, const real *dq, const real 
         real bent = near->taken[p];
         ik_gap_row(ik, near, p, row);
         for (int j = 0; j < n; j++) bent -= row[j] * way[j];
-        const real most = IK_STRAY * (ik_norm(n, row) * size);
+        const real most = IK_BENT_WAY * (ik_norm(n, row) * size);
         if (bent > R(0.0) && most / bent < part) part = most / bent;
     }
     for (int p = 0; p < near->n_pairs; p++) {
