@@ -18,6 +18,7 @@ from torch import Tensor
 from hybridkin._core.arrays import as_array, number, whole
 from hybridkin._core.kernel_numbers import (
     IK_BENT_WAY,
+    IK_BRAKED,
     IK_INSIDE_OBSTACLE,
     IK_NEARER,
     IK_OBSTACLE,
@@ -28,7 +29,7 @@ from hybridkin._core.plan import Plan
 from hybridkin._core.portable import Portable
 from hybridkin.ik._gram import apply_rows
 from hybridkin.ik._nearest import Polyhedron, nearest
-from hybridkin.ik._rates import stopping
+from hybridkin.ik._rates import stopping, way_to_stop
 from hybridkin.ik.obstacles import distances
 from hybridkin.ik.tasks import Task
 
@@ -268,6 +269,26 @@ class Near(NamedTuple):
         moved = self.clear.points(self.q + way) - self.x
         along = self.normal * self.clear.relative(moved, self.n_obstacles)
         return -along.sum(-1)
+
+    def farthest(self, dq: Tensor, change: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the first ways (N, n) after steps dq that take too much, and what they take.
+
+        The way to a stop comes first. Where gaps are not far larger than this way, it is bent: then
+        follow the step alone, and parts of the way to a stop.
+        """
+        way = dq + way_to_stop(dq, change)
+        taken = self.taken(way)
+        longest = apply_rows(self.A.abs(), way.abs())
+        watched = ~(2.0 * longest < self.gap).all(-1)
+        others = [dq + way_to_stop(dq, change, 2.0**k) for k in range(IK_BRAKED + 1)]
+        for other in (dq, *others):
+            goes_on = watched & ~self.is_broken(taken).any(-1) & (other != way).any(-1)
+            if not goes_on.any():
+                continue
+            goes_on = goes_on[:, None]
+            taken = torch.where(goes_on, self.taken(other), taken)
+            way = torch.where(goes_on, other, way)
+        return way, taken
 
     def is_broken(self, taken: Tensor) -> Tensor:
         """Return whether ways take more of gaps than there is, by more than rounding, (N, p)."""

@@ -64,13 +64,13 @@ def stopping(way: Tensor, change: Tensor) -> Tensor:
     return torch.where((way > 0.0) & torch.isfinite(way), stops, way)
 
 
-def way_to_stop(dq: Tensor, change: Tensor) -> Tensor:
-    """Return what follows steps dq (N, n) when every actuator stops, (N, n).
+def way_to_stop(dq: Tensor, change: Tensor, periods: float = math.inf) -> Tensor:
+    """Return what follows steps dq (N, n) when every actuator stops, (N, n), or in some periods.
 
     Every step is then shorter by `change`, until it is zero; infinite: nothing follows.
     """
     size = dq.abs()
-    n_steps = torch.floor(size / change)
+    n_steps = torch.floor(size / change).clamp_max(periods)
     n_steps = torch.where(torch.isfinite(n_steps), n_steps, 0.0)
     less = 0.5 * n_steps * (n_steps + 1.0) * change
     way = n_steps * size - torch.where(n_steps > 0.0, less, 0.0)

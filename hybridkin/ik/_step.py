@@ -34,7 +34,7 @@ from hybridkin.ik._gram import (
     solve_rows,
 )
 from hybridkin.ik._levels import up_to_level, uppermost, with_lower_levels
-from hybridkin.ik._rates import stopping, way_to_stop
+from hybridkin.ik._rates import stopping
 from hybridkin.ik._settings import StepSettings
 from hybridkin.ik._strict import StepLimits, step_within
 from hybridkin.ik.limits import Bounds, with_limit
@@ -241,8 +241,7 @@ def _clear_step(wish: _Wish, limits: StepLimits, change: Tensor, scene: Tensor) 
     step = wish.step(limits.with_rows(*near.rows(b)))
     blocked = near.is_active(step.dq)
     for _ in range(IK_AROUND):
-        way = step.dq + way_to_stop(step.dq, change)
-        taken = near.taken(way)
+        way, taken = near.farthest(step.dq, change)
         broken = near.is_broken(taken).any(-1)
         if not broken.any():
             return step._replace(blocked=blocked)
@@ -256,7 +255,7 @@ def _clear_step(wish: _Wish, limits: StepLimits, change: Tensor, scene: Tensor) 
     part = torch.ones_like(wanted[:, :1])
     for halving in range(IK_SHORTER + 1):
         dq = torch.where(part < 1.0, brake + part * (wanted - brake), wanted)
-        taken = near.taken(dq + way_to_stop(dq, change))
+        _, taken = near.farthest(dq, change)
         broken = near.is_broken(taken).any(-1, keepdim=True)
         if not broken.any():
             break

@@ -232,9 +232,11 @@ static inline int ik_meets(const ik_settings *ik, const ik_rows_t *rows, int fir
     return 0;
 }
 
-/* The way of an actuator after a step, until it stands: every step is shorter by `change`. */
-static inline real ik_way_to_stop(real step, real change) {
-    const real size = ik_abs(step), count = HK_MATH(floor)(size / change);
+/* The way of an actuator after a step, until it stands or in some periods: every step is shorter by
+   `change`. */
+static inline real ik_way_to_stop(real step, real change, real periods) {
+    const real size = ik_abs(step), whole = HK_MATH(floor)(size / change);
+    const real count = whole < periods ? whole : periods;
     if (!(count >= R(1.0) && count < R(INFINITY))) return R(0.0);
     const real way = count * size - R(0.5) * count * (count + R(1.0)) * change;
     return step < R(0.0) ? -way : way;
@@ -246,32 +248,21 @@ static inline int ik_is_broken(const ik_near_t *near, int pair) {
     return !(near->taken[pair] <= left + near->rounding);
 }
 
-/* The way (n) of a step and of the hardest braking after it. */
-static inline void ik_way_after(const ik_settings *ik, const real *dq, real seconds, real *way) {
-    for (int j = 0; j < ik->n; j++) {
-        way[j] = dq[j];
-        if (ik->flags & IK_ACCELERATES)
-            way[j] += ik_way_to_stop(dq[j], ik->accel[j] * seconds * seconds);
-    }
-}
-
-/* Evaluate what a step, with the way to a stop after it, really takes of all gaps, and return whether
-   that is too much of any. */
-static HK_NOINLINE int ik_check_gaps(const ik_settings *ik, const real *q, const real *dq,
-                                     real seconds, ik_near_t *near) {
+/* Evaluate what a way from q really takes of all gaps, and return whether that is too much of any. */
+static HK_NOINLINE int ik_take_gaps(const ik_settings *ik, const real *q, const real *way,
+                                    ik_near_t *near) {
     const int n_points = near->n_points, n_meeting = ik->body[IK_N_MEETING];
     const int32_t *meeting = ik->body + IK_POINTS + n_points;
     real at[HK_MAX_N], *taken = near->taken;
     const real *normal = near->normal;
     int any = 0;
-    ik_way_after(ik, dq, seconds, at);
-    for (int j = 0; j < ik->n; j++) at[j] += q[j];
+    for (int j = 0; j < ik->n; j++) at[j] = q[j] + way[j];
     ik_points(ik, 0, at, near->moved, NULL);
     for (int i = 0; i < 3 * n_points; i++) near->moved[i] -= near->x[i];
     for (int i = 0; i < n_points; i++)
         for (int k = 0; k < ik->n_obstacles; k++, normal += 3) {
-            const real *way = near->moved + 3 * i;
-            *taken++ = -(normal[0] * way[0] + normal[1] * way[1] + normal[2] * way[2]);
+            const real *moved = near->moved + 3 * i;
+            *taken++ = -(normal[0] * moved[0] + normal[1] * moved[1] + normal[2] * moved[2]);
         }
     for (int k = 0; k < n_meeting; k++, normal += 3) {
         const real *one = near->moved + 3 * meeting[k];
@@ -284,22 +275,59 @@ static HK_NOINLINE int ik_check_gaps(const ik_settings *ik, const real *q, const
     return any;
 }
 
-/* Tighten the limits of pairs of which a step took too much, and return which part of it to try. What
-   the curvature of the model took is to be at most IK_BENT_WAY of the way; it shrinks with the square of
-   the step. */
-static HK_NOINLINE real ik_tighten(const ik_settings *ik, const real *dq, real seconds,
-                                   ik_near_t *near) {
+/* Whether the gap of a pair is not far larger than a way (n). */
+static HK_NOINLINE int ik_passes_near(const ik_settings *ik, const real *way,
+                                      const ik_near_t *near) {
+    real row[HK_MAX_N];
+    for (int p = 0; p < near->n_pairs; p++) {
+        real longest = R(0.0);
+        ik_gap_row(ik, near, p, row);
+        for (int j = 0; j < ik->n; j++) longest += ik_abs(row[j]) * ik_abs(way[j]);
+        if (!(R(2.0) * longest < near->gap[p])) return 1;
+    }
+    return 0;
+}
+
+/* Whether a step leads too far, on the way (n) to a stop. Where this passes near something it is bent:
+   then also the step alone, and parts of the way. `way` is the first one that does. */
+static int ik_leads_too_far(const ik_settings *ik, const real *q, const real *dq, real seconds,
+                            ik_near_t *near, real *way) {
+    const int stops = ik->flags & IK_ACCELERATES;
+    real most = R(0.0);
+    for (int j = 0; j < ik->n; j++) {
+        const real change = ik->accel[j] * seconds * seconds;
+        way[j] = dq[j];
+        if (!stops) continue;
+        way[j] += ik_way_to_stop(dq[j], change, R(INFINITY));
+        most = hk_larger(HK_MATH(floor)(ik_abs(dq[j]) / change), most);
+    }
+    if (ik_take_gaps(ik, q, way, near)) return 1;
+    if (!(most > R(0.0) && ik_passes_near(ik, way, near))) return 0;
+    real periods = R(0.0);
+    for (int k = 0; periods < most && k <= IK_BRAKED + 1; k++) {
+        for (int j = 0; j < ik->n; j++)
+            way[j] = dq[j] + ik_way_to_stop(dq[j], ik->accel[j] * seconds * seconds, periods);
+        if (ik_take_gaps(ik, q, way, near)) return 1;
+        periods = periods > R(0.0) ? R(2.0) * periods : R(1.0);
+    }
+    return 0;
+}
+
+/* Tighten the limits of pairs of which a step dq on its way took too much, and return which part of
+   it to try. What the curvature of the model took is to be at most IK_BENT_WAY of the way; it shrinks
+   with the square of the step. */
+static inline real ik_tighten(const ik_settings *ik, const real *dq, const real *way, real seconds,
+                              ik_near_t *near) {
     const int n = ik->n;
-    real row[HK_MAX_N], way[HK_MAX_N], part = R(1.0);
-    ik_way_after(ik, dq, seconds, way);
-    const real length = ik_norm(n, way);
+    const real size = ik_norm(n, way);
+    real row[HK_MAX_N], part = R(1.0);
     for (int p = 0; p < near->n_pairs; p++) {
         if (!ik_is_broken(near, p)) continue;
         real bent = near->taken[p];
         ik_gap_row(ik, near, p, row);
         for (int j = 0; j < n; j++) bent -= row[j] * way[j];
-        const real straight = bent > R(0.0) ? IK_BENT_WAY * (ik_norm(n, row) * length) / bent : R(1.0);
-        part = straight < part ? straight : part;
+        const real most = IK_BENT_WAY * (ik_norm(n, row) * size);
+        if (bent > R(0.0) && most / bent < part) part = most / bent;
     }
     for (int p = 0; p < near->n_pairs; p++) {
         if (!ik_is_broken(near, p)) continue;
@@ -314,28 +342,29 @@ static HK_NOINLINE real ik_tighten(const ik_settings *ik, const real *dq, real s
 }
 
 /* The step after which the body is clear of obstacles, and can stop before them. Where the model bends
-   its way into one, rows are tightened by what it took too much, for a shorter way if that is much;
-   where that does not help, the step is shortened towards the hardest braking. `rows` holds those of other limits. */
+   its way into one, rows are tightened by what it took too much, and a part of the wish is tried;
+   where that does not help, the step is shortened towards the hardest braking. `rows` holds those of
+   other limits. */
 static HK_NOINLINE void ik_step_clear(const ik_settings *ik, const ik_wish_t *wish, const real *J,
                                       real seconds, ik_rows_t *rows, real *A, real *b,
                                       ik_step_t *s) {
-    const int n = ik->n, m = ik->m, first = rows->k;
-    real wanted[HK_MAX_N], v[IK_ROWS], allowed[IK_ROWS], part = R(1.0);
-    ik_wish_t shorter = *wish;
-    shorter.v = v, shorter.allowed = allowed;
-    for (int i = 0; i < m; i++) v[i] = wish->v[i], allowed[i] = wish->allowed[i];
+    const int n = ik->n, first = rows->k;
+    real wanted[HK_MAX_N], way[HK_MAX_N], v[IK_ROWS], allowed[IK_ROWS], part = R(1.0);
+    const ik_wish_t tried = {wish->q, wish->x, wish->J, wish->e, v, allowed};
     ik_near_t near = ik_near_of(ik);
+    for (int i = 0; i < ik->m; i++) v[i] = wish->v[i], allowed[i] = wish->allowed[i];
     ik_find_gaps(ik, wish->q, wish->x, J, &near);
     ik_reaches(ik, s, &near);
     for (int round = 0; round <= IK_AROUND; round++) {
         rows->k = first + ik_gap_rows(ik, &near, seconds, A + n * first, b + first);
-        ik_propose(ik, &shorter, rows, s);
+        ik_propose(ik, &tried, rows, s);
         if (round == 0) s->blocked = ik_meets(ik, rows, first, s->dq);
-        if (!ik_check_gaps(ik, wish->q, s->dq, seconds, &near)) return;
+        if (!ik_leads_too_far(ik, wish->q, s->dq, seconds, &near, way)) return;
         s->blocked = 1;
-        const real less = ik_tighten(ik, s->dq, seconds, &near);
-        for (int i = 0; i < m; i++) v[i] *= less, allowed[i] *= less;
-        for (int j = 0; j < n; j++) s->posture[j] *= less;
+        if (round == IK_AROUND) break;
+        const real shorter = ik_tighten(ik, s->dq, way, seconds, &near);
+        for (int i = 0; i < ik->m; i++) v[i] *= shorter, allowed[i] *= shorter;
+        for (int j = 0; j < n; j++) s->posture[j] *= shorter;
     }
     for (int j = 0; j < n; j++) wanted[j] = s->dq[j];
     for (int halving = 0; halving <= IK_SHORTER; halving++) {
@@ -345,7 +374,7 @@ static HK_NOINLINE void ik_step_clear(const ik_settings *ik, const ik_wish_t *wi
             s->dq[j] = brake + part * (wanted[j] - brake);
             s->held[j] = (unsigned char)((s->dq[j] <= s->lower[j]) | (s->dq[j] >= s->upper[j]));
         }
-        if (part > R(0.0) && !ik_check_gaps(ik, wish->q, s->dq, seconds, &near)) break;
+        if (part > R(0.0) && !ik_leads_too_far(ik, wish->q, s->dq, seconds, &near, way)) break;
     }
     ik_motion(ik, wish->J, s->dq, s->promised);
 }
