@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -9,9 +10,10 @@ import torch
 from torch import Tensor
 
 from hybridkin._core.actuation import Actuation
-from hybridkin._core.kernel_numbers import IK_AT_REST_SHARE
+from hybridkin._core.kernel_numbers import IK_AT_REST_SHARE, IK_BRAKED, IK_SHORTER
+from hybridkin.ik._clear import Near
 from hybridkin.ik._gram import apply_rows
-from hybridkin.ik._rates import stopping
+from hybridkin.ik._rates import stopping, way_to_stop
 from hybridkin.ik._settings import StepSettings
 from hybridkin.ik._step import StepRows
 from hybridkin.ik.limits import Bounds
@@ -51,7 +53,12 @@ class Direct:
         return self.command
 
     def step(
-        self, control: Callable[..., StepRows], J: Tensor, seconds: float, last: Tensor
+        self,
+        control: Callable[..., StepRows],
+        J: Tensor,
+        seconds: float,
+        last: Tensor,
+        scene: Tensor,
     ) -> StepRows:
         """Send the next command, and return its step; see `Lead.step`."""
         step = control()
@@ -99,6 +106,7 @@ class Lead:
         J: Tensor,
         seconds: float,
         last: Tensor,
+        scene: Tensor,
     ) -> StepRows:
         """Send the next command, and return its step.
 
@@ -116,6 +124,8 @@ class Lead:
             Time until the next command [s].
         last : Tensor of shape (1, n)
             The last step of the command, scaled to this period.
+        scene : Tensor of shape (K, IK_OBSTACLE)
+            Where the obstacles are.
         """
         settings = self._settings
         command = self.command
@@ -136,6 +146,8 @@ class Lead:
             goal = torch.where(down | up, wanted, goal)
         known = torch.isfinite(step.sigma_min)[:, None]
         goal = tick.clip(torch.where(known, goal, command))
+        if settings.clear and known.all():
+            goal = self._kept_clear(goal, tick, seconds, scene)
         wished = self.effective + step.dq
         self.command = goal
         self.effective, self.state = self._hysteresis.apply(goal, self.state, seconds)
@@ -152,6 +164,34 @@ class Lead:
         upper = torch.where(limited & (way > 0.0), end, tick.upper)
         lower = torch.where(limited & (way < 0.0), end, tick.lower)
         return Bounds(lower, upper)
+
+    def _kept_clear(self, goal: Tensor, tick: Bounds, seconds: float, scene: Tensor) -> Tensor:
+        """Return commands after which the body is clear, and can stop before obstacles.
+
+        A command that crosses a backlash has a speed that its actuator does not have yet. So the
+        commands are looked at, too, and shortened towards the hardest braking.
+        """
+        change = self._settings.change(goal, seconds).expand_as(goal)
+        near = self._settings.clear.near(self.effective, change, scene)
+        brake = tick.clip(self.command)
+        wanted = goal
+        part = 1.0
+        for _ in range(IK_SHORTER):
+            if not self._leads_into(near, goal, change, seconds):
+                return goal
+            part *= 0.5
+            goal = brake + part * (wanted - brake)
+        return brake if self._leads_into(near, goal, change, seconds) else goal
+
+    def _leads_into(self, near: Near, goal: Tensor, change: Tensor, seconds: float) -> bool:
+        """Return whether commands, or those while they stop, lead into an obstacle."""
+        step = goal - self.command
+        for periods in (math.inf, 0.0, *(2.0**k for k in range(IK_BRAKED + 1))):
+            command = goal + way_to_stop(step, change, periods)
+            way = self._after(command, seconds) - self.effective
+            if near.is_broken(near.taken(way)).any():
+                return True
+        return False
 
     def _reached(self, commands: Bounds, seconds: float) -> Bounds:
         """Return the bounds of a step of the actuators after commands in bounds (1, n).

@@ -543,7 +543,7 @@ class _InTorch:
             least=rest.least(used),
             scene=self.scene,
         )
-        step = self._lead.step(control, J, seconds, last)
+        step = self._lead.step(control, J, seconds, last, self.scene)
         readings.passed(seconds)
         moved = self._lead.effective - effective
         self._rest = rest.after(settings, moved, step.promised, used)

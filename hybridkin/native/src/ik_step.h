@@ -859,6 +859,52 @@ static inline void ik_command(const ik_settings *ik, const ik_state *now, real s
     }
 }
 
+#if HK_OBSTACLES
+/* Whether commands (n), or those while they stop, lead into an obstacle. */
+static int ik_commands_lead_in(const ik_settings *ik, const ik_state *now, real seconds,
+                               const real *goal, ik_near_t *near) {
+    const int n = ik->n, stops = ik->flags & IK_ACCELERATES;
+    const real *y = now->lead + (ik->hysteresis.code[HK_STATE_ROWS] - 1) * n;
+    real command[HK_MAX_N], way[HK_MAX_N], most = R(0.0), periods = R(INFINITY);
+    for (int j = 0; stops && j < n; j++) {
+        const real step = ik_abs(goal[j] - now->q[j]) / (ik->accel[j] * seconds * seconds);
+        most = hk_larger(HK_MATH(floor)(step), most);
+    }
+    for (int k = 0; k <= IK_BRAKED + 2; k++) {
+        for (int j = 0; j < n; j++) {
+            const real change = ik->accel[j] * seconds * seconds, step = goal[j] - now->q[j];
+            command[j] = goal[j] + (stops ? ik_way_to_stop(step, change, periods) : R(0.0));
+        }
+        ik_try(ik, now, seconds, command, way);
+        for (int j = 0; j < n; j++) way[j] -= y[j];
+        if (ik_take_gaps(ik, y, way, near)) return 1;
+        periods = k == 0 ? R(0.0) : k == 1 ? R(1.0) : R(2.0) * periods;
+        if (!(periods < most)) return 0;
+    }
+    return 0;
+}
+
+/* Shorten commands `goal` (n) within their bounds towards the hardest braking, until the body is clear
+   after them, and can stop: a command that crosses a backlash has a speed that its actuator does not
+   have yet. Returns whether they changed. */
+static HK_NOINLINE int ik_clear_commands(const ik_settings *ik, const ik_state *now, real seconds,
+                                         const real *low, const real *high, real *goal) {
+    const int n = ik->n;
+    real wanted[HK_MAX_N], brake[HK_MAX_N], part = R(1.0);
+    ik_near_t near = ik_near_again(ik);
+    for (int j = 0; j < n; j++) {
+        goal[j] = wanted[j] = ik_clip(goal[j], low[j], high[j]);
+        brake[j] = ik_clip(now->q[j], low[j], high[j]);
+    }
+    for (int halving = 0; halving <= IK_SHORTER; halving++) {
+        if (!ik_commands_lead_in(ik, now, seconds, goal, &near)) return halving > 0;
+        part = halving < IK_SHORTER ? R(0.5) * part : R(0.0);
+        for (int j = 0; j < n; j++) goal[j] = brake[j] + part * (wanted[j] - brake[j]);
+    }
+    return 1;
+}
+#endif
+
 /* One period with hysteresis: limits are those of commands, the law is that of what actuators do.
 
    First the step without limits of speed and acceleration. If its commands are beyond these, the step
@@ -906,8 +952,13 @@ static HK_NOINLINE void ik_lead(const ik_settings *ik, const ik_state *now, cons
             if (down || up) goal[j] = wanted[j];
         }
     }
+    const int unknown = s->sigma_min != s->sigma_min;
+    for (int j = 0; unknown && j < n; j++) goal[j] = now->q[j]; /* hold still */
+#if HK_OBSTACLES
+    if (IK_KEEPS_CLEAR(ik) && !unknown)
+        s->blocked |= ik_clear_commands(ik, now, seconds, low, high, goal);
+#endif
     for (int j = 0; j < n; j++) {
-        if (s->sigma_min != s->sigma_min) goal[j] = now->q[j]; /* hold still, not known */
         now->lead[j] = ik_clip(goal[j], low[j], high[j]);
         missed[j] = y[j] + s->dq[j];
         s->dq[j] = now->lead[j] - now->q[j];

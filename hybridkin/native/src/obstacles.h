@@ -275,6 +275,15 @@ static HK_NOINLINE int ik_take_gaps(const ik_settings *ik, const real *q, const 
     return any;
 }
 
+/* The gaps as they were found, and the rounding of places. */
+static inline ik_near_t ik_near_again(const ik_settings *ik) {
+    ik_near_t near = ik_near_of(ik);
+    real largest = R(0.0);
+    for (int i = 0; i < 3 * near.n_points; i++) largest = hk_larger(ik_abs(near.x[i]), largest);
+    near.rounding = R(32.0) * HK_EPS * largest;
+    return near;
+}
+
 /* Whether the gap of a pair is not far larger than a way (n). */
 static HK_NOINLINE int ik_passes_near(const ik_settings *ik, const real *way,
                                       const ik_near_t *near) {
