@@ -22,6 +22,7 @@ PAGES = sorted(DOCS.glob("*.md"))
 MODULES = (
     "app",
     "datasets",
+    "obstacles",
     "plots",
     "robots",
     "tasks",

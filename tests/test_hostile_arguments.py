@@ -50,6 +50,7 @@ from hybridkin import (
     datasets,
     jacobian,
     load_model,
+    obstacles,
     open_model,
     plots,
     robots,
@@ -101,6 +102,13 @@ GEOMETRY = {
 
 
 ORIGINS = np.stack([np.eye(4)] * 3)
+
+
+BALL = obstacles.Sphere([0.1, 0.0, 0.5], 0.05)
+
+
+SCENE = FOLDER / "scene.toml"
+SCENE.write_text("[[sphere]]\ncenter = [0.1, 0.0, 0.5]\nradius = 0.05\n")
 
 
 AXES = {"duration": 0.5, "dt": 0.1, "timing": "min_jerk"}
@@ -354,6 +362,30 @@ ENTRIES = {
             "per_unit": None,
         },
     ),
+    "plots.ClearanceDisplay": (
+        lambda unit, **k: drawn(plots.ClearanceDisplay(**k), unit=unit),
+        {
+            "distances": {"a": X[:, 0], "b": X[:, 1]},
+            "t": np.arange(24.0),
+            "clearance": 0.01,
+            "unit": "cm",
+        },
+    ),
+    "plots.obstacle_surface": (
+        plots.obstacle_surface,
+        {"obstacle": BALL, "low": np.zeros(3), "high": np.ones(3)},
+    ),
+    "plots.BackboneDisplay among obstacles": (
+        lambda obstacles: drawn(plots.BackboneDisplay(**BODY, obstacles=obstacles), space=True),
+        {"obstacles": [BALL, obstacles.HalfSpace([0.0, 0.0, 1.0], 0.0)]},
+    ),
+    "obstacles.read_scene": (obstacles.read_scene, {"path": SCENE}),
+    "InverseKinematics.body_distances": (
+        InverseKinematics(
+            trunk(), q_min=0.1, q_max=0.4, obstacles=[BALL], body_points=2
+        ).body_distances,
+        {"q": Q[:3], "obstacles": [BALL, BALL]},
+    ),
     "plots.BackboneDisplay": (
         lambda unit, **k: drawn(plots.BackboneDisplay(**k), unit=unit, space=True),
         {**BODY, "unit": "cm"},
@@ -454,7 +486,8 @@ COSTLY = {
         workflow.track_path,
         {
             **{"model": LOADED, "path": PATH, "out": OUT, "limits": LIMITS, "start": "rest"},
-            **{"tol": 1e-3, "force": True},
+            **{"tol": 1e-3, "force": True, "obstacles": [BALL.moved([3.0, 0.0, 0.0])]},
+            "clearance": 0.01,
         },
     ),
     "fit_log": (
@@ -556,6 +589,9 @@ NETWORK = ELMRegressor(4, random_state=0).fit(Q, X)
 IK = InverseKinematics(trunk(), q_min=0.1, q_max=0.4, dq_max=0.05)
 
 
+AMONG = InverseKinematics(trunk(), q_min=0.1, q_max=0.4, obstacles=[BALL], body_points=2)
+
+
 def solver(**given):
     given = {"q_min": 0.1, "q_max": 0.4, **given}
     return InverseKinematics(trunk(), **given).solve(X[:2], max_iter=2).q
@@ -638,6 +674,8 @@ ARRAYS = {
     "ik.step x_target": ("x_target", X[:3], lambda v: IK.step(Q[:3], v).dq),
     "ik.step dx": ("dx", X[:3], lambda v: IK.step(Q[:3], X[:3], v).dq),
     "ik.step x_measured": ("x_measured", X[:3], lambda v: IK.step(Q[:3], X[:3], x_measured=v).dq),
+    "ik.body_balls": ("q", Q[:3], lambda v: AMONG.body_balls(v)),
+    "ik.body_distances": ("q", Q[:3], lambda v: AMONG.body_distances(v)),
     "ik.track": ("path", X[:3], lambda v: IK.track(v, q0=Q[0]).q),
     "ik.track q0": ("q0", Q[0], lambda v: IK.track(X[:3], q0=v).q),
     "ik.track t": ("t", HALF / 1e3, lambda v: IK.track(X[:3], v, q0=Q[0]).q),

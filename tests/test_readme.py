@@ -240,6 +240,10 @@ SMALLER = {
         ("100)", "40)"),
     ],
     "plot_notebook": [("data.q[::4], data.x[::4]", "data.q[::20], data.x[::20]"), ("0.05", "0.2")],
+    "plot_obstacles": [
+        ("N_TICKS = 80", "N_TICKS = 20"),
+        ("fit(data.q, data.x)", "fit(data.q[::4], data.x[::4])"),
+    ],
     "plot_payload": [
         ("dt=0.1)", "dt=0.1, duration=2.5)"),
         ("data.q, data.x", "data.q[::4], data.x[::4]"),

@@ -18,6 +18,7 @@ EXAMPLES = (
     "motions",
     "slack_tendons",
     "tracking",
+    "obstacles",
     "payload",
     "new_day",
     "rigid_arm",

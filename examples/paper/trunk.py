@@ -89,6 +89,8 @@ class TrunkPlant:
     segment_ends : ndarray of shape (3, 3)
         After `settle`: ends of the segments, base to tip, in the motion-capture frame without
         noise [m]. The last one is the tip.
+    backbone : ndarray of shape (19, 3)
+        After `settle`: the backbone from the base to the tip, link by link, likewise [m].
 
     Raises
     ------
@@ -169,7 +171,8 @@ class TrunkPlant:
         self._model = mujoco.MjModel.from_xml_string(trunk_mjcf(down, mass, tip_mass, stiffness))
         self._data = mujoco.MjData(self._model)
         self._tip = self._model.site("tip").id
-        rings = [[f"s{s}_{i}_{LINKS}" for i in range(3)] for s in range(3)]
+        levels = [(0, 0), *((s, k + 1) for s in range(3) for k in range(LINKS))]
+        rings = [[f"s{s}_{i}_{k}" for i in range(3)] for s, k in levels]
         self._rings = [[self._model.site(name).id for name in ring] for ring in rings]
         # A state holds the joint positions and the forces of the nine chambers.
         self._n_dof = self._model.nv
@@ -231,8 +234,9 @@ class TrunkPlant:
         state, held = self._equilibrium(self._rest, target, iter(range(self._max_iter)))
         self._check_stable(state, held)
         lengths, T_base_tip = self._hold(state, target, held)
-        ends = self._data.site_xpos[self._rings].mean(1) @ self._T_mocap_base[:3, :3].T
-        self.segment_ends = ends + self._T_mocap_base[:3, 3]
+        middles = self._data.site_xpos[self._rings].mean(1) @ self._T_mocap_base[:3, :3].T
+        self.backbone = middles + self._T_mocap_base[:3, 3]
+        self.segment_ends = self.backbone[LINKS::LINKS]
         rng = self._rng if random_state is None else np.random.default_rng(random_state)
         q = lengths + self._noise[0] * rng.standard_normal(9)
         pose = self._T_mocap_base @ T_base_tip

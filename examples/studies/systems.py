@@ -28,6 +28,7 @@ from hybridkin import (
     InverseKinematics,
     datasets,
     native,
+    obstacles,
     robots,
     tasks,
 )
@@ -66,6 +67,16 @@ CONTROLLERS = {
     "pose": lambda: InverseKinematics(tasks.PoseTask(TRUNK), **LIMITS),
     "half-space": lambda: InverseKinematics(
         TRUNK, tip_limits=([[0.0, 0.0, 1.0]], [0.72]), **LIMITS
+    ),
+    "obstacles": lambda: InverseKinematics(
+        TRUNK,
+        dq_max=0.5,
+        obstacles=[
+            obstacles.Sphere([0.16, 0.0, 0.7], 0.05),
+            obstacles.HalfSpace([0.0, 1.0, 0.0], -0.1),
+        ],
+        body_points=[(1.0, 0.05), (2.0, 0.05), (3.0, 0.04)],
+        **LIMITS,
     ),
 }
 

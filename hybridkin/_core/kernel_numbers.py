@@ -27,6 +27,7 @@ KINDS = (
     "projected",
     "stacked",
     "with_pose",
+    "body",
 )
 # Stages of hysteresis, numbered from 1: each has its kernel in a header of this name.
 SOURCES = Path(__file__).parents[1] / "native" / "src"
@@ -58,6 +59,14 @@ HK_LONGEST = 1.5  # bound of a correction, relative to the longest one of a trai
 
 HK_J, HK_DISTANCE = 1, 2  # asked for besides x
 HK_IF_SAME = 4  # only if what the plan was made of has not changed
+
+# Entries of a step: its model, flags, normals of a plane, half-spaces, obstacles, the body that
+# keeps clear of them (-1: none), then the stages of hysteresis, and rows of their state.
+IK_MODEL, IK_FLAGS, IK_N_NORMALS, IK_N_SPACES, IK_N_OBSTACLES, IK_BODY = 0, 1, 2, 3, 4, 5
+IK_STAGES, IK_STATE_ROWS = 6, 7
+# Entries of a body: its points, pairs of them that can meet, then the models of the points, and the
+# first and the second points of these pairs.
+IK_N_POINTS, IK_N_MEETING, IK_POINTS = 0, 1, 2
 
 # A step of inverse kinematics.
 IK_LIMITED, IK_POSTURE, IK_WEIGHTS, IK_ACCELERATES, IK_PULLS = 1, 2, 4, 8, 16  # flags
@@ -98,6 +107,9 @@ IK_OBSTACLE = 19  # numbers of one: center, axes, sides of its box, radius
 IK_PAIRS_MOST = 32  # pairs of a point and an obstacle, or of two points, in the law of a step
 IK_NEARER = 0.5  # of a gap: the largest part of it that one step takes, to first order
 IK_AROUND = 4  # steps that are tried where the curvature of the model would lead into an obstacle
+IK_BENT_WAY = (
+    0.25  # of a way towards an obstacle, by the curvature of the model: the most in one step
+)
 IK_SHORTER = 5  # halvings of a step after that; then it brakes
 IK_INSIDE_OBSTACLE = 1e-6  # a body so far in an obstacle has not reached its target [m]
 
@@ -119,13 +131,14 @@ IK_SIGMA_MIN = 4
 IK_DAMPING = 5
 IK_DISTANCE = 6  # length of the error
 IK_STOPPED = 7  # whether half-spaces changed the motion of the tip
+IK_BLOCKED = 8  # whether obstacles changed the step
 # Then target, motion of the target in this period, measured tip, last measured tip minus model, x
 # and error; q, step, q before, whether it was held (n each); what is remembered of the last step
 # (IK_PROMISED + 2 m); and J. Points of a task of m rows have m numbers, poses 16; motions and
 # errors m.
 # With hysteresis q is the command and q before what the actuators did; then follow its state, and
-# one to try.
-IK_TARGET = 8
+# one to try. Then follow the obstacles, where they are now.
+IK_TARGET = 9
 IK_POSE_NUMBERS = 16
 IK_HAS_TARGET = 1
 IK_HAS_FEED = 2
@@ -155,7 +168,6 @@ IK_DOUBTS = 7
 # Hysteresis of the actuators.
 HK_MAX_CREEPS = 16  # time constants of an operator
 HK_CREEP_ROUNDING = 16.0  # of a command, in units of the precision
-IK_STAGES, IK_STATE_ROWS = 4, 5  # entries of a step: stages, and rows of their state
 IK_AT_REST_SHARE = 1e-6  # a command that moves this much farther than its actuator stays
 
 # The search for configurations.

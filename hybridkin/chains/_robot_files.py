@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import difflib
 import math
-import re
-import reprlib
-import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,16 +13,24 @@ import torch
 from hybridkin._core.arrays import shaped
 from hybridkin._core.rotations import rotation
 from hybridkin._core.text_rows import DECIMALS
+from hybridkin._core.toml_files import (
+    Need,
+    Test,
+    among,
+    check_keys,
+    is_number,
+    is_positive,
+    is_table,
+    is_text,
+    many,
+    one_or_many,
+    read_toml,
+)
 from hybridkin._core.units import FRAMES, METRES, SECONDS, UNITS
 from hybridkin.chains.arc_chain import ArcChain
 from hybridkin.chains.constant_curvature import ConstantCurvatureChain
 from hybridkin.chains.elastic_tendons import ElasticTendonChain
 from hybridkin.chains.force_tendons import ForceTendonChain
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib  # pyright: ignore[reportMissingImports]
 
 _STIFFNESS = ("bending_stiffness", "axial_stiffness")
 _PLAIN = "constant-curvature"
@@ -47,139 +51,95 @@ _MODELS = {
 _NEEDED = {_ELASTIC: ("length",), _FORCES: ("length", *_STIFFNESS)}
 _MOST = 64  # segments of a robot, actuators of a segment
 
-# of positive numbers, and of all; others are mistakes
-_LEAST = 1e-18
-_LARGEST = 1e9
-# The time to read hostile TOML grows with the squares of these.
-_DOTS = 600  # between two commas
-_BYTES = 30_000  # of a file
-_Test = Callable[[Any], bool]
-
-
-def _is_number(value: Any) -> bool:
-    return type(value) in (int, float) and abs(value) <= _LARGEST  # not NaN
-
-
-def _is_positive(value: Any) -> bool:
-    return _is_number(value) and value >= _LEAST
-
-
-def _is_text(value: object) -> bool:
-    return isinstance(value, str) and bool(value.strip())
-
-
-def _many(test: _Test, size: int = 0) -> _Test:
-    return lambda v: type(v) is list and len(v) == (size or len(v)) > 0 and all(map(test, v))
-
-
-def _one_or_many(test: _Test) -> _Test:
-    return lambda value: test(value) or _many(test)(value)
-
-
-def _among(*values: Any) -> tuple[str, _Test]:
-    return f"be one of {values}", lambda v: type(v) is type(values[0]) and v in values
-
-
-_TABLE = ("be a table of keys", lambda value: isinstance(value, dict))
-_TEXT = ("be text", _is_text)
-_POSITIVE = ("be positive, or a list of positive numbers", _one_or_many(_is_positive))
+_TABLE = ("be a table of keys", is_table)
+_TEXT = ("be text", is_text)
+_POSITIVE = ("be positive, or a list of positive numbers", one_or_many(is_positive))
 _WHOLE = (
     f"be a whole number from 1 to {_MOST}",
     lambda v: type(v) is int and 0 < v <= _MOST,
 )
 # Tables, their keys, and the requirement on the value of a key, in words and as a test.
-_ROWS: list[tuple[str, str, str, _Test]] = [
+_ROWS: list[tuple[str, str, str, Test]] = [
     ("file", "name", *_TEXT),
-    ("file", "model", *_among(*_CHAINS)),
-    ("file", "routing", *_among("segment", "base")),
+    ("file", "model", *among(*_CHAINS)),
+    ("file", "routing", *among("segment", "base")),
     (
         "file",
         "calibrate",
         'be a list of names, "auto" or "default"',
-        lambda v: v in ([], "auto", "default") or _many(_is_text)(v),
+        lambda v: v in ([], "auto", "default") or many(is_text)(v),
     ),
     (
         "file",
         "segment",
         "hold tables, each under the heading [[segment]]",
-        _many(_TABLE[1]),
+        many(is_table),
     ),
     ("file", "base log limits", *_TABLE),
     (
         "segment",
         "radius length " + " ".join(_STIFFNESS),
         "be a positive number",
-        _is_positive,
+        is_positive,
     ),
-    ("segment", "angle_deg offset", "be a number", _is_number),
-    ("segment", "weight", "be zero or more", lambda v: _is_number(v) and v >= 0),
-    ("segment", "taper", "lie in [0, 1)", lambda v: _is_number(v) and 0 <= v < 1),
-    ("segment", "angles_deg", "hold numbers", _many(_is_number)),
+    ("segment", "angle_deg offset", "be a number", is_number),
+    ("segment", "weight", "be zero or more", lambda v: is_number(v) and v >= 0),
+    ("segment", "taper", "lie in [0, 1)", lambda v: is_number(v) and 0 <= v < 1),
+    ("segment", "angles_deg", "hold numbers", many(is_number)),
     (
         "segment",
         "zeros",
         "be a number, or a list of numbers",
-        _one_or_many(_is_number),
+        one_or_many(is_number),
     ),
     ("segment", "gain spool_radius", *_POSITIVE),
-    ("segment", "rest_bend_deg", "hold 2 numbers", _many(_is_number, 2)),
-    ("segment", "stage", *_among("insertion", "rotation")),
+    ("segment", "rest_bend_deg", "hold 2 numbers", many(is_number, 2)),
+    ("segment", "stage", *among("insertion", "rotation")),
     ("segment", "clockwise", "be true or false", lambda value: isinstance(value, bool)),
     ("segment", "actuators repeat", *_WHOLE),
     (
         "base",
         "position rotation_vector_deg gravity",
         "hold 3 numbers",
-        _many(_is_number, 3),
+        many(is_number, 3),
     ),
-    ("log", "q", "hold names of columns", _many(_is_text)),
-    ("log", "x", "hold names of columns", _many(_is_text)),
+    ("log", "q", "hold names of columns", many(is_text)),
+    ("log", "x", "hold names of columns", many(is_text)),
     (
         "log",
         "markers",
         "hold lists [segment, fraction, x, y, z]",
-        _many(_many(_is_number, 5)),
+        many(many(is_number, 5)),
     ),
     ("log", "q_unit groups runs time", *_TEXT),
     (
         "log",
         "unwrap",
         "be true or false, a positive period, or a table of columns and their periods",
-        lambda v: isinstance(v, (bool, dict)) or _is_positive(v),
+        lambda v: isinstance(v, (bool, dict)) or is_positive(v),
     ),
     ("log", "group_suffix", "be text", lambda value: isinstance(value, str)),
-    ("log", "x_unit", *_among(*METRES)),
+    ("log", "x_unit", *among(*METRES)),
     ("log", "header_line", *_WHOLE),
-    ("log", "decimal", *_among(*DECIMALS)),
-    ("log", "missing", "hold numbers", _many(_is_number)),
-    ("log", "time_unit", *_among(*SECONDS, FRAMES)),
-    ("log", "rate", "be a positive number", _is_positive),
-    ("log", "q_sign", "be 1 or -1, or a list of them", _one_or_many(_among(1, -1)[1])),
+    ("log", "decimal", *among(*DECIMALS)),
+    ("log", "missing", "hold numbers", many(is_number)),
+    ("log", "time_unit", *among(*SECONDS, FRAMES)),
+    ("log", "rate", "be a positive number", is_positive),
+    ("log", "q_sign", "be 1 or -1, or a list of them", one_or_many(among(1, -1)[1])),
     (
         "limits",
         "q_min q_max",
         "be a number, or a list of numbers",
-        _one_or_many(_is_number),
+        one_or_many(is_number),
     ),
     ("limits", "dq_max ddq_max", *_POSITIVE),
-    ("limits", "unit", *_among("m", "log")),
+    ("limits", "unit", *among("m", "log")),
 ]
 
 
 def read_tables(path: Path) -> dict[str, Any]:
     """Return the content of a TOML file; a ValueError names a wrong key."""
-    if path.stat().st_size > _BYTES:
-        raise ValueError(f"a robot description must be at most {_BYTES} bytes long.")
-    try:
-        text = path.read_text(encoding="utf-8")
-        if any(part.count(".") > _DOTS for part in re.split(r"[,=\n]", text)):
-            raise ValueError(f"a key has more than {_DOTS} dots")
-        content = tomllib.loads(text)
-    except (
-        ValueError,
-        RecursionError,
-    ) as error:  # some numbers raise plain ValueErrors
-        raise ValueError(f"this is not a TOML file: {error}.") from error
+    content = read_toml(path, "a robot description")
     _check(content, "file", "the file")
     for k, table in enumerate(content.get("segment", ())):
         _check(table, "segment", f"[[segment]] {k + 1}")
@@ -189,20 +149,11 @@ def read_tables(path: Path) -> dict[str, Any]:
 
 
 def _check(table: Mapping[str, Any], kind: str, where: str) -> None:
-    needs: dict[str, tuple[str, _Test]] = {}
+    needs: dict[str, Need] = {}
     for name, keys, words, fits in _ROWS:
         if name == kind:
             needs |= dict.fromkeys(keys.split(), (words, fits))
-    for key, value in table.items():
-        if key not in needs:
-            hint = f"known: {sorted(needs)}."
-            if close := difflib.get_close_matches(key, needs, n=1):
-                hint = f"did you mean `{close[0]}`?"
-            raise ValueError(f"`{key:.40}` in {where} is not known; {hint}")
-        words, fits = needs[key]
-        if not fits(value):
-            got = reprlib.repr(value)  # shortens deep or long values
-            raise ValueError(f"`{key}` in {where} must {words}, got {got}.")
+    check_keys(table, needs, where)
 
 
 def chain_of(tables: Mapping[str, Any]) -> ArcChain:

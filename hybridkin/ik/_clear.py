@@ -15,14 +15,16 @@ from typing import NamedTuple, TypeAlias
 import torch
 from torch import Tensor
 
-from hybridkin._core.arrays import number, whole
+from hybridkin._core.arrays import as_array, number, whole
 from hybridkin._core.kernel_numbers import (
+    IK_BENT_WAY,
     IK_INSIDE_OBSTACLE,
     IK_NEARER,
     IK_OBSTACLE,
     IK_PAIRS_MOST,
 )
 from hybridkin._core.model import ForwardModel
+from hybridkin._core.plan import Plan
 from hybridkin._core.portable import Portable
 from hybridkin.ik._gram import apply_rows
 from hybridkin.ik._nearest import Polyhedron, nearest
@@ -84,6 +86,17 @@ class KeptClear(Portable):
         apart = self.along - self.along[:, None]
         return (apart > 0.5 * math.pi * reach).nonzero().T
 
+    def write_plan(self, plan: Plan, n: int) -> int:
+        """Write the node of the body of a robot of n actuators, and return its place; -1: none."""
+        if not self:
+            return -1
+        places = [plan.node_of(model.stored()) for model in self.models]
+        one, other = self.meeting
+        reach = self.radii[one] + self.radii[other]
+        numbers = [as_array(part) for part in (self.keep, reach, self.along, self.base)]
+        pairs = [*one.tolist(), *other.tolist()]
+        return plan.node("body", n, 3, numbers, len(places), len(one), *places, *pairs)
+
     def points(self, q: Tensor) -> Tensor:
         """Return the points (N, P, 3) at q (N, n) [m]."""
         points = torch.cat([model(q) for model in self.body], dim=-1)
@@ -105,9 +118,7 @@ class KeptClear(Portable):
         scene = scene.to(x)
         keep = self.keep.to(x)[:, None]
         distance, normal = distances(x, scene)
-        at_base, _ = distances(self.base.to(x), scene)
-        never = keep > at_base + self.along.to(x)[:, None]
-        free = torch.where(never, math.inf, distance - keep).flatten(1)
+        free = torch.where(self._is_never_free(scene), math.inf, distance - keep).flatten(1)
         one, other = self.meeting.to(x.device)
         apart = x[:, other] - x[:, one]
         size = apart.norm(dim=-1)
@@ -115,6 +126,21 @@ class KeptClear(Portable):
         between = size - (self.radii[one] + self.radii[other]).to(x)
         gaps = torch.cat([free, between], dim=1)
         return gaps, torch.cat([normal.flatten(1, 2), away], dim=1)
+
+    def _is_never_free(self, scene: Tensor) -> Tensor:
+        """Return which points (P, K) no configuration frees: the robot is mounted there."""
+        at_base, _ = distances(self.base.to(scene), scene)
+        return self.keep.to(scene)[:, None] > at_base + self.along.to(scene)[:, None]
+
+    def distances(self, q: Tensor, scene: Tensor) -> Tensor:
+        """Return the distances (N, K) of the body at q (N, n) to every obstacle of a scene [m].
+
+        Those of points that are never free do not count.
+        """
+        scene = scene.to(q)
+        distance, _ = distances(self.points(q), scene)
+        distance = distance - self.radii.to(q)[:, None]
+        return torch.where(self._is_never_free(scene), math.inf, distance).amin(1)
 
     def relative(self, rows: Tensor, n_obstacles: int) -> Tensor:
         """Return values of points (N, P, ...) for the pairs of `gaps`, (N, p, ...)."""
@@ -249,11 +275,20 @@ class Near(NamedTuple):
         rounding = 32.0 * torch.finfo(size.dtype).eps * size
         return ~(taken <= self.gap.clamp_min(0.0) + rounding)
 
-    def tightened(self, b: Tensor, dq: Tensor, taken: Tensor) -> Tensor:
-        """Return limits b (N, p) after steps dq that took too much of some gaps."""
-        excess = taken - IK_NEARER * self.gap.clamp_min(0.0)
-        less = torch.minimum(b, apply_rows(self.A, dq) - excess)
-        return torch.where(self.is_broken(taken), less, b)
+    def tightened(self, b: Tensor, dq: Tensor, way: Tensor, taken: Tensor) -> tuple[Tensor, Tensor]:
+        """Return tighter limits b (N, p), and which part of the step to try, (N, 1).
+
+        Steps dq, on the ways to a stop, have taken too much of some gaps. What the curvature of the
+        model took is to be at most IK_BENT_WAY of the way; it shrinks with the square of the step.
+        """
+        broken = self.is_broken(taken)
+        bent = taken - apply_rows(self.A, way)
+        longest = self.A.norm(dim=-1) * way.norm(dim=-1, keepdim=True)
+        straight = torch.where(broken & (bent > 0.0), IK_BENT_WAY * longest / bent, 1.0)
+        part = straight.amin(-1, keepdim=True).clamp_max(1.0)
+        beyond = (taken - apply_rows(self.A, dq)) * part.square()
+        less = IK_NEARER * self.gap.clamp_min(0.0) - beyond
+        return torch.where(broken & (less < b), less, b), part
 
     def is_active(self, dq: Tensor) -> Tensor:
         """Return whether steps are at a limit of the gaps, bool (N,)."""

@@ -20,6 +20,7 @@ from hybridkin._core.kernel_numbers import (
     IK_AGE,
     IK_AGREEING,
     IK_AT_REST,
+    IK_BLOCKED,
     IK_DAMPING,
     IK_DISTANCE,
     IK_DOUBTS,
@@ -34,6 +35,7 @@ from hybridkin._core.kernel_numbers import (
     IK_MEMORY,
     IK_MODE,
     IK_MUST_SEE,
+    IK_OBSTACLE,
     IK_PERIOD,
     IK_PROMISED,
     IK_REACHED,
@@ -149,7 +151,8 @@ class Core:
         self.settings = dataclasses.replace(settings, task=_CoreTask(settings.task, self, models))
         self._idle: list[Follower] = []  # one for every thread that has used `step`
         n_rows = self.plan.entry(self.plan.root, IK_STATE_ROWS)
-        self.places = places = places_of(self.n, self.m, self.width, n_rows)
+        n_obstacles = len(settings.clear.scene)
+        self.places = places = places_of(self.n, self.m, self.width, n_rows, n_obstacles)
         self.lengths = [place.stop - place.start for place in places.values()]
         x = places["x"]
         if len(settings.task.shape) > 1:
@@ -315,11 +318,11 @@ class Follower:
         self._least = mode
         places = core.places
         if state is None:
-            last = "tried" if mode & IK_MUST_SEE else "seen"
+            last = "scene" if mode & IK_MUST_SEE else "seen"
             state = np.zeros(int(places[last].stop))
+            state[places["scene"]] = as_array(core.settings.clear.scene).ravel()
         self.state = state
         self.task = core.settings.task
-        self.scene = core.settings.clear.scene
         self._dt = state[IK_PERIOD] = core.settings.dt
         state[IK_MEMORY] = feedback.memory
         self._parts = {name: state[place] for name, place in places.items()}
@@ -346,6 +349,15 @@ class Follower:
         return Follower, (self.core, self._feedback, self._least, self.state.copy())
 
     @property
+    def scene(self) -> Tensor:
+        """The obstacles, where they are now, shape (K, IK_OBSTACLE)."""
+        return torch.from_numpy(self._parts["scene"].reshape(-1, IK_OBSTACLE).copy())
+
+    @scene.setter
+    def scene(self, scene: Tensor) -> None:
+        self._parts["scene"][:] = as_array(scene).ravel()
+
+    @property
     def hysteresis(self) -> Any:
         """State of the hysteresis; no rows without one."""
         return self._lead.copy()
@@ -361,7 +373,7 @@ class Follower:
             parts[name][:] = 0.0
         parts["error"][:] = math.nan
         self.state[[IK_SIGMA_MIN, IK_DISTANCE]] = math.nan
-        self.state[[IK_DAMPING, IK_STOPPED]] = 0.0
+        self.state[[IK_DAMPING, IK_STOPPED, IK_BLOCKED]] = 0.0
         self._seen[IK_SINCE] = math.inf
         if dq is not None:
             parts["dq"][:] = as_array(dq[0])
@@ -431,6 +443,7 @@ class Follower:
             parts["held"] > 0.0,
             parts["rest"][:, IK_PROMISED : IK_PROMISED + self.core.m],
             state[:, IK_STOPPED] > 0.0,
+            state[:, IK_BLOCKED] > 0.0,
         )
         x = parts["x"].unflatten(1, self.task.shape)
         J = parts["J"].unflatten(1, (self.core.m, self.core.n))
@@ -484,10 +497,11 @@ class _Input:
         return True
 
 
-def places_of(n: int, m: int, width: int, n_rows: int) -> dict[str, slice]:
+def places_of(n: int, m: int, width: int, n_rows: int, n_obstacles: int) -> dict[str, slice]:
     """Return the places of the parts of the state.
 
-    For n actuators, m rows of the task, `width` numbers in a target, and `n_rows` of hysteresis.
+    For n actuators, m rows of the task, `width` numbers in a target, `n_rows` of hysteresis, and
+    obstacles.
     """
     lengths = {
         "target": width,
@@ -504,6 +518,7 @@ def places_of(n: int, m: int, width: int, n_rows: int) -> dict[str, slice]:
         "J": m * n,
         "lead": n_rows * n,
         "tried": n_rows * n,
+        "scene": n_obstacles * IK_OBSTACLE,
         "seen": IK_DOUBTS + IK_AGREEING * m + IK_RING * (1 + width),
     }
     places = {}

@@ -11,7 +11,7 @@ from torch.nn.functional import one_hot
 from hybridkin._core.kernel_numbers import IK_CHANGES, IK_PROXIMAL
 from hybridkin.ik._gram import apply_rows
 
-_ROUNDING = 100.0  # of a component of a unit vector [eps]
+_ROUNDING = 2.0 / 3.0  # of a component of a unit vector: this power of eps
 
 
 class Polyhedron(NamedTuple):
@@ -451,4 +451,4 @@ class _Live(NamedTuple):
 
 def _rounding(x: Tensor) -> float:
     """Return what rounding leaves of a component of a unit vector that is zero."""
-    return _ROUNDING * torch.finfo(x.dtype).eps
+    return torch.finfo(x.dtype).eps ** _ROUNDING

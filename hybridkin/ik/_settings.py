@@ -312,8 +312,6 @@ class StepSettings(Portable):
         posture = self.posture.numbers
         if n is None:
             raise TypeError("the number of actuators is unknown; give one limit for each")
-        if self.clear:
-            raise TypeError("obstacles have no kernel")
         if self.task.n_levels > 1:
             raise TypeError("a Stack of several levels has no kernel")
         if self.own_limits:
@@ -346,6 +344,8 @@ class StepSettings(Portable):
             plan.limit("actuators", n_spaces)  # they share arrays of the kernels
             spaces = self.tip_limits
             numbers += [as_array(spaces.normals).T, as_array(spaces.offsets)]
+        body = self.clear.write_plan(plan, n)
+        numbers.append(as_array(self.clear.scene))
         stages = self.task.hysteresis.stage_numbers(n)
         numbers.append(stages.numbers)
 
@@ -356,7 +356,8 @@ class StepSettings(Portable):
         flags |= IK_PULLS * bool(self.pulls.any())
         flags |= IK_POSE * self.task.has_rotation
         flags |= IK_AXIS * isinstance(self.task, AxisTask)
-        entries = [model, flags, n_normals, n_spaces, *stages.code]
+        n_obstacles = len(self.clear.scene)
+        entries = [model, flags, n_normals, n_spaces, n_obstacles, body, *stages.code]
         return plan.node("ik", n, len(scale), numbers, *entries)
 
     def kernel_rates(self) -> list[float]:

@@ -208,6 +208,12 @@ class _Wish(NamedTuple):
     posture: Tensor
     bounds: Bounds
 
+    def times(self, part: Tensor) -> _Wish:
+        """Return parts (N, 1) of these wishes."""
+        return self._replace(
+            v=part * self.v, allowed=part * self.allowed, posture=part * self.posture
+        )
+
     def step(self, limits: StepLimits) -> StepRows:
         """Return the step within limits, for which tendons can only pull."""
         settings = self.law.settings
@@ -235,12 +241,14 @@ def _clear_step(wish: _Wish, limits: StepLimits, change: Tensor, scene: Tensor) 
     step = wish.step(limits.with_rows(*near.rows(b)))
     blocked = near.is_active(step.dq)
     for _ in range(IK_AROUND):
-        taken = near.taken(step.dq + way_to_stop(step.dq, change))
+        way = step.dq + way_to_stop(step.dq, change)
+        taken = near.taken(way)
         broken = near.is_broken(taken).any(-1)
         if not broken.any():
             return step._replace(blocked=blocked)
         blocked = blocked | broken
-        b = torch.where(broken[:, None], near.tightened(b, step.dq, taken), b)
+        b, part = near.tightened(b, step.dq, way, taken)
+        wish = wish.times(part)
         step = wish.step(limits.with_rows(*near.rows(b)))
 
     brake = bounds.clip(torch.zeros_like(step.dq))

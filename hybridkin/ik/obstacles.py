@@ -10,15 +10,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from os import PathLike
 
 import torch
 from torch import Tensor
 
-from hybridkin._core.arrays import Numbers, as_tensor, check_shape, identity, number
+from hybridkin._core.arrays import Numbers, as_path, as_tensor, check_shape, identity, number
 from hybridkin._core.kernel_numbers import IK_OBSTACLE
 from hybridkin._core.portable import Portable
+from hybridkin.ik._scene_files import DescribedObstacle, described_obstacles
 
-__all__ = ["Box", "Capsule", "HalfSpace", "Obstacle", "Sphere"]
+__all__ = ["Box", "Capsule", "HalfSpace", "Obstacle", "Sphere", "read_scene"]
 
 _LARGEST = 1e6  # distance of a point of an obstacle from the origin [m]
 
@@ -40,6 +42,8 @@ class Obstacle(Portable):
         The sides of the box along these axes [m]; they may be infinite.
     radius : float
         By how much the box is grown [m].
+    name : str
+        What reports and pictures call it; may be empty.
     """
 
     center: Tensor
@@ -47,11 +51,13 @@ class Obstacle(Portable):
     low: Tensor
     high: Tensor
     radius: float
+    name: str = ""
 
     def __repr__(self) -> str:
-        """Return the kind and the place."""
+        """Return the kind, the place and the name."""
         place = ", ".join(f"{c:.4g}" for c in self.center.tolist())
-        return f"{type(self).__name__}(at [{place}])"
+        called = f", {self.name!r:.80}" if self.name else ""
+        return f"{type(self).__name__}(at [{place}]{called})"
 
     @property
     def numbers(self) -> Tensor:
@@ -61,7 +67,8 @@ class Obstacle(Portable):
 
     def moved(self, center: Numbers) -> Obstacle:
         """Return the obstacle, not turned, with its `center` at another place (3,) [m]."""
-        return Obstacle(_point(center, "center"), self.axes, self.low, self.high, self.radius)
+        place = _point(center, "center")
+        return Obstacle(place, self.axes, self.low, self.high, self.radius, self.name)
 
     def distance(self, points: Numbers) -> Tensor:
         """Return the distances of points (..., 3) to its surface, negative inside, (...) [m]."""
@@ -79,6 +86,8 @@ class Sphere(Obstacle):
         Its centre, in the frame of x [m].
     radius : float
         Its radius [m].
+    name : str, default=""
+        What reports and pictures call it.
 
     Examples
     --------
@@ -88,10 +97,10 @@ class Sphere(Obstacle):
     0.2
     """
 
-    def __init__(self, center: Numbers, radius: float) -> None:
+    def __init__(self, center: Numbers, radius: float, *, name: str = "") -> None:
         middle = _point(center, "center")
         at = torch.zeros_like(middle)
-        super().__init__(middle, identity(3, middle), at, at, _size(radius, "radius"))
+        super().__init__(middle, identity(3, middle), at, at, _size(radius, "radius"), _name(name))
 
 
 class HalfSpace(Obstacle):
@@ -104,6 +113,8 @@ class HalfSpace(Obstacle):
     offset : float
         The plane is ``normal x = offset`` [m]; for a normal of length one it is the distance from
         the origin.
+    name : str, default=""
+        What reports and pictures call it.
 
     Examples
     --------
@@ -114,7 +125,7 @@ class HalfSpace(Obstacle):
     0.5
     """
 
-    def __init__(self, normal: Numbers, offset: float) -> None:
+    def __init__(self, normal: Numbers, offset: float, *, name: str = "") -> None:
         direction = _point(normal, "normal")
         length = float(direction.norm())
         if not length > 0.0:
@@ -123,7 +134,7 @@ class HalfSpace(Obstacle):
         far = axis.new_tensor([math.inf, math.inf, math.inf])
         side = axis.new_tensor([math.inf, math.inf, 0.0])
         place = axis * (_place(offset, "offset") / length)
-        super().__init__(place, _frame_along(axis), -far, side, 0.0)
+        super().__init__(place, _frame_along(axis), -far, side, 0.0, _name(name))
 
 
 class Capsule(Obstacle):
@@ -135,6 +146,8 @@ class Capsule(Obstacle):
         Ends of the line, in the frame of x [m].
     radius : float
         Distance from the line to the surface [m].
+    name : str, default=""
+        What reports and pictures call it.
 
     Examples
     --------
@@ -144,7 +157,7 @@ class Capsule(Obstacle):
     0.08
     """
 
-    def __init__(self, start: Numbers, end: Numbers, radius: float) -> None:
+    def __init__(self, start: Numbers, end: Numbers, radius: float, *, name: str = "") -> None:
         first = _point(start, "start")
         way = _point(end, "end") - first
         length = float(way.norm())
@@ -153,7 +166,7 @@ class Capsule(Obstacle):
             axes = _frame_along(way / length)
         low = torch.zeros_like(first)
         high = first.new_tensor([0.0, 0.0, length])
-        super().__init__(first, axes, low, high, _size(radius, "radius"))
+        super().__init__(first, axes, low, high, _size(radius, "radius"), _name(name))
 
 
 class Box(Obstacle):
@@ -166,9 +179,11 @@ class Box(Obstacle):
     size : array-like of shape (3,)
         Its whole lengths along its axes [m].
     rotation : array-like of shape (3, 3), optional
-        Rotation of its axes, one per column, in the frame of x. Default: along the axes of x.
+        Its axes, one per column, in the frame of x [1]. Default: along the axes of x.
     radius : float, default=0.0
         By how much its corners are round, beyond `size` [m].
+    name : str, default=""
+        What reports and pictures call it.
 
     Examples
     --------
@@ -184,6 +199,8 @@ class Box(Obstacle):
         size: Numbers,
         rotation: Numbers = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
         radius: float = 0.0,
+        *,
+        name: str = "",
     ) -> None:
         middle = _point(center, "center")
         half = 0.5 * _point(size, "size")
@@ -197,7 +214,80 @@ class Box(Obstacle):
                 f"`rotation` must be orthonormal and right-handed, got {R.tolist()!r:.200}."
             )
         grown = 0.0 if radius == 0.0 else _size(radius, "radius")
-        super().__init__(middle, R.mT, -half, half, grown)
+        super().__init__(middle, R.mT, -half, half, grown, _name(name))
+
+
+_KINDS = {"sphere": Sphere, "half_space": HalfSpace, "capsule": Capsule, "box": Box}
+
+
+def read_scene(path: str | PathLike[str]) -> list[Obstacle]:
+    r"""Return the obstacles that a TOML file describes.
+
+    Parameters
+    ----------
+    path : path-like
+        The file. Keys are those of the classes of this module, in metres::
+
+            unit = "mm"                     # of all lengths: "m" (the default), "cm", "mm", ...
+
+            [[sphere]]
+            name = "lamp"                   # optional, for reports and pictures
+            center = [0.0, 80.0, 500.0]
+            radius = 30.0
+
+            [[half_space]]                  # what lies behind a plane: normal x <= offset
+            normal = [0.0, 0.0, 1.0]
+            offset = -20.0
+
+            [[capsule]]
+            start = [-100.0, 0.0, 400.0]
+            end = [100.0, 0.0, 400.0]
+            radius = 10.0
+
+            [[box]]
+            center = [0.0, 0.0, 900.0]
+            size = [200.0, 20.0, 100.0]
+            rotation_vector_deg = [0.0, 0.0, 45.0]  # axis times angle, optional
+            radius = 5.0                    # of round corners beyond the size, optional
+
+    Returns
+    -------
+    list of Obstacle
+        Kind by kind, each in the order of the file.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ValueError
+        If the file is not TOML, lacks a key, or has an unknown key or a wrong value; the message
+        names file, table and key.
+
+    Examples
+    --------
+    >>> import pathlib, tempfile
+    >>> from hybridkin import obstacles
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = pathlib.Path(folder) / "scene.toml"
+    ...     _ = path.write_text('unit = "mm"\n[[sphere]]\ncenter = [0, 0, 500]\nradius = 50\n')
+    ...     obstacles.read_scene(path)
+    [Sphere(at [0, 0, 0.5])]
+    """
+    file = as_path(path)
+    if not file.is_file():
+        raise FileNotFoundError(f"`path` must be a scene of obstacles, got {file}: no such file.")
+    try:
+        return [_made(described) for described in described_obstacles(file)]
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from error
+
+
+def _made(described: DescribedObstacle) -> Obstacle:
+    """Return the obstacle of a table of a file."""
+    try:
+        return _KINDS[described.kind](**described.arguments)
+    except ValueError as error:
+        raise ValueError(f"{described.where}: {error}") from error
 
 
 def as_scene(value: Sequence[Obstacle]) -> tuple[Obstacle, ...]:
@@ -282,6 +372,13 @@ def _size(value: float, name: str) -> float:
     if not 0.0 < size <= _LARGEST:
         raise ValueError(f"`{name}` must be a positive length [m], got {size!r}.")
     return size
+
+
+def _name(value: str) -> str:
+    """Return a caller's name of an obstacle."""
+    if not isinstance(value, str):
+        raise TypeError(f"`name` must be text, got {value!r:.80}.")
+    return value
 
 
 def _frame_along(axis: Tensor) -> Tensor:

@@ -27,7 +27,7 @@ from hybridkin._core.arrays import (
 )
 from hybridkin._core.html import html_table
 from hybridkin._core.progress import quiet
-from hybridkin.ik._clear import BodyPoints
+from hybridkin.ik._clear import BodyPoints, KeptClear
 from hybridkin.ik._clear import body_points as body_points_of
 from hybridkin.ik._compiled import Core, core_of
 from hybridkin.ik._feedback import MOST_PERIODS, Feedback
@@ -49,7 +49,7 @@ from hybridkin.ik._starts import nearest_starts
 from hybridkin.ik._step import control_step
 from hybridkin.ik._tracks import Loop, Path, followed
 from hybridkin.ik.limits import Limit, functions
-from hybridkin.ik.obstacles import Obstacle, as_scene
+from hybridkin.ik.obstacles import Obstacle, as_numbers, as_scene
 from hybridkin.ik.results import IKSolution, IKStatus, Step, Track, statuses
 from hybridkin.ik.tasks import as_task
 from hybridkin.ik.tracker import Plant, Tracker
@@ -726,6 +726,82 @@ class InverseKinematics:
         rows = [e.norm(dim=-1), status, clearance]
         error, status, clearance = give_back(rows, (len(e),), is_numpy(track.q))
         return replace(track, error=error, status=status, clearance=clearance)
+
+    @torch.no_grad()
+    def body_balls(self, q: Array) -> tuple[Array, Array]:
+        """Return the balls that cover the body: their middles, and their radii.
+
+        Parameters
+        ----------
+        q : array-like of shape (..., n)
+            Configurations; with hysteresis, what the actuators do.
+
+        Returns
+        -------
+        points : array of shape (..., P, 3)
+            Points along the backbone, the last one the tip of the model [m].
+        radii : array of shape (P,)
+            Radii of the balls [m].
+
+        Raises
+        ------
+        ValueError
+            If the solver was made without obstacles: it then has no points along the body.
+        """
+        clear = self._body()
+        rows = self.settings.configurations(q, "q")
+        points = clear.points(rows.reshape(-1, rows.shape[-1]))
+        middles = give_back([points], rows.shape[:-1], is_numpy(q))[0]
+        return middles, give_back([clear.radii.to(rows)], clear.radii.shape, is_numpy(q))[0]
+
+    @torch.no_grad()
+    def body_distances(self, q: Array, obstacles: Sequence[Obstacle] | None = None) -> Array:
+        """Return the distance from the body to every obstacle.
+
+        Parameters
+        ----------
+        q : array-like of shape (..., n)
+            Configurations; with hysteresis, what the actuators do.
+        obstacles : sequence of K Obstacle, optional
+            Default: those of the solver.
+
+        Returns
+        -------
+        array of shape (..., K)
+            Least distances [m] from the balls along the body to the surfaces, negative inside. They
+            are those of the model, without `clearance` and expected error. Balls that no
+            configuration can free, where the robot is mounted, do not count.
+
+        Raises
+        ------
+        ValueError
+            If the solver was made without obstacles: it then has no points along the body.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from hybridkin import InverseKinematics, obstacles, robots
+        >>> wall = obstacles.HalfSpace([-1.0, 0.0, 0.0], -0.3)
+        >>> trunk = robots.bionic_handling_assistant()
+        >>> ik = InverseKinematics(trunk, q_min=0.1, q_max=0.4, obstacles=[wall])
+        >>> ik.body_distances(np.full(9, 0.25)).round(2)
+        array([0.18])
+        """
+        clear = self._body()
+        rows = self.settings.configurations(q, "q")
+        scene = clear.scene if obstacles is None else as_numbers(as_scene(obstacles))
+        distances = clear.distances(rows.reshape(-1, rows.shape[-1]), scene)
+        return give_back([distances], rows.shape[:-1], is_numpy(q))[0]
+
+    def _body(self) -> KeptClear:
+        """Return the body of the robot, with what it keeps clear of."""
+        clear = self.settings.clear
+        require(
+            bool(clear),
+            "`obstacles` or `body_points` must be given to the solver itself; without them it has "
+            "no points along the body.",
+        )
+        return clear
 
     def _starts(self, target: Tensor, q0: Tensor | None, as_numpy: bool) -> Iterator[Tensor]:
         """Yield two configurations (n,) at a target (1, ...): of the first start, a regular one."""

@@ -22,8 +22,17 @@ from torch import Tensor
 from hybridkin._core.files import check_outputs, write_files
 from hybridkin._core.kernel_numbers import (
     IK_AGREEING,
+    IK_BODY,
     IK_DOUBTS,
     IK_LIMITED,
+    IK_MODEL,
+    IK_N_MEETING,
+    IK_N_NORMALS,
+    IK_N_OBSTACLES,
+    IK_N_POINTS,
+    IK_N_SPACES,
+    IK_OBSTACLE,
+    IK_PAIRS_MOST,
     IK_RING,
     IK_STAGES,
     IK_STATE_ROWS,
@@ -90,9 +99,18 @@ class _Task(Protocol):
     def moved(self, x: Tensor, motion: Tensor, turn: Tensor) -> Tensor: ...
 
 
+class _Clear(Protocol):
+    @property
+    def models(self) -> tuple[ForwardModel, ...]: ...
+    @property
+    def scene(self) -> Tensor: ...
+
+
 class _Settings(Protocol):
     @property
     def task(self) -> _Task: ...
+    @property
+    def clear(self) -> _Clear: ...
     @property
     def fraction(self) -> float: ...
     def write_plan(self, plan: Plan) -> int: ...
@@ -235,9 +253,11 @@ def c_project(
     controller = copy.deepcopy(model) if isinstance(model, _Controller) else None
     if controller:
         modules = [*controller.settings.task.steered]
+        body = [*controller.settings.clear.models]
     else:
         modules = [copy.deepcopy(as_forward_model(model))]
-    for module in modules:
+        body = []
+    for module in (*modules, *body):
         module.double()
     try:
         if controller:
@@ -269,6 +289,11 @@ def c_project(
     entries |= _vectors(modules, plan, controller, dtype)
     if controller is not None and leads(plan):
         entries["LEAD_FIELD"] = filled("lead.h", entries)
+    if controller is not None and keeps_clear(plan):
+        entries["CLEAR_FIELD"] = filled("clear.h", entries)
+        entries["CLEAR_FUNCTION"] = filled("clear_function.h", entries)
+        entries["CLEAR_C"] = filled("clear.c", entries)
+        entries["CLEAR"] = filled("clear.md", entries)
     for key, template in _STEP_PARTS.items():
         entries[key] = "" if controller is None else filled(template, entries)
 
@@ -303,8 +328,8 @@ def _code(plan: Plan, controller: _Controller | None, dtype: str) -> Entries:
     step: Entries = {"CALL": "forward(q, x)"}
     if controller is not None:
         task = controller.settings.task
-        model = plan.entry(plan.root, 0)
-        n_spaces = plan.entry(plan.root, 3)
+        model = plan.entry(plan.root, IK_MODEL)
+        n_spaces = plan.entry(plan.root, IK_N_SPACES)
         poses = task.of_poses
         step = _step_code(plan, task, n_spaces)
 
@@ -314,6 +339,7 @@ def _code(plan: Plan, controller: _Controller | None, dtype: str) -> Entries:
     defines["KINDS"] = f"{sum(1 << kind for kind in kinds)}u"
     defines["POSES"] = int(poses)
     defines["SPACES"] = int(n_spaces > 0)
+    defines["OBSTACLES"] = int(controller is not None and keeps_clear(plan))
     defines["HYSTERESIS"] = int(controller is not None and leads(plan))
     lines = [f"#define HK_{name} {number}" for name, number in defines.items()]
     if dtype == "float32":
@@ -328,7 +354,7 @@ def _code(plan: Plan, controller: _Controller | None, dtype: str) -> Entries:
         "MODEL": model,
         "ROOT": plan.root,
         "BYTES": data.nbytes + 4 * len(plan.code),
-        "OPERATIONS": f"{_operations(plan):,}",
+        "OPERATIONS": f"{_operations(plan, model):,}",
         **step,
     }
 
@@ -345,12 +371,17 @@ def _step_code(plan: Plan, task: _Task, n_spaces: int) -> Entries:
     limits, dt = _limits(plan)
     n = plan.n_inputs
     m = plan.n_outputs
+    n_points, n_pairs, n_obstacles = sizes_of_body(plan)
     entries: Entries = {
         "CALL": "step(&state, target, NULL, NULL)",
         "DT": dt,
         "TASK": m,
         "WIDTH": math.prod(task.shape),
-        "NORMALS": plan.entry(plan.root, 2),
+        "NORMALS": plan.entry(plan.root, IK_N_NORMALS),
+        "POINTS": n_points,
+        "PAIRS": n_pairs,
+        "OBSTACLES": n_obstacles,
+        "OBSTACLE_NUMBERS": max(n_obstacles, 1) * IK_OBSTACLE,
         "NEWTON": f"{10 * n**2 + (20 + 7 * m * m) * n:,}",
         "ABOUT_TARGET": task.about_target,
         "SPACES": _ABOUT_SPACES if n_spaces else "",
@@ -358,6 +389,7 @@ def _step_code(plan: Plan, task: _Task, n_spaces: int) -> Entries:
         "SEEN": IK_DOUBTS + IK_AGREEING * m + IK_RING * (1 + math.prod(task.shape)),
     }
     entries |= {"LEADS": "", "LEAD_FIELD": "", "WITHOUT": ""}
+    entries |= {"CLEAR": "", "CLEAR_FIELD": "", "CLEAR_FUNCTION": "", "CLEAR_C": ""}
     if leads(plan):
         entries["LEADS"] = filled("lead.md", entries)
         entries["WITHOUT"] = ", and without hysteresis there"
@@ -374,6 +406,21 @@ def leads(plan: Plan) -> bool:
     return plan.entry(plan.root, IK_STAGES) > 0
 
 
+def keeps_clear(plan: Plan) -> bool:
+    """Return whether the body of a robot keeps clear of obstacles, or of itself."""
+    return plan.entry(plan.root, IK_BODY) > 0
+
+
+def sizes_of_body(plan: Plan) -> tuple[int, int, int]:
+    """Return the numbers of points of the body, of pairs with a gap, and of obstacles."""
+    if not keeps_clear(plan):
+        return 0, 0, 0
+    body = plan.entry(plan.root, IK_BODY)
+    n_points = plan.entry(body, IK_N_POINTS)
+    n_obstacles = plan.entry(plan.root, IK_N_OBSTACLES)
+    return n_points, n_points * n_obstacles + plan.entry(body, IK_N_MEETING), n_obstacles
+
+
 def _check_stack(plan: Plan, dtype: str) -> None:
     """Raise if the code would need more than 64 KiB of stack; bounds the HK_MODEL_WORK of src."""
     n, segments, m, features, rows = plan.code[:5].tolist()
@@ -384,15 +431,20 @@ def _check_stack(plan: Plan, dtype: str) -> None:
     if rows:
         numbers += 8 * (rows + 1) * (n + 12)
         numbers += 2 * n * plan.entry(plan.root, IK_STATE_ROWS)
+        n_points, n_pairs, _ = sizes_of_body(plan)
+        if n_points:
+            numbers += (9 + 3 * n) * n_points + 6 * n_pairs + 2 * (n + 3) * IK_PAIRS_MOST
     if numbers * np.dtype(dtype).itemsize > _MOST_STACK:
         raise NoKernel("its sizes need more than 64 KiB of stack, too much for a controller")
 
 
-def _operations(plan: Plan) -> int:
-    """Return the approximate largest number of operations for x and J."""
+def _operations(plan: Plan, model: int) -> int:
+    """Return the approximate largest number of operations for x and J of a model and its parts."""
     ends = [plan.begin(place) for place in plan.places[1:]]
     work = 0
     for place, end in zip(plan.places, [*ends, len(plan.data)], strict=True):
+        if place > model:  # parts come first
+            break
         n, m = plan.lengths(place)
         count = end - plan.begin(place)
         kind = plan.kind(place)

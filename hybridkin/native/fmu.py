@@ -26,6 +26,7 @@ from hybridkin.native.export import (
     CProject,
     c_project,
     filled,
+    keeps_clear,
     leads,
     literals,
 )
@@ -111,10 +112,11 @@ def export_fmu(
     no measurement), the outputs command, tip (that of the model), error, status (0 a step without
     limits, 1 limits restricted it, 2 held, because an input is not finite) and rejected (1 if the
     measurement was not used, as it cannot be), with hysteresis effective (what the actuators do),
-    and as parameters the start, the limits, gain, beta, fraction (of what a measurement shows
-    beyond the offset between robot and model, by default 0.2, and 1 with a `gain`), delay (age of
-    measurements) and memory (0: the offset stays). A step of the simulation must be a multiple of
-    its period; in several periods a measurement is that of the first.
+    with obstacles the input obstacles (their centers now) and the output blocked (1 if they changed
+    the step), and as parameters the start, the limits, gain, beta, fraction (of what a measurement
+    shows beyond the offset between robot and model, by default 0.2, and 1 with a `gain`), delay
+    (age of measurements) and memory (0: the offset stays). A step of the simulation must be a
+    multiple of its period; in several periods a measurement is that of the first.
 
     Parameters are checked as in Python. All but the start may change between steps. A call that is
     refused returns fmi3Error, logs the reason (category logStatusError), and changes nothing.
@@ -237,6 +239,12 @@ def _variables(project: CProject) -> list[Variable]:
     if leads(plan):
         about = "what the actuators do, after hysteresis"
         variables.append(Variable("effective", "output", about, (n,)))
+    if keeps_clear(plan):
+        variables.append(Variable("blocked", "output", "1: obstacles changed the step", ()))
+    centers = settings.clear.scene[:, :3].numpy()
+    if len(centers):
+        about = "centers of the obstacles [m]"
+        variables.append(Variable("obstacles", "input", about, centers.shape, centers))
     for limit, values in zip(_LIMITS, project.limits, strict=True):
         if np.isfinite(values).all():
             about = f"{_LIMITS[limit]} of q, in its unit and s"

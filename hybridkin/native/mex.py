@@ -8,7 +8,11 @@ from pathlib import Path
 
 from hybridkin._core.files import check_outputs, write_files
 from hybridkin._core.texts import matlab_comment
-from hybridkin.native.export import ABOUT_Q, c_project, filled
+from hybridkin.native.export import ABOUT_Q, c_project, filled, keeps_clear
+
+_GIVE_BLOCKED = """    const double blocked = state.blocked;
+    give(n_out, out, 5, 1, 1, &blocked);
+"""
 
 
 def export_mex(
@@ -70,6 +74,15 @@ def export_mex(
         "STEP_CALL": "mex_call.c",
         "STEP_HELP": "mex_step.m",
     }
+    clear = {
+        "CLEAR_MEX": "mex_clear.c",
+        "CLEAR_CALL": "mex_clear_call.c",
+        "CLEAR_HELP": "mex_clear.m",
+    }
+    has_obstacles = project.controller is not None and keeps_clear(project.plan)
+    entries["GIVE_BLOCKED"] = _GIVE_BLOCKED * has_obstacles
+    for key, template in clear.items():
+        entries[key] = filled(template, entries) if has_obstacles else ""
     for key, template in parts.items():
         entries[key] = "" if project.controller is None else filled(template, entries)
     header = project.texts[f"{name}.h"]

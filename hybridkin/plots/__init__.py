@@ -8,7 +8,9 @@ every figure: that of `model_color` for its name.
 """
 
 from hybridkin.plots._canvas import model_color, new_figure
+from hybridkin.plots._obstacles import obstacle_surface
 from hybridkin.plots.animation import TrackAnimation
+from hybridkin.plots.clearance import ClearanceDisplay
 from hybridkin.plots.errors import ErrorBoxDisplay, ErrorHistogramDisplay
 from hybridkin.plots.space import BackboneDisplay, WorkspaceDisplay
 from hybridkin.plots.tracking import ActuatorDisplay, TrackingDisplay
@@ -16,6 +18,7 @@ from hybridkin.plots.tracking import ActuatorDisplay, TrackingDisplay
 __all__ = [
     "ActuatorDisplay",
     "BackboneDisplay",
+    "ClearanceDisplay",
     "ErrorBoxDisplay",
     "ErrorHistogramDisplay",
     "TrackAnimation",
@@ -23,4 +26,5 @@ __all__ = [
     "WorkspaceDisplay",
     "model_color",
     "new_figure",
+    "obstacle_surface",
 ]

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from hybridkin._core.texts import visible
 from hybridkin.plots._canvas import COLORS
+from hybridkin.plots._obstacles import COLOR, OPACITY, surface_of
 from hybridkin.plots._scene import Line, Scene
 from hybridkin.plots.page_server import page_server, stop
 
@@ -57,9 +58,10 @@ def _recorded(
         paths.append(Line("target", scene.target[None], "black", 1.0))
     for line in paths:
         _Stroke(server.scene, line.label, line, longest).show(0)
+    _add_obstacles(server.scene, scene, longest)
     strokes = []
     for k, line in enumerate(scene.moving):
-        name = visible(line.label or f"part {k + 1}").replace("/", "\u2215")
+        name = _node(line.label or f"part {k + 1}")
         strokes.append(_Stroke(server.scene, name, line, longest))
     above = np.append(middle[:2], scene.high[2] / longest + 0.08)
     caption = server.scene.add_label("/caption", "", position=above)
@@ -72,6 +74,26 @@ def _recorded(
         recording.insert_sleep(1.0 / fps)
         progress(k + 1, len(scene.rows))
     return recording.as_html()
+
+
+def _node(name: str) -> str:
+    """Return a name of a part of the page, which is no path."""
+    return visible(name).replace("/", "\u2215")
+
+
+def _add_obstacles(page: Any, scene: Scene, longest: float) -> None:
+    """Draw the obstacles of a scene."""
+    for k, solid in enumerate(scene.obstacles):
+        surface = surface_of(solid, scene.low, scene.high)
+        if len(surface.faces):
+            page.add_mesh_simple(
+                f"/obstacle {k + 1} {_node(solid.name)}".rstrip(),
+                surface.vertices / longest,
+                surface.faces,
+                color=to_rgb(COLOR),
+                opacity=OPACITY,
+                side="double",
+            )
 
 
 class _Stroke:

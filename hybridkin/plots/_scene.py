@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from numpy.typing import NDArray
 
 from hybridkin._core.texts import plot_label
 from hybridkin.plots._canvas import COLORS, Space, label_space, small_legend
+from hybridkin.plots._obstacles import COLOR, OPACITY, Solid, surface_of
+
+_TOP = (-0.1, -0.2, 1.0)  # where the name of an obstacle stands, for an eye at the usual place
 
 
 class Line(NamedTuple):
@@ -48,6 +53,7 @@ class Scene(NamedTuple):
     rows: NDArray  # (K,) rows that are frames
     moving: list[Line]
     captions: list[str]
+    obstacles: list[Solid]
 
 
 class Stage:
@@ -59,6 +65,7 @@ class Stage:
         xlim, ylim, zlim = np.stack([scene.low, scene.high], axis=1)
         ax.set(xlim=xlim, ylim=ylim, zlim=zlim)
         label_space(ax, scene.unit)
+        add_obstacles(ax, scene.obstacles)
         if len(scene.target):
             ax.plot(*scene.target.T, color="black", linewidth=1.0, label="target")
         trail = ax.plot([], [], [], color=COLORS[0], linewidth=1.2, linestyle="--")
@@ -88,3 +95,20 @@ class Stage:
             line, dot = self.cursor
             line.set_xdata(np.repeat(scene.steps[row], 2))
             dot.set_data([scene.steps[row]], [scene.error[row]])
+
+
+def add_obstacles(ax: Space, obstacles: Sequence[Solid]) -> None:
+    """Draw obstacles, in the unit of axes that have their limits."""
+    low, high = np.array([ax.get_xlim(), ax.get_ylim(), ax.get_zlim()]).T
+    for solid in obstacles:
+        surface = surface_of(solid, low, high)
+        if not len(surface.faces):
+            continue
+        ax.add_collection3d(
+            Poly3DCollection(
+                surface.triangles, shade=True, facecolors=COLOR, alpha=OPACITY, linewidths=0.0
+            )
+        )
+        if solid.name:
+            place = surface.vertices[(surface.vertices @ _TOP).argmax()]
+            ax.text(*place, plot_label(solid.name), fontsize="small")

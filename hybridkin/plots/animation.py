@@ -32,6 +32,7 @@ from hybridkin.plots._canvas import (
     space_or_new,
     steps_of,
 )
+from hybridkin.plots._obstacles import Convex, extent, solids
 from hybridkin.plots._page import page
 from hybridkin.plots._scene import Line, Scene, Stage
 from hybridkin.plots.models import Model, predicted
@@ -62,6 +63,8 @@ class TrackAnimation(Display):
         Name of `x` in the legend.
     expected : array-like of shape (T,), optional
         Error of the robot to expect [m]. Default: the distance from the target is shown.
+    obstacles : sequence of Obstacle, default=()
+        Obstacles around the robot, from `hybridkin.obstacles`.
 
     Attributes
     ----------
@@ -102,6 +105,7 @@ class TrackAnimation(Display):
         rows: ArrayLike | None = None,
         name: str = "tip",
         expected: ArrayLike | None = None,
+        obstacles: Sequence[Convex] = (),
     ) -> None:
         self.x = shaped(x, "x", "T3")
         T = len(self.x)
@@ -123,6 +127,7 @@ class TrackAnimation(Display):
             raise ValueError(f"`body` must hold {K} configurations, got {len(body.points)}.")
         self.body = body
         self.name = str(name)
+        self.obstacles = solids(obstacles)
 
     @classmethod
     def from_estimator(
@@ -137,6 +142,7 @@ class TrackAnimation(Display):
         expected: ArrayLike | None = None,
         names: Sequence[str] = (),
         n_frames: int = 150,
+        obstacles: Sequence[Convex] = (),
     ) -> Self:
         """Return the film of a robot that runs through given configurations.
 
@@ -161,6 +167,8 @@ class TrackAnimation(Display):
             Names of the actuators, see `BackboneDisplay`.
         n_frames : int, default=150
             Frames at most, evenly in time.
+        obstacles : sequence of Obstacle, default=()
+            Obstacles around the robot, from `hybridkin.obstacles`.
 
         Returns
         -------
@@ -185,7 +193,16 @@ class TrackAnimation(Display):
             finite = np.isfinite(q).all(axis=1)
             x = np.full((len(q), 3), np.nan)
             x[finite] = predicted(model, q[finite])
-        return cls(x, target=target, t=t, body=body, rows=rows, name=name, expected=expected)
+        return cls(
+            x,
+            target=target,
+            t=t,
+            body=body,
+            rows=rows,
+            name=name,
+            expected=expected,
+            obstacles=obstacles,
+        )
 
     @property
     def fps(self) -> float:
@@ -313,6 +330,7 @@ class TrackAnimation(Display):
         finite = everything[np.isfinite(everything).all(axis=1)]
         if len(finite) == 0:
             raise ValueError("`x` must hold at least one known tip; all rows are NaN.")
+        finite = np.concatenate([finite, extent(self.obstacles)])
         low = finite.min(axis=0)
         high = finite.max(axis=0)
         margin = 0.04 * float((high - low).max()) or 1e-3
@@ -349,6 +367,7 @@ class TrackAnimation(Display):
             rows=self.rows,
             moving=[line._replace(points=scale * line.points) for line in self.lines()],
             captions=[self.caption(k, unit) for k in range(len(self.rows))],
+            obstacles=[solid.scaled(scale) for solid in self.obstacles],
         )
 
 

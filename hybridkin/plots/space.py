@@ -25,7 +25,8 @@ from hybridkin.plots._canvas import (
     small_legend,
     space_or_new,
 )
-from hybridkin.plots._scene import Line
+from hybridkin.plots._obstacles import Convex, extent, solids
+from hybridkin.plots._scene import Line, add_obstacles
 from hybridkin.plots.models import Model, body_of
 
 _BODY = "#404040"
@@ -185,6 +186,9 @@ class BackboneDisplay(Display):
         Tips that a learned model predicts [m]; the learned correction is dotted.
     rigid : bool, default=False
         Whether the points are joints with straight links between.
+    obstacles : sequence of Obstacle, default=()
+        Obstacles around the robot, from `hybridkin.obstacles`; one without an end, such as a
+        half-space, is cut at the picture.
 
     Attributes
     ----------
@@ -219,6 +223,7 @@ class BackboneDisplay(Display):
         tips: ArrayLike | None = None,
         predicted: ArrayLike | None = None,
         rigid: bool = False,
+        obstacles: Sequence[Convex] = (),
     ) -> None:
         points = plain(points, "points")
         if points.ndim == 2:
@@ -242,6 +247,7 @@ class BackboneDisplay(Display):
         self.tips = shaped(self.points[:, -1] if tips is None else tips, "tips", "K3", K)
         self.predicted = shaped_or_empty(predicted, "predicted", "K3", K)
         self.rigid = rigid
+        self.obstacles = solids(obstacles)
 
     @classmethod
     def from_estimator(
@@ -252,6 +258,7 @@ class BackboneDisplay(Display):
         n_points: int = 12,
         tips: ArrayLike | None = None,
         names: Sequence[str] = (),
+        obstacles: Sequence[Convex] = (),
     ) -> Self:
         """Return the body of a chain, or of a fitted hybrid model, in given configurations.
 
@@ -271,13 +278,15 @@ class BackboneDisplay(Display):
             reaches it. Default: see `model`.
         names : sequence of str, optional
             Names of the actuators: each has a colour of its own. Default: colours by segment.
+        obstacles : sequence of Obstacle, default=()
+            Obstacles around the robot, see `BackboneDisplay`.
 
         Returns
         -------
         BackboneDisplay
             Not drawn yet.
         """
-        return cls(**body_of(model, q, n_points, tips), names=names)
+        return cls(**body_of(model, q, n_points, tips), names=names, obstacles=obstacles)
 
     def plot(self, ax: Axes | None = None, *, unit: str = "cm") -> Self:
         """Draw into a 3-D axes and return self.
@@ -306,7 +315,10 @@ class BackboneDisplay(Display):
             self._draw_body(space, scale)
         if space.get_legend_handles_labels()[1]:
             small_legend(space, loc="upper left")
+        surroundings = [solid.scaled(scale) for solid in self.obstacles]
+        space.auto_scale_xyz(*extent(surroundings).T, had_data=True)
         label_space(space, unit)
+        add_obstacles(space, surroundings)
         return self._drawn(space)
 
     def lines(self, *, body: bool = True, tip: bool = True) -> list[Line]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from hybridkin import InverseKinematics, RigidChain
+from hybridkin import InverseKinematics, RigidChain, obstacles
 from hybridkin.ik.trajectories import figure_eight
 
 DT, N_JOINTS = 0.01, 7
@@ -144,5 +144,74 @@ def test_against_quadratic_programs(race, seven_joints, peer, limits):
         f"tracker, 7 joints, {limits}",
         f"{peer.__name__.lower()} (daqp), the same arm",
         ticking(ours, lap),
+        ticking(theirs, lap),
+    )
+
+
+# Balls about the seven links and their end, and four obstacles about the path.
+BALLS = [(0.5, 0.05), (1.5, 0.05), (2.5, 0.05), (3.5, 0.05), (4.5, 0.04), (5.5, 0.04), (6.5, 0.04)]
+BALLS.append((7.0, 0.03))
+CLEARANCE = 0.01  # [m]
+
+
+class MinkAmongObstacles(Mink):
+    """The same with mink's collision avoidance between eight balls of the arm and four others."""
+
+    def __init__(self, urdf, scene, places):
+        super().__init__(urdf)
+        mink, mujoco = pytest.importorskip("mink"), pytest.importorskip("mujoco")
+        spec = mujoco.MjSpec.from_string(urdf)
+        ball = mujoco.mjtGeom.mjGEOM_SPHERE
+        for k, (link, place, radius) in enumerate(places):
+            spec.body(link).add_geom(name=f"ball{k}", type=ball, size=[radius] * 3, pos=place)
+        for k, (center, radius) in enumerate(scene):
+            spec.worldbody.add_geom(name=f"obstacle{k}", type=ball, size=[radius] * 3, pos=center)
+        model = spec.compile()
+        self.configuration = mink.Configuration(model, START.copy())
+        pairs = [([f"ball{k}" for k in range(8)], [f"obstacle{k}" for k in range(4)])]
+        avoidance = mink.CollisionAvoidanceLimit(
+            model, pairs, minimum_distance_from_collisions=CLEARANCE, gain=0.85
+        )
+        self.limits = [*self.limits, avoidance]
+
+
+@pytest.mark.parametrize("place", ["far", "in the way"])
+def test_against_collision_avoidance(race, seven_joints, place):
+    """A whole tick of each among four spheres, beside the path or on it."""
+    chain = RigidChain.from_urdf(seven_joints, "link7")
+    at_start = chain(torch.tensor(START)).numpy()
+    center = at_start + np.array([0.02, 0.05, -0.03])
+    away = 0.16 if place == "in the way" else 0.5
+    ways = np.array([[1.0, 0.0, 0.3], [0.0, 1.0, 0.2], [-1.0, 0.2, 0.4], [0.1, -1.0, 0.1]])
+    scene = [(center + away * way / np.linalg.norm(way), 0.06) for way in ways]
+    balls = [obstacles.Sphere(middle, radius) for middle, radius in scene]
+    ours = InverseKinematics(
+        chain,
+        dq_max=2.0,
+        q_pref=0.0,
+        dt=DT,
+        obstacles=balls,
+        body_points=BALLS,
+        clearance=CLEARANCE,
+    )
+    clear = ours.settings.clear
+    tracker = ours.tracker(START)
+    places = []
+    for at, radius in BALLS:
+        joint = min(int(at), N_JOINTS - 1)
+        places.append((f"link{joint + 1}", [0.02 * (at - joint), 0.0, 0.15 * (at - joint)], radius))
+    theirs = MinkAmongObstacles(seven_joints, scene, places)
+    lap = figure_eight(center, (0.1, 0.05), duration=4.0, dt=DT).x
+    gaps = []
+    for point in [*lap, *lap]:
+        q = tracker.step(point)
+        theirs.step(point)
+        gaps.append(float(clear.smallest(torch.tensor(q)[None], clear.scene)))
+    assert min(gaps) > -1e-9
+    assert (min(gaps) < 1e-3) == (place == "in the way")
+    race(
+        f"tracker, 7 joints, 8 balls and 4 spheres {place}",
+        "mink (daqp) with collision avoidance, the same arm",
+        ticking(tracker, lap),
         ticking(theirs, lap),
     )

@@ -16,9 +16,11 @@ from saved_models import FOLDER, elastic_chain, structural_chain, tendon_chain, 
 from hybridkin import (
     ConstantCurvatureChain,
     ElasticTendonChain,
+    IKStatus,
     InverseKinematics,
     as_forward_model,
     load_model,
+    obstacles,
     robots,
 )
 from hybridkin._core.plan import NoKernel
@@ -101,13 +103,24 @@ TASKS = {
     "axis": (lambda: AxisTask(trunk(), [1.0, 0.0, 2.0], length=0.2), {}),
     "points": (lambda: PointsTask(trunk(), [0.5, 1.0]), {}),
     "half-spaces": (trunk, {"tip_limits": (np.eye(3), [0.03, 0.03, 0.29])}),
+    "obstacles": (
+        trunk,
+        {
+            "obstacles": [
+                obstacles.Sphere([0.1, 0.0, 0.2], 0.04),
+                obstacles.Box([0.0, 0.15, 0.2], [0.1, 0.1, 0.3]),
+            ],
+            "body_points": [(0.5, 0.03), (1.0, 0.03)],
+        },
+    ),
 }
 
 
 @needs_cc
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "dtype"), [*((name, "float64") for name in TASKS), ("pose", "float32")]
+    ("name", "dtype"),
+    [*((name, "float64") for name in TASKS), ("pose", "float32"), ("obstacles", "float32")],
 )
 def test_the_code_of_other_tasks(tmp_path, name, dtype):
     make, settings = TASKS[name]
@@ -161,6 +174,60 @@ int main(void) {
     return 0;
 }
 """
+
+
+AMONG = """
+#include <stdio.h>
+#include "robot.h"
+int main(void) {
+    const double start[9] = {%s}, target[3] = {%s};
+    double ball[19] = {%s};
+    robot_state state;
+    robot_reset(&state, start);
+    for (int i = 0; i < 60; i++) {
+        ball[0] -= 0.002;
+        robot_obstacle(&state, 0, ball);
+        robot_obstacle(&state, 2, ball); /* there is none */
+        robot_step(&state, target, NULL, NULL);
+        for (int j = 0; j < 9; j++) printf("%%.17g ", state.q[j]);
+        printf("%%d\\n", state.blocked);
+    }
+    return 0;
+}
+"""
+
+
+@needs_cc
+@pytest.mark.slow
+def test_the_code_keeps_clear_of_obstacles_that_move(tmp_path):
+    chain = robots.bionic_handling_assistant()
+    ball = obstacles.Sphere([0.35, 0.05, 0.65], 0.06)
+    wall = obstacles.HalfSpace([0.0, -1.0, 0.0], -0.12)
+    points = [(1.0, 0.05), (2.0, 0.05), (3.0, 0.05)]
+    options = {"q_min": 0.15, "q_max": 0.35, "dq_max": 0.5, "body_points": points}
+    ik = InverseKinematics(chain, obstacles=[ball, wall], **options)
+    start = np.full(9, 0.25)
+    target = np.array([0.1, 0.15, 0.7])
+    export_c(ik, tmp_path, name="robot")
+    rows = (start, target, ball.numbers.tolist())
+    numbers = [", ".join(map(repr, map(float, row))) for row in rows]
+    (tmp_path / "among.c").write_text(AMONG % tuple(numbers))
+    sources = ("robot.c", "among.c")
+    program = built(tmp_path, "-fsanitize=address,undefined", sources=sources)
+    found = np.loadtxt(subprocess.check_output([program], text=True).splitlines())
+    tracker = ik.tracker(start)
+    expected = []
+    blocked = []
+    for k in range(len(found)):
+        tracker.obstacles = [ball.moved([0.35 - 0.002 * (k + 1), 0.05, 0.65]), wall]
+        expected.append(tracker.step(target))
+        blocked.append(tracker.status is IKStatus.BLOCKED)
+    close = rounding.of_commands([start, *expected])
+    np.testing.assert_allclose(found[:, :9], expected, rtol=0, atol=close)
+    assert sum(blocked) > 10
+    assert (found[:, 9] >= blocked).all()
+    readme = (tmp_path / "README.md").read_text()
+    assert "3 points of the body keep clear of 2 obstacles" in readme
 
 
 @needs_cc
@@ -254,8 +321,10 @@ def test_code_for_motors_moves_the_robot_as_in_metres(tmp_path):
 
 @needs_cc
 @pytest.mark.slow
-def test_the_readme_bounds_the_stack(tmp_path):
-    model = limited(load_model(FOLDER / "blend.safetensors"))
+@pytest.mark.parametrize("among", [False, True])
+def test_the_readme_bounds_the_stack(tmp_path, among):
+    settings = TASKS["obstacles"][1] if among else {}
+    model = limited(load_model(FOLDER / "blend.safetensors"), **settings)
     export_c(model, tmp_path, name="robot")
     readme = " ".join((tmp_path / "README.md").read_text().split())
     bound = int(re.search(r"on top\): \d+ and (\d+) bytes", readme)[1])

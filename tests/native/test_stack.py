@@ -18,6 +18,7 @@ from hybridkin import (
     InverseKinematics,
     RigidChain,
     as_forward_model,
+    obstacles,
 )
 from hybridkin._core.plan import MOST, Plan
 from hybridkin.ik._compiled import core_of
@@ -108,6 +109,11 @@ def test_functions_of_the_library_take_little_stack(tmp_path, kind):
         spaces = np.random.default_rng(0).standard_normal((ACTUATORS, 3)), np.ones(ACTUATORS)
         ik = InverseKinematics(model, **options, weights=2.0, tip_limits=spaces)
         plans.append(core_of(ik.settings).plan)
+    if kind in ("arcs", "elastic"):
+        balls = [obstacles.Sphere([0.1 * k, 0.0, 1.0], 0.01) for k in range(4)]
+        points = [(0.5 + k, 0.01) for k in range(SEGMENTS - 1)] + [(float(SEGMENTS), 0.01)]
+        among = {"obstacles": balls, "body_points": points, "tip_limits": spaces}
+        plans.append(core_of(InverseKinematics(model, **options, **among).settings).plan)
     program = painted(tmp_path)
     for plan in plans:
         write_plan(tmp_path / "plan", plan, q)

@@ -79,7 +79,9 @@ def test_a_unit_closes_the_loop_with_measurements_and_restores_its_state(tmp_pat
 
 
 @NEEDS_OCTAVE
-@pytest.mark.parametrize("kind", ["trunk", "network", "elastic", "half-space", "hysteresis"])
+@pytest.mark.parametrize(
+    "kind", ["trunk", "network", "elastic", "half-space", "hysteresis", "obstacles"]
+)
 def test_octave_computes_as_python(kind, tmp_path):
     controller = systems.CONTROLLERS[kind]()
     module = controller.settings.task.steered[0]

@@ -22,6 +22,7 @@ from hybridkin.app.cli._values import (
     between,
     count,
     hysteresis,
+    length,
     names,
     not_negative,
     numbers,
@@ -354,13 +355,15 @@ def _view(command: argparse.ArgumentParser) -> None:
     Opens a page of this machine with the robot in 3D. Drag the target, and the tip follows; move a
     slider, and an actuator moves. "Wiggle every actuator" shows whether a description bends the
     right way. With a log its tips are coloured by the error of the model, and a click on one moves
-    the robot there. Ctrl-C ends it.
+    the robot there. Obstacles can be dragged, and the body keeps clear of them while it follows the
+    target. Ctrl-C ends it.
 
     Some examples:
       hybridkin view model
       hybridkin view model --path path.csv --unit mm   # a button follows it, in a loop
       hybridkin view robot.toml log.csv
       hybridkin view model --q-min=-8 --q-max 8 --dq-max 20
+      hybridkin view model --obstacles scene.toml --clearance 5mm
       hybridkin view model --no-browser --port 9000    # over ssh: forward this port
 
     Limits are in the unit and sign of the robot's logs. Default: those of `track`; without any, the
@@ -380,6 +383,7 @@ def _view(command: argparse.ArgumentParser) -> None:
     add("--port", type=count, default=8080, help="port, or the next free one (8080)")
     add("--no-browser", action="store_true", help="print the address, open nothing")
     _add_limits(command)
+    _add_obstacles(command)
     _add_log(command)
 
 
@@ -403,6 +407,7 @@ def _track(command: argparse.ArgumentParser) -> None:
       hybridkin track model --shape figure-eight --size 40,20 --unit mm --duration 8 --out track
       hybridkin track model --shape spiral --size 5,20 --unit mm --turns 3 --out track
       hybridkin track model --shape line --size 0,30,0 --unit mm --q-min=-8 --q-max 8 --out track
+      hybridkin track model path.csv --obstacles scene.toml --clearance 5mm --out track
 
     A path file has the columns t, x, y, z, or x, y, z together with --dt.
 
@@ -413,6 +418,17 @@ def _track(command: argparse.ArgumentParser) -> None:
     --out-of-reach the tip goes as near as it can. The last line says how many points are reached
     and missed, by how much, and the error to expect over all of them. The exit code is 1 if a fifth
     of the points are missed or outside the log, with --fail-missed if one is missed.
+
+    With --obstacles the whole body keeps clear of what a file describes:
+
+      [[sphere]]
+      center = [0.0, 0.08, 0.5]     # [m], in the frame of the tip
+      radius = 0.03
+
+    and [[box]], [[capsule]], [[half_space]]; all keys:
+    python -c "import hybridkin; help(hybridkin.obstacles.read_scene)". The report gives the least
+    distance of the body to each, and the number of points with the status BLOCKED, where an
+    obstacle is in the way.
 
     The first rows have the status LEAD_IN. They lead to the path from where the robot stands:
     --from rest (no tendon pulled), --from=A,B,... (a value of every actuator in the unit and sign
@@ -473,6 +489,7 @@ def _track(command: argparse.ArgumentParser) -> None:
         metavar="MM",
         help="accepted error [mm] (0.1)",
     )
+    _add_obstacles(command)
     _add_delay(command, "kept for `verify`; the commands do not depend on it (0)")
     where = "where the robot stands before the path (rest)"
     stand: Any = {"default": "rest", "dest": "start", "metavar": "rest|path|A,B,..."}
@@ -534,6 +551,7 @@ def _animate(command: argparse.ArgumentParser) -> None:
       hybridkin animate model track --out track.mp4
       hybridkin animate model track/track.csv --out track.html --frames 80
       hybridkin animate robot.toml log.csv --out log.gif      # the commands of a log
+      hybridkin animate model track --obstacles scene.toml --out track.html
     """
     add = command.add_argument
     _add_model(command)
@@ -560,6 +578,8 @@ def _animate(command: argparse.ArgumentParser) -> None:
         metavar="N",
         help="largest number of frames (150)",
     )
+    text = "obstacles to show (none)"
+    add("--obstacles", type=Path, metavar="SCENE.toml", help=text)
     add("--force", action="store_true", help=_REPLACE_OTHERS)
 
 
@@ -576,6 +596,7 @@ def _export(command: argparse.ArgumentParser) -> None:
       hybridkin export model --out robot_c --name robot --dtype float32 --dt 0.001
       hybridkin export model --fmu robot.fmu --name robot --dt 0.01
       hybridkin export model --mex --out matlab --name robot --dt 0.01
+      hybridkin export model --out robot_c --dt 0.01 --obstacles scene.toml --clearance 5mm
     """
     add = command.add_argument
     _add_model(command)
@@ -598,6 +619,7 @@ def _export(command: argparse.ArgumentParser) -> None:
     )
     add("--force", action="store_true", help=_REPLACE_OTHERS)
     _add_limits(command)
+    _add_obstacles(command)
 
 
 def _describe(command: argparse.ArgumentParser) -> None:
@@ -643,6 +665,15 @@ def _add_limits(command: argparse.ArgumentParser) -> None:
     }
     for name, text in largest.items():
         add(name, type=numbers, default=math.inf, metavar="A,...", help=text)
+
+
+def _add_obstacles(command: argparse.ArgumentParser) -> None:
+    """Add the scene around the robot, and the distance to it."""
+    add = command.add_argument
+    text = "obstacles that the whole body keeps clear of (none)"
+    add("--obstacles", type=Path, metavar="SCENE.toml", help=text)
+    text = "least distance between body and obstacles, such as 5mm (0)"
+    add("--clearance", type=length, default=0.0, metavar="LENGTH", help=text)
 
 
 def _add_model(

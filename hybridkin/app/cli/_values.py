@@ -7,6 +7,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from hybridkin.formats import METRES
+
 
 def numbers(text: str) -> Sequence[float]:
     """Return numbers separated by commas."""
@@ -19,6 +21,15 @@ def numbers(text: str) -> Sequence[float]:
 def in_millimetres(text: str) -> Sequence[float]:
     """Return positive numbers of millimetres in metres."""
     return tuple(float(f"{1e-3 * size:.9g}") for size in map(positive, text.split(",")))
+
+
+def length(text: str) -> float:
+    """Return a length with its unit, such as 5mm, in metres."""
+    for unit in sorted(METRES, key=len, reverse=True):
+        size = text.removesuffix(unit).strip()
+        if size != text:
+            return METRES[unit] * not_negative(size)
+    raise argparse.ArgumentTypeError(f"must be a length with its unit, as in 5mm, got {text!r}")
 
 
 def start(text: str) -> Sequence[float] | str:

@@ -30,7 +30,13 @@ from hybridkin.app.cli._terminal import Stages, write
 from hybridkin.formats import FRAMES, METRES, check_outputs, visible, write_file
 
 if TYPE_CHECKING:
-    from hybridkin import ForwardModel, HybridForwardModel, robots, trajectories
+    from hybridkin import (
+        ForwardModel,
+        HybridForwardModel,
+        obstacles,
+        robots,
+        trajectories,
+    )
     from hybridkin.app import LogReport
     from hybridkin.app.workflow import (
         Counts,
@@ -226,7 +232,9 @@ def _view(arguments: argparse.Namespace, stages: Stages) -> _Result:
     path = _path_of(arguments, model)
     limits = _scaled_limits(arguments, model)
     place = {"host": arguments.host, "port": arguments.port}
-    with hybridkin.app.view(model, log, path=path, **vars(limits), **place) as shown_robot:
+    around = {"obstacles": _scene(arguments), "clearance": arguments.clearance}
+    options = {**vars(limits), **around, **place}
+    with hybridkin.app.view(model, log, path=path, **options) as shown_robot:
         address = shown_robot.address
         words = f"{visible(model.description_.name)} is at {address}. Ctrl-C ends it."
         stages.note(words, important=True)
@@ -275,6 +283,8 @@ def _track(arguments: argparse.Namespace, stages: Stages) -> _Result:
         delay=arguments.delay or 0.0,
         counts=_counts(arguments, model),
         out_of_reach=arguments.out_of_reach,
+        obstacles=_scene(arguments),
+        clearance=arguments.clearance,
         force=arguments.force,
         progress=stages,
     )
@@ -340,6 +350,7 @@ def _animate(arguments: argparse.Namespace, stages: Stages) -> _Result:
         unit=arguments.unit,
         speed=arguments.speed,
         n_frames=arguments.frames,
+        obstacles=_scene(arguments),
         force=arguments.force,
         progress=stages,
     )
@@ -362,6 +373,8 @@ def _export(arguments: argparse.Namespace, stages: Stages) -> _Result:
         dtype=arguments.dtype,
         dt=arguments.dt,
         limits=None if arguments.dt is None else _limits(arguments, model),
+        obstacles=_scene(arguments),
+        clearance=arguments.clearance,
         force=arguments.force,
     )
     return report, 0
@@ -499,6 +512,13 @@ _COMMANDS = (
     _demo,
 )
 _RUN = {command.__name__[1:]: command for command in _COMMANDS}
+
+
+def _scene(arguments: argparse.Namespace) -> list[obstacles.Obstacle]:
+    """Return the obstacles of the file that the arguments name; none without."""
+    if arguments.obstacles is None:
+        return []
+    return hybridkin.obstacles.read_scene(arguments.obstacles)
 
 
 def _model_of(arguments: argparse.Namespace) -> HybridForwardModel:

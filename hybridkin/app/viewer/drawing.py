@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, TypeAlias
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from hybridkin import Commands, ForwardModel
+from hybridkin import Commands, ForwardModel, obstacles
 from hybridkin.app.viewer.steered import SteeredRobot
 from hybridkin.app.workflow.model import is_fitted, tips_at
 from hybridkin.datasets import Log
-from hybridkin.plots import BackboneDisplay
+from hybridkin.formats import visible
+from hybridkin.plots import BackboneDisplay, obstacle_surface
 
 Color: TypeAlias = tuple[int, int, int]
 
@@ -21,10 +23,13 @@ ORANGE = (235, 150, 30)
 RED = (210, 50, 50)
 BLUE = (40, 90, 200)
 GREY = (150, 150, 150)
+BROWN = (166, 124, 82)
 YELLOW = (250, 215, 70)
 GHOSTS = {"nominal model": (90, 90, 90), "calibrated model": (150, 90, 190)}
 _POINTS = 10  # drawn along a segment
 _MOST_ROWS = 2000  # of a log, drawn as a cloud
+_LABEL = 0.03  # height of a name above its obstacle, relative to what is shown
+_UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 _CLICK = 2.0  # distance of a click from a row, relative to the size of its dot
 
 
@@ -108,6 +113,90 @@ class Body:
 def _body_of(model: Any, robot: SteeredRobot) -> BackboneDisplay:
     """Return the body of a model at the configuration of a robot."""
     return BackboneDisplay.from_estimator(model, robot.q, n_points=_POINTS)
+
+
+class DraggedObstacle:
+    """An obstacle with arrows, by which it is dragged.
+
+    Parameters
+    ----------
+    scene : viser scene
+        Where it is drawn.
+    name : str
+        Name of its node.
+    obstacle : Obstacle
+        The obstacle.
+    corners : ndarray of shape (2, 3)
+        Least and largest corner of what is shown [m]; a half-space is cut there.
+    drag : callable
+        Called with its new center (3,) [m] when the page drags it.
+    """
+
+    def __init__(
+        self,
+        scene: Any,
+        name: str,
+        obstacle: obstacles.Obstacle,
+        corners: NDArray,
+        drag: Callable[[NDArray], None],
+    ) -> None:
+        center = obstacle.center.numpy()
+        surface = obstacle_surface(obstacle, *corners)
+        middle = center
+        top = 0.0
+        if len(surface.faces):
+            ends = np.stack([surface.vertices.min(axis=0), surface.vertices.max(axis=0)])
+            middle = ends.mean(axis=0)
+            top = 0.5 * float(np.ptp(ends[:, 2]))
+        self._to_center = center - middle
+        self._drag = drag
+        size = float(np.ptp(corners, axis=0).max())
+        self._arrows = scene.add_transform_controls(
+            name, scale=0.1 * size, disable_rotations=True, position=middle
+        )
+        self._arrows.on_update(self._dragged)
+        if len(surface.faces):
+            scene.add_mesh_simple(
+                f"{name}/surface",
+                surface.vertices - middle,
+                surface.faces,
+                color=BROWN,
+                opacity=0.5,
+                side="double",
+            )
+        if obstacle.name:
+            above = (0.0, 0.0, top + _LABEL * size)
+            scene.add_label(f"{name}/label", visible(obstacle.name), position=above)
+
+    def _dragged(self, event: Any) -> None:
+        if event.client is not None:  # not one of our own
+            self._drag(np.array(self._arrows.position) + self._to_center)
+
+    def place(self, obstacle: obstacles.Obstacle) -> None:
+        """Draw it where it is, if the page has it elsewhere; obstacles are not turned."""
+        there = obstacle.center.numpy() - self._to_center
+        if not np.allclose(self._arrows.position, there, rtol=0.0, atol=1e-9):
+            self._arrows.position = there
+        if not np.array_equal(self._arrows.wxyz, _UPRIGHT):
+            self._arrows.wxyz = _UPRIGHT
+
+
+class Balls:
+    """The balls along the body that keep clear of obstacles."""
+
+    def __init__(self, scene: Any, robot: SteeredRobot) -> None:
+        self.frame = scene.add_frame("/balls", show_axes=False, visible=False)
+        self._balls = []
+        for k, radius in enumerate(robot.balls[1].tolist()):
+            ball = scene.add_icosphere(f"/balls/{k + 1}", radius, BLUE, opacity=0.15)
+            self._balls.append(ball)
+
+    def move(self, robot: SteeredRobot) -> None:
+        """Draw them where they are, if they are shown."""
+        if not self.frame.visible:
+            return
+        for ball, point in zip(self._balls, robot.balls[0], strict=True):
+            ball.position = point
 
 
 class Ghost:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from threading import Event, Thread
 from typing import Any
 
@@ -17,10 +18,21 @@ from hybridkin import (
     ForwardModel,
     HybridForwardModel,
     as_forward_model,
+    obstacles,
     open_model,
     trajectories,
 )
-from hybridkin.app.viewer.drawing import BLUE, GREEN, ORANGE, RED, Body, Ghost, LogCloud
+from hybridkin.app.viewer.drawing import (
+    BLUE,
+    GREEN,
+    ORANGE,
+    RED,
+    Balls,
+    Body,
+    DraggedObstacle,
+    Ghost,
+    LogCloud,
+)
 from hybridkin.app.viewer.motions import (
     Loop,
     Motion,
@@ -40,6 +52,7 @@ __all__ = ["LiveView", "view"]
 
 _CAMERA = np.array([0.9, -1.1, 0.4])  # from the middle, relative to the robot's size
 _PAUSE = 0.1  # between two updates of the words [s]
+_MARGIN = 0.1  # of what is shown of half-spaces, relative to the robot's size
 
 
 def view(
@@ -51,6 +64,8 @@ def view(
     q_max: ArrayLike = np.inf,
     dq_max: ArrayLike = np.inf,
     ddq_max: ArrayLike = np.inf,
+    obstacles: Sequence[obstacles.Obstacle] = (),
+    clearance: float = 0.0,
     host: str = "127.0.0.1",
     port: int = 8080,
 ) -> LiveView:
@@ -68,6 +83,11 @@ def view(
     q_min, q_max, dq_max, ddq_max : float or array-like of shape (n,), optional
         Limits of position, speed and acceleration [unit of q, s]. Default: those of the model and
         its description; else the range of the log, and one second for the whole range.
+    obstacles : sequence of Obstacle, default=()
+        Obstacles around the robot, from `hybridkin.obstacles`, which can be dragged. While the
+        robot follows a target its whole body keeps clear of them.
+    clearance : float, default=0.0
+        Least distance between body and obstacles [m].
     host : str, default="127.0.0.1"
         Address to listen to. The default can be reached from this machine alone, and by no page
         but this one.
@@ -109,7 +129,8 @@ def view(
         q_min = np.where(np.isfinite(q_min), q_min, np.nanmin(log.q, axis=0))
         q_max = np.where(np.isfinite(q_max), q_max, np.nanmax(log.q, axis=0))
     limits = path_limits(model, q_min=q_min, q_max=q_max, dq_max=dq_max, ddq_max=ddq_max)
-    return LiveView(SteeredRobot(model, limits), log, path, host, port)
+    robot = SteeredRobot(model, limits, obstacles, clearance)
+    return LiveView(robot, log, path, host, port)
 
 
 def _has_range(model: HybridForwardModel) -> bool:
@@ -166,6 +187,13 @@ class LiveView:
         middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
         self._server.initial_camera.look_at = middle
         self._server.initial_camera.position = middle + robot.size * _CAMERA
+        margin = _MARGIN * robot.size
+        ends = np.stack([corners.min(axis=0) - margin, corners.max(axis=0) + margin])
+        self._obstacles = []
+        for k, obstacle in enumerate(robot.obstacles):
+            drag = partial(self.move_obstacle, k)
+            name = f"/obstacle {k + 1}"
+            self._obstacles.append(DraggedObstacle(scene, name, obstacle, ends, drag))
         scene.add_frame("/base", axes_length=0.15 * robot.size, axes_radius=0.004 * robot.size)
         self._body = Body(scene, robot.model, robot)
         self._aim = scene.add_transform_controls(
@@ -196,11 +224,15 @@ class LiveView:
                 name = "learned error: mechanical to hybrid tip"
                 self._switched[name] = self._rows.learned
             scene.on_click()(self._clicked)
-        self._ghosts = []
+        self._moving: list[Ghost | Balls] = []
         for name, chain in _other_models(robot.model).items():
             ghost = Ghost(scene, name, chain, robot)
-            self._ghosts.append(ghost)
+            self._moving.append(ghost)
             self._switched[name] = ghost.line
+        if robot.obstacles:
+            balls = Balls(scene, robot)
+            self._moving.append(balls)
+            self._switched["body that keeps clear"] = balls.frame
         if self._expected() > 0.0:
             self._switched["expected error"] = self._radius
 
@@ -234,6 +266,12 @@ class LiveView:
         """Move the actuators to q (n,), as if their sliders were moved."""
         self._motion = None
         self.robot.go_to(q)
+        self._wake.set()
+
+    def move_obstacle(self, k: int, center: NDArray) -> None:
+        """Move an obstacle to a center (3,) [m], as if it was dragged there."""
+        self.robot.move_obstacle(k, center)
+        self._obstacles[k].place(self.robot.obstacles[k])
         self._wake.set()
 
     def _add_panel(self, log: Log | None, path: trajectories.Trajectory | None) -> None:
@@ -363,8 +401,8 @@ class LiveView:
         robot = self.robot
         with self._server.atomic():
             self._body.move(robot)
-            for ghost in self._ghosts:
-                ghost.move(robot)
+            for part in self._moving:
+                part.move(robot)
             if self._radius.visible:
                 self._radius.position = robot.x
                 self._radius.scale = self._expected()
@@ -390,6 +428,7 @@ class LiveView:
         lines = [f"**{situation.words}**"]
         if np.isfinite(situation.error):
             lines.append(f"error {1e3 * situation.error:.2f} mm")
+        lines += self._about_obstacles()
         lines.append("at limits: " + (", ".join(at_limits) or "none"))
         lines.append(f"{self.ticks_per_second:.0f} ticks/s")
         motion = self._motion
@@ -399,6 +438,16 @@ class LiveView:
         for slider, value in zip(self._sliders, robot.q / self._factor, strict=True):
             if abs(slider.value - value) > 0.5 * slider.step:
                 slider.value = float(np.clip(value, slider.min, slider.max))
+
+    def _about_obstacles(self) -> list[str]:
+        """Return how far the nearest obstacle is, in words; nothing without obstacles."""
+        robot = self.robot
+        if not robot.obstacles:
+            return []
+        distances = robot.distances
+        nearest = int(distances.argmin())
+        name = markdown(robot.obstacles[nearest].name or f"obstacle {nearest + 1}")
+        return [f"nearest obstacle: {1e3 * distances[nearest]:.1f} mm, {name}"]
 
 
 def _other_models(model: HybridForwardModel) -> dict[str, ForwardModel]:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from threading import Lock
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hybridkin import HybridForwardModel, IKStatus, InverseKinematics
+from hybridkin import HybridForwardModel, IKStatus, InverseKinematics, obstacles
 from hybridkin.app.workflow.domain import Domain, PathLimits
 from hybridkin.app.workflow.model import commands_for, domain_distance, tips_at
 from hybridkin.datasets import Log
@@ -21,6 +22,7 @@ _TRAVEL = 1.0  # time for the whole range of an actuator without a limit of spee
 _CLOSE = 1e-3  # distance to a target that is reached, relative to the size of the robot
 _STILL = 1e-5  # largest step of a robot at rest, relative to the range of an actuator
 _REMEMBERED = 30_000  # commands kept: ten minutes
+_FARTHEST = 100.0  # of an obstacle that is moved, in sizes of the robot
 
 
 class Situation(NamedTuple):
@@ -55,6 +57,10 @@ class SteeredRobot:
         The model.
     limits : PathLimits
         Limits of the actuators. Without a limit of speed the whole range takes one second.
+    obstacles : sequence of Obstacle, default=()
+        What the body keeps clear of while it follows a target.
+    clearance : float, default=0.0
+        Least distance between body and obstacles [m].
 
     Attributes
     ----------
@@ -64,9 +70,17 @@ class SteeredRobot:
         Tip and target [m].
     size : float
         Largest extent of the reachable space [m].
+    obstacles : tuple of Obstacle
+        The obstacles where they are now.
     """
 
-    def __init__(self, model: HybridForwardModel, limits: PathLimits) -> None:
+    def __init__(
+        self,
+        model: HybridForwardModel,
+        limits: PathLimits,
+        obstacles: Sequence[obstacles.Obstacle] = (),
+        clearance: float = 0.0,
+    ) -> None:
         self.model = model
         self.limits = limits
         self.domain = Domain(model, limits)
@@ -80,7 +94,7 @@ class SteeredRobot:
         self.size = float(np.ptp(np.vstack([tips, np.zeros(3)]), axis=0).max())
         self._close = _CLOSE * self.size
         self._largest_step = speed / RATE
-        self._tracker = InverseKinematics(
+        self._ik = InverseKinematics(
             model.module_.tip_model.without_hysteresis,
             q_min=limits.q_min,
             q_max=limits.q_max,
@@ -89,7 +103,11 @@ class SteeredRobot:
             q_pref=self.q,
             gain=_GAIN,
             dt=1.0 / RATE,
-        ).tracker(self.q, tol=self._close)
+            obstacles=obstacles,
+            clearance=clearance,
+        )
+        self._tracker = self._ik.tracker(self.q, tol=self._close)
+        self.obstacles = self._tracker.obstacles
         self._goal = self.q
         self._by_hand = False  # the actuators are set, not led by the target
         self._resting = False
@@ -116,6 +134,21 @@ class SteeredRobot:
         with self._lock:
             self._goal = np.clip(goal, self.limits.q_min, self.limits.q_max)
             self._by_hand = True
+            self._resting = False
+
+    def move_obstacle(self, k: int, center: ArrayLike) -> None:
+        """Move an obstacle, without a turn, to a center (3,) [m].
+
+        A place that is not finite, or too far away to matter, is ignored.
+        """
+        place = np.asarray(center, dtype=float)
+        if place.shape != (3,) or not (np.abs(place) <= _FARTHEST * self.size).all():
+            return
+        with self._lock:
+            moved = [*self.obstacles]
+            moved[k] = moved[k].moved(place)
+            self._tracker.obstacles = moved
+            self.obstacles = self._tracker.obstacles
             self._resting = False
 
     def tick(self) -> bool:
@@ -158,9 +191,24 @@ class SteeredRobot:
                 out_of_reach = True
                 if self._tracker.status == IKStatus.AT_LIMITS:
                     words += ": actuators are at their limits"
+                elif self._tracker.status == IKStatus.BLOCKED:
+                    words = "BLOCKED: an obstacle is in the way"
             if not inside:
                 words += ", outside the domain of the model"
             return Situation(f"{words}.", reached, out_of_reach, inside, error)
+
+    @property
+    def distances(self) -> NDArray[np.float64]:
+        """The least distance (K,) of the body to every obstacle [m], negative inside."""
+        with self._lock:
+            return np.asarray(self._ik.body_distances(self.q, self.obstacles))
+
+    @property
+    def balls(self) -> tuple[NDArray, NDArray]:
+        """Middles (P, 3) and radii (P,) of the balls that keep clear of obstacles [m]."""
+        with self._lock:
+            points, radii = self._ik.body_balls(self.q)
+        return np.asarray(points), np.asarray(radii)
 
     @property
     def held(self) -> NDArray[np.bool_]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -16,6 +16,7 @@ from hybridkin.app.workflow.model import (
     tips_at,
     trained_range,
 )
+from hybridkin.app.workflow.surroundings import Surroundings
 from hybridkin.arguments import real_array
 
 _WALKERS = 256
@@ -152,6 +153,7 @@ class Domain:
 
     model: HybridForwardModel
     limits: PathLimits
+    surroundings: Surroundings = field(default_factory=Surroundings)
 
     @cached_property
     def preferred(self) -> NDArray:
@@ -239,7 +241,7 @@ class Domain:
         return commands[far.argmin(axis=-1)]
 
     def solver(self, dt: float = 0.01) -> InverseKinematics:
-        """Return inverse kinematics within the limits, with `preferred` as its posture.
+        """Return inverse kinematics within the limits, clear of obstacles; posture: `preferred`.
 
         With hysteresis the limits of q are those of the commands.
         """
@@ -253,6 +255,8 @@ class Domain:
             ddq_max=limits.ddq_max,
             q_pref=self.preferred,
             dt=dt,
+            obstacles=self.surroundings.obstacles,
+            clearance=self.surroundings.clearance,
         )
 
     def postures(self, n: int) -> NDArray:

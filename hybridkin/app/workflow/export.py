@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from hybridkin import HybridForwardModel
+from hybridkin import HybridForwardModel, obstacles
 from hybridkin.app.workflow.domain import Domain, PathLimits, path_limits
 from hybridkin.app.workflow.model import hysteresis_in_words
-from hybridkin.app.workflow.report import Report
+from hybridkin.app.workflow.report import Report, millimetres
+from hybridkin.app.workflow.surroundings import Surroundings
 from hybridkin.arguments import one_of
 from hybridkin.native import export_c, export_fmu, export_mex
 
@@ -29,6 +31,8 @@ def export_model(
     dtype: str = "float64",
     dt: float | None = None,
     limits: PathLimits | None = None,
+    obstacles: Sequence[obstacles.Obstacle] = (),
+    clearance: float = 0.0,
     force: bool = False,
 ) -> Report[dict[str, object]]:
     """Write a model as C code, see `native.export_c`.
@@ -50,26 +54,39 @@ def export_model(
         configuration in the domain of the model. Default: the model alone.
     limits : PathLimits, optional
         Limits of the step. Default: `path_limits`.
+    obstacles : sequence of Obstacle, default=()
+        What the whole body keeps clear of in the step, from `hybridkin.obstacles`; needs `dt`.
+    clearance : float, default=0.0
+        Least distance between body and obstacles [m].
     force : bool, default=False
         Replace files that `export` did not write.
 
     Returns
     -------
     Report of dict
-        Number type "dtype", control period "dt" [s] and "limits" of the step.
+        Number type "dtype", control period "dt" [s] and "limits" of the step, and names of the
+        "obstacles".
     """
     one_of(kind, "kind", _TITLES)
     if kind != "c" and dtype != "float64":
         raise ValueError('`dtype` must be "float64" here; "float32" is for C code.')
-    record: dict[str, object] = {"dtype": dtype, "dt": dt}
+    surroundings = Surroundings(obstacles, clearance)
+    if surroundings and dt is None:
+        raise ValueError("`obstacles` need `dt` (--dt): they are limits of the step.")
+    record: dict[str, object] = {"dtype": dtype, "dt": dt, "obstacles": surroundings.names}
     report = Report(_TITLES[kind], record)
     report.text(f"{name}: {model.n_features_in_} actuators, {dtype}.")
     exported = model.module_.tip_model
     if dt is not None:
         limits = limits or path_limits(model)
-        exported = Domain(model, limits).solver(dt=dt)
+        exported = Domain(model, limits, surroundings).solver(dt=dt)
         record["limits"] = limits
         report.text(f"Steps of {dt:g} s within limits: {limits.source}.")
+    if surroundings:
+        report.text(
+            f"The body keeps {millimetres(clearance)} clear of {{names}}.",
+            names=", ".join(surroundings.names),
+        )
     about_q = _about_q(model)
     report.text("{about_q}", about_q=about_q)
     words = {"name": name, "about_q": about_q}

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
 import hybridkin
-from hybridkin import Commands, HybridForwardModel
+from hybridkin import Commands, HybridForwardModel, obstacles
 from hybridkin.app.workflow.model import has_body, promised_errors, tips_at
 from hybridkin.app.workflow.report import Progress, Report, quiet
 from hybridkin.app.workflow.track import LEAD_IN, TARGET, read_track
@@ -21,6 +22,7 @@ def animate_track(
     unit: str = "cm",
     speed: float = 1.0,
     n_frames: int = 150,
+    obstacles: Sequence[obstacles.Obstacle] = (),
     force: bool = False,
     progress: Progress = quiet,
 ) -> Report[dict[str, object]]:
@@ -41,6 +43,8 @@ def animate_track(
         Speed of the film relative to the motion.
     n_frames : int, default=150
         Largest number of frames.
+    obstacles : sequence of Obstacle, default=()
+        Obstacles to show, from `hybridkin.obstacles`.
     force : bool, default=False
         Replace a file that `animate` did not write.
     progress : callable, optional
@@ -74,6 +78,7 @@ def animate_track(
         expected=promised.mean if promised.known else None,
         names=model.description_.log.q if model.module_.robot.rings else (),
         n_frames=n_frames,
+        obstacles=obstacles,
     )
     try:
         film.save(out, unit=unit, speed=speed, progress=partial(progress, "drawing frames"))

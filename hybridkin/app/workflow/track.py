@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import hybridkin
-from hybridkin import HybridForwardModel, IKStatus, Track, robots, trajectories
+from hybridkin import HybridForwardModel, IKStatus, Track, obstacles, robots, trajectories
 from hybridkin.app.workflow.counts import Counts
 from hybridkin.app.workflow.domain import Domain, PathLimits, path_limits
 from hybridkin.app.workflow.errors import Errors
@@ -38,12 +38,20 @@ from hybridkin.app.workflow.report import (
     percent,
     quiet,
 )
+from hybridkin.app.workflow.surroundings import (
+    ObstacleDistance,
+    Surroundings,
+    add_bodies,
+    add_distances,
+    nearest_distances,
+)
 from hybridkin.datasets import Log, load_log, log_columns
 from hybridkin.formats import METRES, duration_in_words
 
 TARGET = ("target_x", "target_y", "target_z")
 TIME = "t"
 _REACHED = (IKStatus.CONVERGED, IKStatus.OUT_OF_DOMAIN)
+_FINAL = (IKStatus.CONVERGED, IKStatus.BLOCKED)  # smaller steps change nothing
 LEAD_IN = "LEAD_IN"  # status of the rows before the path
 _STEP = 0.002  # largest tip step between two solutions, relative to the extent of the workspace
 _PEAK = 1.875  # largest speed of `min_jerk`
@@ -95,6 +103,13 @@ class TrackRecord:
         How much later than its command a tip will be read [s], for `verify_track`.
     period : float
         Time from row to row that the commands are computed for [s].
+    blocked : int
+        Number of points that an obstacle keeps the robot from.
+    clearance : float
+        Least distance between body and obstacles that was asked for [m].
+    obstacles : list of ObstacleDistance
+        By obstacle its "name" and the least distances of the body by the model [m]: along the
+        "path", and on the "lead_in", the way to it. Empty without obstacles.
     """
 
     command: str = "track"
@@ -115,6 +130,9 @@ class TrackRecord:
     limits: PathLimits
     delay: float = 0.0
     period: float = _DT
+    blocked: int = 0
+    clearance: float = 0.0
+    obstacles: list[ObstacleDistance] = field(default_factory=list)
 
 
 def _write(report: Report[TrackRecord], model: HybridForwardModel, better: str) -> None:
@@ -150,6 +168,7 @@ def _write(report: Report[TrackRecord], model: HybridForwardModel, better: str) 
     if plane_in_words(model):
         report.text("{plane}", plane=plane_in_words(model))
     report.text(*_about_counts(record, Counts.read(model.description_.training)))
+    add_distances(report, record.obstacles, record.clearance, record.blocked)
     report.text(_outcome(record, better))
 
 
@@ -204,6 +223,8 @@ def track_path(
     delay: float = 0.0,
     counts: Counts = _ANY_NUMBER,
     out_of_reach: bool = False,
+    obstacles: Sequence[obstacles.Obstacle] = (),
+    clearance: float = 0.0,
     force: bool = False,
     progress: Progress = quiet,
 ) -> Report[TrackRecord]:
@@ -217,6 +238,7 @@ def track_path(
     are all that the robot gets. Rows with the status LEAD_IN move from `start` to the path, below
     ``dq_max`` (default: a tenth of the largest range per second) and ``ddq_max``. With backlash,
     columns ``effective_NAME`` hold the motion of the actuators, half its width from the commands.
+    With obstacles the column ``distance`` is that of the body to the nearest one.
 
     Parameters
     ----------
@@ -242,6 +264,12 @@ def track_path(
         ``dq_max`` by one number.
     out_of_reach : bool, default=False
         If points of the path are out of reach, track them as closely as possible.
+    obstacles : sequence of Obstacle, default=()
+        What the whole body keeps clear of on the path, from `hybridkin.obstacles`. The lead-in goes
+        straight; the report says where it does not keep clear.
+    clearance : float, default=0.0
+        Least distance between body and obstacles [m], to which the error to expect of the model
+        comes where it is known.
     force : bool, default=False
         Replace files of `out` that `track` did not write.
     progress : callable, optional
@@ -259,9 +287,11 @@ def track_path(
         the largest scale in reach.
     """
     check_out(out, "track", ["track.csv", "track.png", "commands.png"], force=force)
-    domain = Domain(model, limits or path_limits(model))
+    surroundings = Surroundings(obstacles, clearance)
+    domain = Domain(model, limits or path_limits(model), surroundings)
     stands = _start(domain, start)
-    check_reach(domain, path, tol, out_of_reach, progress)
+    free = replace(domain, surroundings=Surroundings())
+    check_reach(free, path, tol, out_of_reach, progress)
     attempts = Attempts(progress)
     if not model.hysteresis_ or stands is None:
         track = best_track(domain, path, tol, attempts)
@@ -294,7 +324,9 @@ def track_path(
     missed = np.isin(track.status, _REACHED, invert=True)
     better = ""
     if is_fitted(model) and inside.mean() < 1.0 - _MOST_OUTSIDE:
-        better = f": {better_place(domain, path, tol)}"
+        better = f": {better_place(free, path, tol)}"
+    ik = domain.solver()
+    distances = surroundings.distances(ik, whole.effective)
     record = TrackRecord(
         model=str(model.description_.path),
         n=len(path),
@@ -307,12 +339,15 @@ def track_path(
         expected=_expected(model, track),
         expected_inside=_expected(model, track, track.status == IKStatus.CONVERGED),
         rounded=rounded,
-        backend=domain.solver().tracker(track.q[0]).backend,
+        backend=ik.tracker(track.q[0]).backend,
         hysteresis=widths_in_log(model),
         lead_in=n_lead,
         limits=domain.limits,
         delay=delay,
         period=_period(whole),
+        blocked=statuses.count(IKStatus.BLOCKED.name),
+        clearance=clearance,
+        obstacles=nearest_distances(surroundings, distances, n_lead),
     )
     report = Report(f"{model.description_.name}: a path of {len(path)} points", record)
     _write(report, model, better)
@@ -321,9 +356,10 @@ def track_path(
         commands["actuator"] = whole.effective
     _add_path(report, model, track)
     _add_commands(report, domain, whole.t, commands, n_lead)
+    add_bodies(report, surroundings, model, track, distances[n_lead:])
     statuses = [LEAD_IN] * n_lead + statuses
     digits = 15 if counts else 9
-    _add_track(report, whole, commands, statuses, model.description_.log, digits)
+    _add_track(report, whole, commands, statuses, distances, model.description_.log, digits)
     report.write(out)
     return report
 
@@ -417,6 +453,7 @@ def _with_lead_in(track: Track, lead_in: NDArray, model: HybridForwardModel) -> 
         x=np.concatenate([x, track.x]),
         target=np.concatenate([x, track.target]),
         error=np.concatenate([np.zeros(n), track.error]),
+        clearance=np.concatenate([np.full(n, np.nan), track.clearance]),
     )
 
 
@@ -471,7 +508,7 @@ def best_track(
         track = ik.track(fine, q0=commands, tol=tol, progress=attempts, state=state)
         # Only the points are kept, not the steps between them.
         tracks.append(_alone(_thinned(track, every), domain, tol, state))
-        if tracks[-1].score == (len(path), len(path)):
+        if np.isin(tracks[-1].status, _FINAL).all():
             break
         commands = track.q[0]
     return max(tracks, key=attrgetter("score"))  # of equal tracks the first
@@ -583,10 +620,14 @@ def _add_track(
     track: Track,
     commands: Mapping[str, NDArray],
     statuses: Sequence[str],
+    distances: NDArray,
     log: robots.LogFormat,
     digits: int,
 ) -> None:
-    """Add commands with so many digits, and with backlash what actuators do, point by point."""
+    """Add commands with so many digits, and with backlash what actuators do, point by point.
+
+    With distances (T, K) of the body to obstacles also the least of them.
+    """
     lengths = np.column_stack([track.x, track.target, track.error]) / METRES[log.x_unit]
     head = [TIME, *log.q, *log.x, *TARGET, "error", "status"]
     columns = [
@@ -598,6 +639,9 @@ def _add_track(
     if "actuator" in commands:
         head += [f"effective_{name}" for name in log.q]
         columns += [*_text(log.to_log(commands["actuator"]))]
+    if distances.size:
+        head.append("distance")
+        columns.append(_text(distances.min(axis=1) / METRES[log.x_unit]))
     report.table_file("track.csv", head, zip(*columns, strict=True))
 
 

@@ -70,7 +70,9 @@ HK_API int64_t hk_work(const int32_t *code, int32_t at) {
     int around = n + m + m * n, slots = 0;
     if (code[at + HK_KIND] == HK_IK) {
         around = IK_SEARCH_WORK(n);
-        slots = IK_SLOTS_WORK(n, code[at + HK_M], code[at + HK_MORE + 2]) +
+        const int32_t *more = code + at + HK_MORE, *body = ik_body_of(code, at);
+        const int n_pairs = IK_PAIRS_OF(body, more[IK_N_OBSTACLES]);
+        slots = IK_SLOTS_WORK(n, code[at + HK_M], more[IK_N_NORMALS], body[IK_N_POINTS], n_pairs) +
                 IK_STATE_SIZE(n, IK_ROWS, IK_WIDTH);
     }
     return (int64_t)HK_LANES * (1 + around + model) + of_units + slots;
@@ -177,8 +179,9 @@ static ik_settings ik_settings_in(const hk_call *call) {
 
 /* A period, see `ik_tick`. */
 HK_API int32_t hk_ik_tick(const ik_follower *f) {
-    const ik_settings ik = ik_settings_in(&f->call);
+    ik_settings ik = ik_settings_in(&f->call);
     const ik_state now = ik_state_of(&ik, f->state);
+    ik.scene = now.scene;
     return ik_tick(&ik, f->state, now.seen);
 }
 

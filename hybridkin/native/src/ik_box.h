@@ -352,22 +352,29 @@ static inline void ik_calm(int n, const real *task, real *z) {
     for (int j = 0; j < n && share < R(1.0); j++) z[j] *= share;
 }
 
-/* Limits of a step beside its bounds: rows A (k, n) of any length with A dq <= b. */
+/* Limits of a step beside its bounds: rows A (k, n) of any length with A dq <= b, the most important
+   ones first. */
 typedef struct {
     int k;
     const real *A, *b;
 } ik_rows_t;
 
+static const ik_rows_t ik_no_rows = {0, NULL, NULL};
+
+/* Whether there can be any, and how many at most: of half-spaces, and of obstacles. */
+#define HK_LIMITS (HK_SPACES || HK_OBSTACLES)
+enum { IK_MOST_LIMITS = HK_SPACES * HK_MAX_N + HK_OBSTACLES * IK_PAIRS_MOST + !HK_LIMITS };
+
 /* The step within its limits whose task part does not depend on the preferred step z: near a
    singularity the damped task is solved for z = 0 first, then z chooses among the steps that move
    the tip so. `work`: IK_STRICT_WORK(n, m) numbers. */
-#define IK_STRICT_WORK(n, m) (NEAR_WORK(n, m) + HK_MAX_N * (n))
+#define IK_STRICT_WORK(n, m) (NEAR_WORK(n, m) + IK_MOST_LIMITS * (n))
 static void ik_strict_step(int m, int n, const real *J, const real *g, const real *v,
                            const real *z, const real *lower, const real *upper,
                            const ik_rows_t *rows, real damping_sq, int calm, real *work,
                            real *dq) {
     real sum = R(0.0), moved[IK_MOST_ROWS], none[HK_MAX_N], slower[HK_MAX_N];
-    real *A = work + NEAR_WORK(n, m), b[HK_MAX_N], most[HK_MAX_N];
+    real *A = work + NEAR_WORK(n, m), b[IK_MOST_LIMITS], most[IK_MOST_LIMITS];
     real mu[IK_MOST_ROWS] = {R(0.0)};
     int preferred = 0;
     for (int k = 0, at = 0; k < m; k++)
@@ -452,6 +459,6 @@ static HK_NOINLINE void ik_within(int m, int n, const real *J, const real *g, co
                                   const ik_rows_t *rows, real damping_sq, int calm, real *work,
                                   real *dq) {
     ik_strict_box(m, n, J, g, v, z, lower, upper, damping_sq, calm, dq);
-    if (HK_SPACES && ik_breaks(n, rows, dq))
+    if (HK_LIMITS && ik_breaks(n, rows, dq))
         ik_strict_step(m, n, J, g, v, z, lower, upper, rows, damping_sq, calm, work, dq);
 }

@@ -107,7 +107,7 @@ static void ik_slide_on(const ik_search_t *s, ik_row *r, int phase) {
         r->step.posture[j] = r->share * r->free[j];
         if (phase == IK_POLISH && (*lower >= R(0.0) || *upper <= R(0.0))) *lower = *upper = R(0.0);
     }
-    ik_limited_step(&s->ik, r->live.J, r->live.e, slides, NULL, NULL, &r->step);
+    ik_limited_step(&s->ik, r->live.J, r->live.e, slides, NULL, &ik_no_rows, &r->step);
     ik_ask(&s->ik, r, phase);
 }
 
@@ -143,7 +143,7 @@ static void ik_lower_on(const ik_search_t *s, ik_row *r) {
             r->step.upper[j] = R(0.5) * s->ik.period[j];
             r->step.lower[j] = -r->step.upper[j];
         }
-    ik_limited_step(&s->ik, r->live.J, r->live.e, 0, &trust, NULL, &r->step);
+    ik_limited_step(&s->ik, r->live.J, r->live.e, 0, &trust, &ik_no_rows, &r->step);
     IK_OF(m, ik_rows_of, n, r->live.J, r->step.dq, moved);
     for (int i = 0; i < m; i++) moved[i] = r->live.e[i] - moved[i];
     r->predicted = ik_norm(m, moved);

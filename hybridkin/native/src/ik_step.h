@@ -21,6 +21,13 @@ typedef struct {
     real most, fraction;           /* the largest possible size of one, and how much is taken */
     const real *axis;              /* (3) of the tip that is steered */
     const real *spaces, *offsets;  /* normals (m, n_spaces), and how far along them */
+#if HK_OBSTACLES
+    int n_obstacles;
+    const int32_t *body;           /* entries of its node: points that keep clear of obstacles, */
+    const real *keep;              /* distances: of points, of pairs of them that can meet, along the
+                                      body up to points [m]; then the place of its base */
+    const real *scene;             /* the obstacles, where they are now */
+#endif
     hk_hysteresis hysteresis;
     real gain, beta, dt, damping;  /* gain < 0: 1 / dt; damping < 0: adaptive */
     real least;                    /* lambda^2 at least, in the unit where nothing has a weight */
@@ -30,9 +37,15 @@ typedef struct {
 enum { IK_WEIGHTED, IK_IN_PLANE, IK_TAUT, IK_WISHED, IK_END, IK_SLOTS = IK_END + 3 };
 
 /* Numbers of these matrices. */
-#define IK_SLOTS_WORK(n, m, normals)                                                               \
+#define IK_SLOTS_WORK(n, m, normals, points, pairs)                                                \
     (IK_SLOTS * (n) * ((m) + (normals)) +                                                          \
-     HK_SPACES * (IK_STRICT_WORK(n, (m) + (normals)) + HK_MAX_N * (n)))
+     HK_LIMITS * (IK_STRICT_WORK(n, (m) + (normals)) + IK_MOST_LIMITS * (n)) +                     \
+     HK_OBSTACLES * IK_NEAR_WORK(n, points, pairs))
+#define IK_NEAR_WORK(n, points, pairs) ((9 + 3 * (n)) * (points) + 6 * (pairs))
+
+/* Pairs of a point of a body and an obstacle, or of two points that can meet. */
+#define IK_PAIRS_OF(body, n_obstacles)                                                             \
+    ((body)[IK_N_POINTS] * (n_obstacles) + (body)[IK_N_MEETING])
 
 static inline real *ik_slot(const ik_settings *ik, int which) {
     return ik->slots + which * ik->n * (ik->m + ik->n_normals);
@@ -44,9 +57,19 @@ static inline real *ik_rows_memory(const ik_settings *ik) {
     return ik_slot(ik, IK_SLOTS) + IK_STRICT_WORK(ik->n, ik->m + ik->n_normals);
 }
 
+/* Memory for what is near the body. */
+static inline real *ik_near_memory(const ik_settings *ik) {
+    return ik_rows_memory(ik) + IK_MOST_LIMITS * ik->n;
+}
+
 #define IK_IS_POSE(ik) (HK_POSES && (ik)->flags & IK_POSE)
 #define IK_IS_AXIS(ik) (HK_POSES && (ik)->flags & IK_AXIS)
 #define IK_IN_SPACES(ik) (HK_SPACES && (ik)->n_spaces > 0 && (ik)->flags & IK_LIMITED)
+#if HK_OBSTACLES
+#define IK_KEEPS_CLEAR(ik) ((ik)->body[IK_N_POINTS] > 0)
+#else
+#define IK_KEEPS_CLEAR(ik) 0
+#endif
 
 enum { IK_WIDTH = HK_POSES && HK_MAX_R < 16 ? 16 : HK_MAX_R }; /* of a target at most */
 
@@ -55,27 +78,44 @@ typedef struct {
     real lower[HK_MAX_N], upper[HK_MAX_N], posture[HK_MAX_N];
     real dq[HK_MAX_N], promised[IK_ROWS], sigma_min, damping; /* promised: to first order */
     unsigned char held[HK_MAX_N];
-    int stopped; /* by half-spaces of the tip */
+    int stopped, blocked; /* by half-spaces of the tip; by obstacles */
 } ik_step_t;
+
+#if HK_OBSTACLES
+/* The entries of the body of a step; without one it has no points. */
+static inline const int32_t *ik_body_of(const int32_t *code, int at) {
+    static const int32_t none[] = {0, 0};
+    const int body = code[at + HK_MORE + IK_BODY];
+    return body < 0 ? none : code + body + HK_MORE;
+}
+#endif
 
 static inline ik_settings ik_settings_of(const int32_t *code, const real *data, int at,
                                          real *work) {
     const int32_t *node = code + at, *more = node + HK_MORE;
-    const int n = node[HK_N], m = node[HK_M], flags = more[1], n_normals = more[2];
+    const int n = node[HK_N], m = node[HK_M], flags = more[IK_FLAGS];
+    const int n_normals = more[IK_N_NORMALS], n_spaces = more[IK_N_SPACES];
     const real *a = data + node[HK_DATA], *b = a + 6 * n;
-    const real *c = b + 5 + 2 * m + (flags & IK_AXIS ? 3 : 0);
+    const real *c = b + 5 + 2 * m + (flags & IK_AXIS ? 3 : 0), *d = c + (2 + n_normals) * n;
+    const real *scene = d + n_spaces * (m + 1);
+#if HK_OBSTACLES
+    const int32_t *body = ik_body_of(code, at);
+    const int n_points = body[IK_N_POINTS], n_pairs = IK_PAIRS_OF(body, more[IK_N_OBSTACLES]);
+#else
+    enum { n_points = 0, n_pairs = 0 };
+#endif
     const ik_settings ik = {
         .plan = {code, data, R(0.0)},
-        .work = work + IK_SLOTS_WORK(n, m, n_normals),
+        .work = work + IK_SLOTS_WORK(n, m, n_normals, n_points, n_pairs),
         .slots = work,
-        .model = more[0],
+        .model = more[IK_MODEL],
         .n = n,
         .m = m,
         .width = HK_POSES && flags & IK_POSE ? IK_POSE_NUMBERS : m,
         .flags = flags,
         .n_free = HK_POSES && flags & IK_AXIS ? 1 : 0,
         .n_normals = n_normals,
-        .n_spaces = more[3],
+        .n_spaces = n_spaces,
         .low = a,
         .high = a + n,
         .speed = a + 2 * n,
@@ -94,9 +134,15 @@ static inline ik_settings ik_settings_of(const int32_t *code, const real *data, 
         .period = c,
         .pulls = c + n,
         .normals = c + 2 * n,
-        .spaces = c + (2 + n_normals) * n,
-        .offsets = c + (2 + n_normals) * n + more[3] * m,
-        .hysteresis = {more + IK_STAGES, c + (2 + n_normals) * n + more[3] * (m + 1), n,
+        .spaces = d,
+        .offsets = d + n_spaces * m,
+#if HK_OBSTACLES
+        .n_obstacles = more[IK_N_OBSTACLES],
+        .body = body,
+        .keep = data + code[more[IK_BODY] < 0 ? at + HK_DATA : more[IK_BODY] + HK_DATA],
+        .scene = scene,
+#endif
+        .hysteresis = {more + IK_STAGES, scene + IK_OBSTACLE * more[IK_N_OBSTACLES], n,
                        HK_CREEP_ROUNDING * HK_EPS},
     };
     return ik;
@@ -266,10 +312,10 @@ static HK_NOINLINE void ik_limited_in_plane(const ik_settings *ik, const real *J
 }
 
 /* Fill in a step for the task v within its bounds; `slides`: with its posture step. `trust` is
-   lambda^2 / sigma_max^2 in place of the settings' damping, NULL where that counts; `margin` (NULL:
-   none) is what the half-spaces of the tip leave. */
+   lambda^2 / sigma_max^2 in place of the settings' damping, NULL where that counts; `limits` are rows
+   for the unit in which weights are 1. */
 HK_INLINE void ik_limited_step_of(int m, int n, const ik_settings *ik, const real *J, const real *v,
-                                  int slides, const real *trust, const real *margin,
+                                  int slides, const real *trust, const ik_rows_t *limits,
                                   ik_step_t *s) {
     real ends[2 * HK_MAX_N], z[HK_MAX_N], mu[IK_ROWS], g[IK_PAIRS];
     real low = R(0.0), high, damping_sq, *dq = s->dq;
@@ -314,21 +360,13 @@ HK_INLINE void ik_limited_step_of(int m, int n, const ik_settings *ik, const rea
     if (ik->flags & IK_LIMITED) {
         int over =
             ik->n_normals > 0 && ik->flags & IK_WEIGHTS; /* weights turn J out of the plane */
-        real *A = ik_rows_memory(ik);
-        const ik_rows_t rows = {margin ? ik->n_spaces : 0, A, margin};
         for (int j = 0; j < n; j++) over |= ik_clip(dq[j], lower[j], upper[j]) != dq[j];
-        for (int i = 0; HK_SPACES && i < rows.k; i++)
-            for (int j = 0; j < n; j++) {
-                A[n * i + j] = R(0.0);
-                for (int r = 0; r < m; r++)
-                    A[n * i + j] += ik->spaces[r * rows.k + i] * J[n * r + j];
-            }
-        over |= HK_SPACES && ik_breaks(n, &rows, dq);
+        over |= HK_LIMITS && ik_breaks(n, limits, dq);
         if (over && ik->n_normals > 0)
-            ik_limited_in_plane(ik, J, v, z, slides ? s->posture : NULL, lower, upper, &rows,
+            ik_limited_in_plane(ik, J, v, z, slides ? s->posture : NULL, lower, upper, limits,
                                 damping_sq, dq);
         else if (over)
-            ik_within(m, n, J, g, v, z, lower, upper, &rows, damping_sq, ik->least > R(0.0),
+            ik_within(m, n, J, g, v, z, lower, upper, limits, damping_sq, ik->least > R(0.0),
                       ik_strict_memory(ik), dq);
     }
     for (int j = 0; j < n; j++) {
@@ -340,13 +378,13 @@ HK_INLINE void ik_limited_step_of(int m, int n, const ik_settings *ik, const rea
 }
 
 static HK_NOINLINE void ik_limited_step(const ik_settings *ik, const real *J, const real *v,
-                                        int slides, const real *trust, const real *margin,
+                                        int slides, const real *trust, const ik_rows_t *limits,
                                         ik_step_t *s) {
     switch (HK_COMMON(100 * ik->m + ik->n)) {
-    case 306: ik_limited_step_of(3, 6, ik, J, v, slides, trust, margin, s); break;
-    case 309: ik_limited_step_of(3, 9, ik, J, v, slides, trust, margin, s); break;
-    case 606: ik_limited_step_of(6, 6, ik, J, v, slides, trust, margin, s); break;
-    default: IK_OF(ik->m, ik_limited_step_of, ik->n, ik, J, v, slides, trust, margin, s);
+    case 306: ik_limited_step_of(3, 6, ik, J, v, slides, trust, limits, s); break;
+    case 309: ik_limited_step_of(3, 9, ik, J, v, slides, trust, limits, s); break;
+    case 606: ik_limited_step_of(6, 6, ik, J, v, slides, trust, limits, s); break;
+    default: IK_OF(ik->m, ik_limited_step_of, ik->n, ik, J, v, slides, trust, limits, s);
     }
 }
 
@@ -404,7 +442,7 @@ static inline real ik_braking(const ik_settings *ik, const real *J, const real *
                               ik_step_t *s) {
     real least = R(INFINITY);
     for (int j = 0; j < ik->n; j++) s->lower[j] = -least, s->upper[j] = least;
-    ik_limited_step(ik, J, way, 0, NULL, NULL, s);
+    ik_limited_step(ik, J, way, 0, NULL, &ik_no_rows, s);
     for (int j = 0; j < ik->n; j++) {
         const real ratio = ik->accel[j] * seconds * seconds / ik_abs(s->dq[j]);
         least = ratio < least ? ratio : least;
@@ -522,7 +560,7 @@ static void ik_approach(const ik_settings *ik, const real *q, const real *x, con
             more.lower[j] = s->lower[j] - end.dq[j];
             more.upper[j] = s->upper[j] - end.dq[j];
         }
-        ik_limited_step(ik, end.J, end.missing, 0, NULL, NULL, &more);
+        ik_limited_step(ik, end.J, end.missing, 0, NULL, &ik_no_rows, &more);
         for (int j = 0; j < ik->n; j++) {
             end.dq[j] = ik_clip(end.dq[j] + more.dq[j], s->lower[j], s->upper[j]);
             if (more.dq[j] <= more.lower[j]) end.dq[j] = s->lower[j]; /* to the last bit */
@@ -581,6 +619,57 @@ static void ik_arrive(const ik_settings *ik, const real *q, const real *x, const
 
 #include "rest.h"
 
+/* What a step is for: the task v at q, of which half-spaces of the tip allow a part, from an error e.
+   J is that of taut tendons alone. */
+typedef struct {
+    const real *q, *x, *J, *e, *v, *allowed;
+} ik_wish_t;
+
+/* Propose a step within its bounds and rows: with the way out of a singular configuration, and where
+   tendons can only pull it arrives. */
+static HK_NOINLINE void ik_propose(const ik_settings *ik, const ik_wish_t *wish,
+                                   const ik_rows_t *limits, ik_step_t *s) {
+    const real *J = wish->J;
+    ik_limited_step(ik, J, wish->v, ik->flags & IK_POSTURE, NULL, limits, s);
+    ik_motion(ik, J, s->dq, s->promised);
+    if (ik->flags & IK_PULLS) {
+        if (ik_finite(ik->n, s->dq)) ik_arrive(ik, wish->q, wish->x, J, wish->allowed, s);
+    } else if (!IK_IN_SPACES(ik)) {
+        const real damping_sq = s->damping * s->damping;
+        const int lost = !(s->sigma_min > R(0.0)) || damping_sq > R(1.001) * ik->least;
+        if (!lost || !(ik_norm(ik->m, wish->e) > R(0.0))) return;
+        if (ik_norm(ik->m, s->promised) > IK_STUCK * ik_norm(ik->m, wish->v)) return;
+        ik_escape(ik, wish->q, J, wish->e, s);
+        ik_motion(ik, J, s->dq, s->promised);
+    }
+}
+
+#if HK_OBSTACLES
+#include "obstacles.h"
+#endif
+
+/* Write the rows A (n_spaces, n) of the half-spaces and what is left up to them, b, with `tip` (m)
+   where they see it; with a limit of acceleration so little that the robot can stop. */
+static inline void ik_space_rows(const ik_settings *ik, const real *J, const real *tip,
+                                 real seconds, ik_step_t *s, real *A, real *b) {
+    const int k = ik->n_spaces;
+    real left[HK_MAX_N];
+    ik_along(ik, tip, left);
+    for (int i = 0; i < k; i++) {
+        b[i] = ik->offsets[i] - left[i];
+        for (int j = 0; j < ik->n; j++, A++) {
+            *A = R(0.0);
+            for (int r = 0; r < ik->m; r++) *A += ik->spaces[r * k + i] * J[ik->n * r + j];
+            if (ik->flags & IK_WEIGHTS) *A *= ik->unit[j];
+        }
+    }
+    for (int i = 0; i < k && ik->flags & IK_ACCELERATES; i++) {
+        real normal[IK_ROWS];
+        for (int r = 0; r < ik->m; r++) normal[r] = ik->spaces[r * k + i];
+        b[i] = ik_stopping(b[i], ik_braking(ik, J, normal, seconds, s));
+    }
+}
+
 /* Eq. (1) for one period from q: the error e and the motion `feed` of the target (may be NULL) are
    taken back. `tip` (m) is where half-spaces see it. What is not finite, or overflows, holds still,
    with a limit of acceleration after it has braked; from outside the limits the actuators that are
@@ -589,16 +678,17 @@ static HK_NOINLINE void ik_control(const ik_settings *ik, const real *q, const r
                                    const real *J, const real *e, const real *feed, real seconds,
                                    const real *last, const real *tip, const ik_ends *ends,
                                    ik_step_t *s) {
-    const int n = ik->n, m = ik->m, slides = ik->flags & IK_POSTURE;
-    real v[IK_ROWS], gain = ik->gain < R(0.0) ? R(1.0) : ik->gain * seconds;
-    real beta = ik->beta * seconds;
+    const int n = ik->n, m = ik->m;
+    real v[IK_ROWS], allowed[IK_ROWS], b[IK_MOST_LIMITS];
+    real gain = ik->gain < R(0.0) ? R(1.0) : ik->gain * seconds, beta = ik->beta * seconds;
     gain = gain > R(1.0) ? R(1.0) : gain;
     beta = beta > R(1.0) ? R(1.0) : beta;
     for (int i = 0; i < m; i++) v[i] = gain * e[i] + (feed ? feed[i] : R(0.0));
     const real sizes[2] = {ik_norm(m, e), ik_norm(m, v)};
     const int known = !last || ik_finite(n, last);
-    s->stopped = 0;
+    s->stopped = s->blocked = 0;
     if (known && ik_finite(n, q) && ik_finite(m * n, J) && ik_finite(2, sizes)) {
+        const real *whole = J;
         if (ik->flags & IK_PULLS) {
             real *taut = ik_slot(ik, IK_TAUT);
             for (int j = 0; j < m * n; j++) taut[j] = J[j];
@@ -611,32 +701,23 @@ static HK_NOINLINE void ik_control(const ik_settings *ik, const real *q, const r
             for (int i = 0; i < m; i++)
                 v[i] = (share < gain ? share : gain) * e[i] + (feed ? feed[i] : R(0.0));
         }
+        ik_wish_t wish = {q, x, J, e, v, v};
+        ik_rows_t limits = ik_no_rows;
+        if (HK_LIMITS) limits.A = ik_rows_memory(ik), limits.b = b;
         if (IK_IN_SPACES(ik)) {
-            const int k = ik->n_spaces;
-            real margin[HK_MAX_N], left[HK_MAX_N];
-            ik_along(ik, tip, left);
-            for (int i = 0; i < k; i++) margin[i] = ik->offsets[i] - left[i];
-            for (int i = 0; i < k && ik->flags & IK_ACCELERATES; i++) {
-                real normal[IK_ROWS];
-                for (int r = 0; r < m; r++) normal[r] = ik->spaces[r * k + i];
-                margin[i] = ik_stopping(margin[i], ik_braking(ik, J, normal, seconds, s));
-            }
-            ik_bound(ik, q, seconds, last, ends, s);
-            ik_limited_step(ik, J, v, slides, NULL, margin, s);
-            s->stopped = ik_leaves(ik, margin, v);
-            if (s->stopped) ik_allowed(ik, margin, v, v);
-        } else {
-            ik_bound(ik, q, seconds, last, ends, s);
-            ik_limited_step(ik, J, v, slides, NULL, NULL, s);
-            ik_motion(ik, J, s->dq, s->promised);
-            const real damping_sq = s->damping * s->damping;
-            const int lost = !(s->sigma_min > R(0.0)) || damping_sq > R(1.001) * ik->least;
-            if (lost && !(ik->flags & IK_PULLS) && sizes[0] > R(0.0) &&
-                ik_norm(m, s->promised) <= IK_STUCK * ik_norm(m, v))
-                ik_escape(ik, q, J, e, s);
+            limits.k = ik->n_spaces;
+            ik_space_rows(ik, J, tip, seconds, s, ik_rows_memory(ik), b);
+            s->stopped = ik_leaves(ik, b, v);
+            if (s->stopped) ik_allowed(ik, b, v, allowed), wish.allowed = allowed;
         }
-        ik_motion(ik, J, s->dq, s->promised);
-        if (ik->flags & IK_PULLS && ik_finite(n, s->dq)) ik_arrive(ik, q, x, J, v, s);
+        ik_bound(ik, q, seconds, last, ends, s);
+        (void)whole;
+#if HK_OBSTACLES
+        if (IK_KEEPS_CLEAR(ik))
+            ik_step_clear(ik, &wish, whole, seconds, &limits, ik_rows_memory(ik), b, s);
+        else
+#endif
+            ik_propose(ik, &wish, &limits, s);
         if (ik_finite(n, s->dq)) return; /* else v is too large to compute with */
     }
     ik_bound(ik, q, seconds, known ? last : NULL, ends, s);
@@ -652,6 +733,7 @@ static HK_NOINLINE void ik_control(const ik_settings *ik, const real *q, const r
 typedef struct {
     real *target, *feed, *tip, *offset, *x, *error, *q, *dq, *before, *held, *rest, *J;
     real *lead, *tried; /* with hysteresis: its state, and one to try */
+    real *scene;        /* the obstacles; not of a step alone */
     real *seen;         /* the state of readings; not of a step alone */
 } ik_state;
 
@@ -673,11 +755,15 @@ static inline ik_state ik_state_of(const ik_settings *ik, real *state) {
     parts.rest = parts.held + ik->n;
     parts.J = parts.rest + IK_REST_SIZE(ik->m);
     parts.lead = parts.J + ik->m * ik->n;
-    parts.tried = parts.seen = parts.lead;
+    parts.tried = parts.scene = parts.lead;
     if (HK_HYSTERESIS && ik->hysteresis.code[0] > 0) {
         parts.tried += ik->hysteresis.code[HK_STATE_ROWS] * ik->n;
-        parts.seen = parts.tried + ik->hysteresis.code[HK_STATE_ROWS] * ik->n;
+        parts.scene = parts.tried + ik->hysteresis.code[HK_STATE_ROWS] * ik->n;
     }
+    parts.seen = parts.scene;
+#if HK_OBSTACLES
+    parts.seen += IK_OBSTACLE * ik->n_obstacles;
+#endif
     return parts;
 }
 
@@ -889,6 +975,7 @@ static inline int ik_tick(const ik_settings *ik, real *state, real *seen) {
     state[IK_DAMPING] = step.damping;
     state[IK_DISTANCE] = ik_norm(m, now.error);
     state[IK_STOPPED] = (real)step.stopped;
+    if (HK_OBSTACLES) state[IK_BLOCKED] = (real)step.blocked;
     for (int j = 0; j < n; j++) {
         now.dq[j] = step.dq[j];
         now.held[j] = step.held[j];

@@ -35,7 +35,12 @@ typedef struct {
 } near_state;
 
 #define NEAR_WORK(n, m) (2 * ((n) + (m)) * ((n) + (m)))
-#define NEAR_ROUNDING (R(100.0) * HK_EPS)
+/* What rounding may leave of a component of a unit vector that is zero: eps^(2/3). */
+#ifdef HK_FLOAT
+#define NEAR_ROUNDING R(2.4e-5)
+#else
+#define NEAR_ROUNDING R(3.7e-11)
+#endif
 
 /* y (N) = a symmetric matrix times a vector. */
 HK_INLINE void near_times(int N, const real *matrix, const real *vector, real *y) {
@@ -301,8 +306,8 @@ HK_INLINE void ik_nearest_of(int n, int m, const near_problem *p, real *dq) {
     near_multipliers(n, m, p, &s);
     const real unit = IK_CLOSE * HK_EPS, close = unit * ik_largest(n, s.x); /* not of the slack */
     for (int j = 0; j < n; j++) {
-        dq[j] = s.x[j];
         const real low = p->lower[j], high = p->upper[j];
+        dq[j] = ik_clip(s.x[j], low, high);
         if (low > -R(INFINITY) && dq[j] - low <= close + unit * ik_abs(low)) dq[j] = low;
         if (high < R(INFINITY) && high - dq[j] <= close + unit * ik_abs(high)) dq[j] = high;
     }

@@ -23,8 +23,8 @@ typedef int64_t hk_bits;
 #define R(c) ((real)(c))
 
 /* Code exported for one model sets HK_KINDS, one bit per kind of its nodes, its own sizes, and
-   whether its task is a pose (HK_POSES) or has half-spaces (HK_SPACES), or its actuators have
-   hysteresis (HK_HYSTERESIS). */
+   whether its task is a pose (HK_POSES) or has half-spaces (HK_SPACES), its body keeps clear of
+   obstacles (HK_OBSTACLES), or its actuators have hysteresis (HK_HYSTERESIS). */
 #ifdef HK_KINDS
 #define HK_USES(kind) ((HK_KINDS >> (kind)) % 2u)
 #define HK_IS_ONLY_CHAIN(kind) ((HK_KINDS & 30u) == 1u << (kind)) /* of the first four kinds */
@@ -36,6 +36,7 @@ typedef int64_t hk_bits;
 #define HK_IS_ONLY_CHAIN(kind) 0
 #define HK_POSES 1 /* of a task */
 #define HK_SPACES 1
+#define HK_OBSTACLES 1
 #define HK_HYSTERESIS 1
 #define HK_COMMON(sizes) (sizes) /* have instances of their own, which keep all in registers */
 #define HK_INLINE static inline __attribute__((always_inline))

@@ -14,6 +14,9 @@ static void write_outputs(instance_t *unit) {
 #endif
     values[V_ERROR] = unit->state.error;
     values[V_REJECTED] = unit->state.rejected;
+#if HK_OBSTACLES
+    values[V_BLOCKED] = unit->state.blocked;
+#endif
 }
 
 /* At rest at the start command. */
@@ -28,6 +31,9 @@ static ik_settings settings_of(const instance_t *unit, real *work) {
     const double *values = unit->values;
     ik_settings ik = ik_settings_of(code, data, @ROOT@, work);
 @PARAMETERS@
+#if HK_OBSTACLES
+    ik.scene = unit->state.obstacles;
+#endif
     ik.gain = values[V_GAIN];
     ik.beta = values[V_BETA];
     ik.fraction = values[V_FRACTION];
@@ -55,6 +61,11 @@ static int step_unit(instance_t *unit, double step) {
         return refused(unit, "a step must be a multiple of %g s, got %g s", @DT@, step);
     unit->state.memory = values[V_MEMORY] > 0.0 ? values[V_MEMORY] : INFINITY;
     unit->state.delay = values[V_DELAY];
+#if @OBSTACLES@
+    for (int i = 0; i < @OBSTACLES@; i++)
+        for (int k = 0; k < 3; k++)
+            unit->state.obstacles[IK_OBSTACLE * i + k] = values[V_OBSTACLES + 3 * i + k];
+#endif
     /* A measurement is that of one period; without any, the error is that of the model. */
     int known = 0;
     for (int i = 0; i < @WIDTH@; i++) known += !isnan(values[V_MEASURED + i]);

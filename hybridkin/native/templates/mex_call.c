@@ -1,4 +1,4 @@
-    char command[8] = "";
+    char command[16] = "";
     if (n_in > 1 && mxIsChar(in[0])) mxGetString(in[0], command, sizeof command);
     if (!strcmp(command, "reset") && n_in == 2) {
         reset(out, in[1]);
@@ -8,3 +8,4 @@
         step(n_out, out, n_in, in);
         return;
     }
+@CLEAR_CALL@

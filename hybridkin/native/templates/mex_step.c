@@ -46,4 +46,5 @@ static void step(int n_out, mxArray *out[], int n_in, const mxArray *in[]) {
     give(n_out, out, 2, 1, 1, &state.error);
     give(n_out, out, 3, @N@, 1, held);
     give(n_out, out, 4, 1, 1, &rejected);
-}
+@GIVE_BLOCKED@}
+@CLEAR_MEX@

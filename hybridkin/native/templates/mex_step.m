@@ -6,3 +6,4 @@
 %   and whether the measured tip was not used, as it cannot be. The velocity (@TASK@ numbers [m/s])
 %   and the measured tip (@WIDTH@ numbers) may be []; its age [s] is at first 0, then as before.
 %
+@CLEAR_HELP@

@@ -12,7 +12,7 @@ static void ik_model(const ik_settings *ik, const real *q, real *x, real *J) {
 }
 
 /* Numbers of memory for a step, on the stack. */
-enum { STEP_WORK = WORK + IK_SLOTS_WORK(@N@, @TASK@, @NORMALS@) };
+enum { STEP_WORK = WORK + IK_SLOTS_WORK(@N@, @TASK@, @NORMALS@, @POINTS@, @PAIRS@) };
 
 /* Numbers of the state of hysteresis, and what the actuators do, where the model is evaluated. */
 enum { LEAD = @LEAD@ };
@@ -30,6 +30,9 @@ void @NAME@_reset(@NAME@_state *state, const @REAL@ *q) {
     for (int j = 0; j < @N@; j++) state->q[j] = q[j];
 #if HK_HYSTERESIS
     for (int i = 0; i < LEAD; i++) state->hysteresis[i] = q[i % @N@];
+#endif
+#if HK_OBSTACLES
+    for (int i = 0; i < IK_OBSTACLE * @OBSTACLES@; i++) state->obstacles[i] = ik.scene[i];
 #endif
     state->memory = state->seen[IK_SINCE] = (real)INFINITY;
     ik_model(&ik, q, state->x, J);
@@ -77,6 +80,9 @@ static void step_within(const ik_settings *ik, @NAME@_state *state, const @REAL@
     state->sigma_min = all[IK_SIGMA_MIN];
     state->damping = all[IK_DAMPING];
     state->stopped = all[IK_STOPPED] > (real)0;
+#if HK_OBSTACLES
+    state->blocked = all[IK_BLOCKED] > (real)0;
+#endif
     for (int j = 0; j < @N@; j++) {
         state->q[j] = now.q[j];
         state->dq[j] = now.dq[j];
@@ -87,6 +93,10 @@ static void step_within(const ik_settings *ik, @NAME@_state *state, const @REAL@
 void @NAME@_step(@NAME@_state *state, const @REAL@ *target, const @REAL@ *dx,
     const @REAL@ *measured) {
     real work[STEP_WORK];
-    const ik_settings ik = ik_settings_of(code, data, @ROOT@, work);
+    ik_settings ik = ik_settings_of(code, data, @ROOT@, work);
+#if HK_OBSTACLES
+    ik.scene = state->obstacles;
+#endif
     step_within(&ik, state, target, dx, measured);
 }
+@CLEAR_C@

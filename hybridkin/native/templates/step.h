@@ -18,7 +18,7 @@ typedef struct {
                        stamps, that of the next one */
     unsigned char rejected;  /* whether the last measurement was not used, as it cannot be */
     @REAL@ seen[@SEEN@]; /* of measurements, and of x in the last 64 periods */
-@LEAD_FIELD@} @NAME@_state;
+@LEAD_FIELD@@CLEAR_FIELD@} @NAME@_state;
 
 /* Start at rest at the actuator vector q, as read from the robot@WITHOUT@; sets memory to INFINITY
    and delay to 0. */
@@ -32,3 +32,4 @@ void @NAME@_reset(@NAME@_state *state, const @REAL@ *q);
    future, counts as none. */
 void @NAME@_step(@NAME@_state *state, const @REAL@ *target, const @REAL@ *dx,
     const @REAL@ *measured);
+@CLEAR_FUNCTION@

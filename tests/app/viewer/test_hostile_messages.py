@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import hybridkin
-from hybridkin import robots
+from hybridkin import obstacles, robots
 from hybridkin.app.workflow.model import tips_at
 
 viser = pytest.importorskip("viser", reason='needs viser: pip install "hybridkin[view]"')
@@ -204,6 +204,50 @@ def test_no_message_of_a_stranger_ends_the_view(shown):
     assert not shown._sliders[0]._impl.removed
     assert np.isfinite(shown.robot.q).all()
     assert np.shape(shown._aim.position) == (3,)
+
+
+@pytest.fixture
+def among():
+    chain = robots.bionic_handling_assistant()
+    scene = [obstacles.Sphere([0.5, 0.0, 0.5], 0.05), obstacles.HalfSpace([0, 0, 1], -0.3)]
+    with hybridkin.app.view(chain, q_min=0.1, q_max=0.4, obstacles=scene, port=9550) as view:
+        yield view
+
+
+def centers(view):
+    return np.array([obstacle.center.tolist() for obstacle in view.robot.obstacles])
+
+
+def test_the_page_drags_obstacles_and_turns_none(among):
+    drag = {**POSE, "name": "/obstacle 1", "position": [0.4, 0.1, 0.6]}
+    start = {"type": "TransformControlsDragStartMessage", "name": "/obstacle 1"}
+    end = {"type": "TransformControlsDragEndMessage", "name": "/obstacle 1"}
+    connected(among, sending(start, {**drag, "wxyz": [0.0, 1.0, 0.0, 0.0]}, end))
+    until(lambda: np.allclose(centers(among), [[0.4, 0.1, 0.6], [0.0, 0.0, -0.3]]))
+    assert among._obstacles[0]._arrows.wxyz == pytest.approx([1.0, 0.0, 0.0, 0.0])
+    # The arrows of a plane stand in the middle of what is drawn of it.
+    floor = among._obstacles[1]
+    lifted = np.add(floor._arrows.position, [0.0, 0.0, 0.1])
+    drag = {**POSE, "name": "/obstacle 2", "position": lifted.tolist()}
+    connected(among, sending(drag))
+    until(lambda: np.allclose(centers(among)[1], [0.0, 0.0, -0.2]))
+
+
+@pytest.mark.filterwarnings("ignore:The page sent")
+def test_no_message_of_a_stranger_moves_an_obstacle_out_of_the_world(among):
+    before = centers(among)
+    hostile = []
+    places = {f"/obstacle {k + 1}": among._obstacles[k]._arrows.position for k in range(2)}
+    places |= dict.fromkeys(["/obstacle 3", "/obstacle 1/surface"], np.zeros(3))
+    for name, place in places.items():
+        drag = {**POSE, "name": name, "position": place.tolist()}
+        hostile += [{**drag, "position": value} for value in VALUES]
+        hostile += [{**drag, "wxyz": value} for value in VALUES]
+        hostile += [{**drag, "position": [far, 0.0, 0.0]} for far in (NAN, INF, 1e300, 1e8, 1e5)]
+    assert connected(among, sending(*hostile)) is None
+    np.testing.assert_array_equal(centers(among), before)
+    assert among._obstacles[0]._arrows.position == pytest.approx(before[0])
+    assert is_alive(among)
 
 
 @pytest.mark.filterwarnings("ignore:The page sent")

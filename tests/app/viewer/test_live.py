@@ -8,11 +8,20 @@ import numpy as np
 import pytest
 
 import hybridkin
-from hybridkin import ELMRegressor, HybridForwardModel, datasets, robots, trajectories
+from hybridkin import (
+    ELMRegressor,
+    HybridForwardModel,
+    datasets,
+    obstacles,
+    robots,
+    trajectories,
+)
 from hybridkin.app.cli.main import main
 from hybridkin.app.viewer.motions import Loop
 
 pytest.importorskip("viser", reason='needs viser: pip install "hybridkin[view]"')
+
+PLATE = obstacles.Box([-0.5, 0.0, 0.5], [0.02, 0.5, 0.5])
 
 
 @pytest.fixture(scope="module")
@@ -145,3 +154,23 @@ def test_the_command_ends_at_ctrl_c(fitted, tmp_path, capsys, monkeypatch):
     assert opened
     assert opened[0] in err
     assert opened[0].startswith("http://127.0.0.1:93")
+
+
+def test_obstacles_are_drawn_moved_and_named():
+    scene = [obstacles.Sphere([0.5, 0.0, 0.5], 0.05, name="lamp <img src=x>\n"), PLATE]
+    chain = robots.bionic_handling_assistant()
+    with hybridkin.app.view(chain, q_min=0.1, q_max=0.4, obstacles=scene, port=9350) as shown:
+        until(lambda: "nearest obstacle" in shown._words.content)
+        nodes = shown._server.scene._handle_from_node_name
+        assert {"/obstacle 1", "/obstacle 1/surface", "/obstacle 2"} <= {*nodes}
+        vertices = nodes["/obstacle 1/surface"].vertices
+        np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 0.05, rtol=1e-5)
+        assert not shown._switched["body that keeps clear"].visible
+        shown._switched["body that keeps clear"].visible = True
+        shown.move_obstacle(0, np.array([0.25, 0.0, 0.5]))
+        assert nodes["/obstacle 1"].position == pytest.approx([0.25, 0.0, 0.5])
+        until(lambda: "lamp `<img` `src=x>" in shown._words.content)
+        until(lambda: shown.robot.distances[0] > -1e-6)
+        points, radii = shown.robot.balls
+        until(lambda: nodes[f"/balls/{len(radii)}"].position == pytest.approx(points[-1], abs=0.01))
+        assert nodes["/balls/1"].radius == pytest.approx(radii[0])

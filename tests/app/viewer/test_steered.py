@@ -10,6 +10,7 @@ from hybridkin import (
     ForwardModel,
     HybridForwardModel,
     Hysteresis,
+    obstacles,
     open_model,
     robots,
 )
@@ -112,3 +113,52 @@ def test_threads_may_steer_at_the_same_time(trunk):
     assert np.isfinite(trunk.commands()).all()
     assert (trunk.q >= 0.1).all()
     assert (trunk.q <= 0.4).all()
+
+
+# Obstacles
+
+
+def among(scene, **options):
+    model = open_model(robots.bionic_handling_assistant())
+    limits = path_limits(model, q_min=0.1, q_max=0.4)
+    return SteeredRobot(model, limits, scene, **options)
+
+
+BALL = obstacles.Sphere([0.35, 0.0, 0.55], 0.1)
+FLOOR = obstacles.HalfSpace([0.0, 0.0, 1.0], -0.2)
+
+
+def test_the_body_keeps_clear_of_obstacles_and_the_robot_says_what_is_in_the_way():
+    robot = among([BALL, FLOOR], clearance=0.01)
+    robot.follow(BALL.center.numpy())
+    least = []
+    for _ in range(400):
+        if not robot.tick():
+            break
+        least.append(robot.distances[0])
+    assert min(least) > 0.01 - 1e-6
+    assert least[-1] < 0.02
+    assert robot.situation.words.startswith("BLOCKED: an obstacle is in the way")
+    assert robot.situation.out_of_reach
+
+
+def test_obstacles_that_move_push_the_body_away():
+    robot = among([BALL, FLOOR])
+    robot.follow(robot.x)
+    run(robot, 100)
+    before = robot.q.copy()
+    robot.move_obstacle(0, robot.x + np.array([0.12, 0.0, 0.0]))
+    assert robot.distances[0] < -0.01
+    assert run(robot, 300) > 5
+    assert robot.distances[0] > -1e-6
+    assert (robot.q != before).any()
+    np.testing.assert_array_equal(robot.obstacles[1].center, FLOOR.center)
+
+
+@pytest.mark.parametrize(
+    "place", [[np.nan] * 3, [0.0, np.inf, 0.0], [1e9, 0.0, 0.0], [0.0, 0.0], [[0.0]] * 3, 1.0]
+)
+def test_obstacles_stay_where_no_place_is_given(place):
+    robot = among([BALL])
+    robot.move_obstacle(0, place)
+    np.testing.assert_array_equal(robot.obstacles[0].center, BALL.center)

@@ -1,0 +1,4 @@
+    if (!strcmp(command, "obstacle") && n_in == 4) {
+        obstacle(out, in);
+        return;
+    }
