@@ -577,8 +577,10 @@ class RigidChain(Chain):
     def couplings_to_tip(self) -> Tensor:
         """Motion of the m joints before the tip per motion of every actuator, shape (m, n)."""
         m = self._joints_to_tip
+        if self._part_of_link == 1.0:
+            return self.couplings[:m]
         reached = torch.ones_like(self.couplings[:m])
-        if m and self.kinds[m - 1] == "prismatic":  # the stroke is a part of the link
+        if self.kinds[m - 1] == "prismatic":  # the stroke is a part of the link
             reached[-1] = self._part_of_link
         return reached * self.couplings[:m]
 

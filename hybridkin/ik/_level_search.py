@@ -40,7 +40,7 @@ class _InOneLevel(Search):
 
     def _within(self, e: Tensor) -> Tensor:
         scale = torch.ones_like(e[0])
-        for k, level in enumerate(self.task.levels):
+        for k, level in enumerate(self.task.by_level):
             scale[[*level.rows]] = self.ratio**k
         return self.task.reached(e / scale, self.tol)
 
@@ -129,7 +129,7 @@ class LevelSearch(Search):
 
     def _errors(self, at: Point) -> list[Tensor]:
         """Return the errors (N,) of all levels."""
-        return [at.e[:, level.rows].norm(dim=-1) for level in self.settings.task.levels]
+        return [at.e[:, level.rows].norm(dim=-1) for level in self.settings.task.by_level]
 
     @cached_property
     def _tolerances(self) -> list[float]:
@@ -139,7 +139,7 @@ class LevelSearch(Search):
             return [self.tol] * task.n_levels
         of_parts = np.multiply(self.tol, task.units)
         of_rows = np.repeat(of_parts, task.parts)
-        return [float(of_rows[[*level.rows]].min()) for level in task.levels]
+        return [float(of_rows[[*level.rows]].min()) for level in task.by_level]
 
     def _compared(self, old: Point, new: Point) -> tuple[Tensor, Tensor]:
         """Return whether points are nearer in the first level that differs, and only a little."""

@@ -32,7 +32,7 @@ def uppermost(task: Task, rows: Tensor) -> Tensor:
 def up_to_level(task: Task, rows: Tensor, last: int) -> Tensor:
     """Return rows of the task (N, m) or (N, m, n), zero in the levels after `last`."""
     kept = torch.zeros_like(rows)
-    for level in task.levels[: last + 1]:
+    for level in task.by_level[: last + 1]:
         kept[:, level.rows] = rows[:, level.rows]
     return kept
 
@@ -99,7 +99,7 @@ def _in_order(
     normals = J[:, :0]
     if settings.plane.n_normals:
         normals = (settings.plane.normals.to(J).mT * unit).expand(len(J), -1, -1)
-    first, *lower = settings.task.levels
+    first, *lower = settings.task.by_level
     room = _Room(dq / unit, inside, _orthonormal(normals))
     room = room.without(J[:, first.rows])
     for k, level in enumerate(lower, start=1):
@@ -110,7 +110,7 @@ def _in_order(
     if not z.any():
         return limits.clip(room.dq * unit)
     every = room._replace(taken=normals[:, :0])
-    for level in settings.task.levels:
+    for level in settings.task.by_level:
         every = every.without(J[:, level.rows])
     z = calmed(every.free(z), room.dq, (least > 0.0).any(0))
     if settings.plane.n_normals:

@@ -416,11 +416,14 @@ class _Live(NamedTuple):
             by = by + rounding * (by + b.gather(-1, row[:, None])[:, 0].abs())
             over = torch.where(has_row, by, 0.0)
             b = b.scatter_add(-1, row[:, None], over[:, None]).minimum(self.within.most)
-        # Where no row contradicts it is rounding, of all that is missing; nothing begins anew.
+        # Where no row contradicts it is rounding, and nothing begins anew; what is more, or comes
+        # again, cannot be met.
         size = 8.0 * torch.finfo(b.dtype).eps * now.x.abs().amax(-1)
-        size = torch.maximum(size, missing)
+        ends = stuck & ((missing > size) | (now.close > 0.0))
+        size = torch.where(ends, torch.inf, size)
         seen = now._replace(
             close=torch.where(stuck, size, now.close),
+            rounds=torch.where(ends, 0, now.rounds),
             chosen=torch.where(stuck, -1, now.chosen),
             force=torch.where(stuck, 0.0, now.force),
         )

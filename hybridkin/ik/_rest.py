@@ -154,7 +154,7 @@ class RestOfLevels(NamedTuple):
 
 def at_start(task: Task, e: Tensor) -> Rest | RestOfLevels:
     """Return what is known at the start of a motion of a task, for errors (N, m): nothing."""
-    return Rest.at(e) if task.n_levels == 1 else RestOfLevels.at(task.levels, e)
+    return Rest.at(e) if task.n_levels == 1 else RestOfLevels.at(task.by_level, e)
 
 
 def _squared(rows: Tensor) -> Tensor:

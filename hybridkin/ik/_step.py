@@ -287,7 +287,7 @@ def limited_step(
     """
     if settings.task.n_levels == 1:
         return _one_level(settings, settings.task.n_free, J, v, posture, limits, damping_sq, least)
-    first = settings.task.levels[0]
+    first = settings.task.by_level[0]
     n_levels = settings.task.n_levels
     least = least + v.new_zeros(n_levels, len(v))
     if damping_sq is not None:
@@ -397,7 +397,7 @@ def _gains(law: Law, J: Tensor, e: Tensor, change: Tensor, most: float) -> Tenso
         brake = _braking(law, J, e, change)
         return stopping(torch.ones_like(brake), brake).clamp_max(most)[:, None]
     gains = torch.empty_like(e)
-    for k, level in enumerate(task.levels):
+    for k, level in enumerate(task.by_level):
         brake = _braking(law, up_to_level(task, J, k), up_to_level(task, e, k), change)
         gain = stopping(torch.ones_like(brake), brake).clamp_max(most)
         gains[:, level.rows] = gain[:, None]

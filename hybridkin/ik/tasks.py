@@ -177,7 +177,7 @@ class Task:
         return (self,)
 
     @property
-    def levels(self) -> tuple[Level, ...]:
+    def by_level(self) -> tuple[Level, ...]:
         """The levels of priority, the first one first; together they have all rows."""
         return (Level((*range(sum(self.parts)),), self.n_free),)
 
@@ -694,7 +694,7 @@ class Stack(Task):
                 "`weights` must be positive, one for every task, got "
                 f"{self.weights} for {len(parts)} tasks."
             )
-        self.priorities = _priorities(levels, len(parts))
+        self.levels = _checked_levels(levels, len(parts))
         sizes = {task.n_actuators for task in parts if task.n_actuators}
         if len(sizes) > 1:
             raise ValueError(f"`tasks` must have the same actuators, got {sorted(sizes)} of them.")
@@ -713,7 +713,7 @@ class Stack(Task):
         self.units = tuple(units)
         self.models = tuple(model for task in tasks for model in task.models)
         self.n_free = sum(task.n_free for task in tasks)
-        self.n_levels = 1 + max(self.priorities)
+        self.n_levels = 1 + max(self.levels)
         self.estimator = tasks[0].estimator
         self.module = tasks[0].module
 
@@ -723,15 +723,15 @@ class Stack(Task):
         return tuple(turns for task in self._tasks for turns in task.angular)
 
     @property
-    def levels(self) -> tuple[Level, ...]:
+    def by_level(self) -> tuple[Level, ...]:
         """The levels of priority, the first one first; together they have all rows."""
         levels = []
         for level in range(self.n_levels):
             rows = []
             n_free = 0
             start = 0
-            for task, size, priority in zip(self._tasks, self.rows, self.priorities, strict=True):
-                if priority == level:
+            for task, size, at in zip(self._tasks, self.rows, self.levels, strict=True):
+                if at == level:
                     rows += range(start, start + size)
                     n_free += task.n_free
                 start += size
@@ -741,9 +741,9 @@ class Stack(Task):
     def in_one_level(self, ratio: float) -> Stack:
         """Return the stack in one level, with weights that fall by a ratio from level to level."""
         stack = copy.copy(self)
-        weighted = zip(self.weights, self.priorities, strict=True)
-        stack.weights = tuple(weight * ratio**priority for weight, priority in weighted)
-        stack.priorities = (0,) * len(self.priorities)
+        weighted = zip(self.weights, self.levels, strict=True)
+        stack.weights = tuple(weight * ratio**level for weight, level in weighted)
+        stack.levels = (0,) * len(self.levels)
         stack._take(self._tasks)
         return stack
 
@@ -879,18 +879,18 @@ def as_task(model: object) -> Task:
     return model if isinstance(model, Task) else PositionTask(model)
 
 
-def _priorities(levels: Sequence[int] | None, count: int) -> tuple[int, ...]:
+def _checked_levels(levels: Sequence[int] | None, count: int) -> tuple[int, ...]:
     """Return the levels of tasks, checked; 0 for all without them."""
     if levels is None:
         return (0,) * count
     need = f"`levels` must be whole numbers 0, 1, ... without a gap, one for each of {count} tasks"
     if isinstance(levels, str) or not isinstance(levels, Iterable):
         raise TypeError(f"{need}, got {levels!r:.80}.")
-    priorities = tuple(levels)
-    good = all(isinstance(a, int | np.integer) for a in priorities) and len(priorities) == count
-    if not good or {*priorities} != {*range(1 + max(priorities))}:
-        raise ValueError(f"{need}, got {priorities}.")
-    return tuple(int(level) for level in priorities)
+    numbers = tuple(levels)
+    good = all(isinstance(a, int | np.integer) for a in numbers) and len(numbers) == count
+    if not good or {*numbers} != {*range(1 + max(numbers))}:
+        raise ValueError(f"{need}, got {numbers}.")
+    return tuple(int(level) for level in numbers)
 
 
 def _length(value: float, name: str) -> float:

@@ -14,12 +14,14 @@ from hybridkin import (
     ConstantCurvatureChain,
     ElasticTendonChain,
     ForceTendonChain,
+    InverseKinematics,
     RigidChain,
     as_forward_model,
     load_model,
     save_model,
 )
 from hybridkin._core.model import Moved, Shifted
+from hybridkin.ik.tasks import PointsTask
 from hybridkin.native.library import evaluate, program_of
 
 MOTION = torch.eye(4, dtype=torch.float64)
@@ -187,6 +189,17 @@ def test_a_point_of_an_arm_in_closed_form():
     assert_close(point.with_tip(3.0)(q), planar(q))
     assert point.unit_of_q == planar.unit_of_q
     assert point.turns.tolist() == planar.turns.tolist()
+
+
+@pytest.mark.parametrize("given", [np.asarray, torch.from_numpy])
+def test_points_of_an_arm_are_steered(given):
+    """The point on the second link moves with two joints, the tip with all three."""
+    task = PointsTask(arm(), [1.5, 3.0])
+    q = np.array([0.4, 0.2, -0.6])
+    targets = np.stack([arm().with_tip(at)(torch.from_numpy(q)).numpy() for at in (1.5, 3.0)])
+    solution = InverseKinematics(task).solve(given(targets), q0=given(np.array([0.0, 0.1, 0.0])))
+    assert solution.converged
+    assert_close(torch.as_tensor(solution.q), torch.from_numpy(q), rtol=0.0, atol=1e-3)
 
 
 def test_the_body_moves_with_the_base(model, q):

@@ -9,6 +9,8 @@ from scipy.optimize import minimize
 from torch.testing import assert_close
 
 from hybridkin import ElasticTendonChain, InverseKinematics, robots
+from hybridkin._core.model import ForwardModel
+from hybridkin._core.planes import PlaneOfQ
 from hybridkin.ik._step import limited_step
 from hybridkin.ik._strict import StepLimits
 from hybridkin.ik.obstacles import Sphere
@@ -241,6 +243,32 @@ def test_steps_move_the_upper_task_as_it_moves_alone(control):
     assert_same_motion(chain.jacobian(q), step.dq, alone.dq)
     J = chain.with_tip(at).jacobian(q)
     assert (moved(J, step.dq - alone.dq).norm(dim=1) > 1e-6).any(), "the other task moves too"
+
+
+class OnPlane(ForwardModel):
+    """The trunk as its log knows it, in which two directions of q do not occur."""
+
+    n_actuators, n_outputs = 9, 3
+    plane = PlaneOfQ(torch.full((9,), 0.25).double(), torch.linalg.qr(random(9, 2))[0])
+
+    def forward(self, q):
+        return TRUNK(q)
+
+
+@pytest.mark.parametrize("dq_max", [10.0, 0.5])
+def test_levels_and_posture_keep_to_the_plane_of_a_log(dq_max):
+    model = OnPlane()
+    task = Stack([PositionTask(model), PositionTask(MIDDLE)], levels=[0, 1])
+    ik = InverseKinematics(task, q_min=0.1, q_max=0.4, dq_max=dq_max, beta=5.0, q_pref=0.2)
+    alone = InverseKinematics(model, q_min=0.1, q_max=0.4, dq_max=dq_max, beta=0.0)
+    q = OnPlane.plane.nearest(0.25 + 0.02 * random(20, 9))
+    target = TRUNK(q) + 0.005 * random(20, 3, seed=1)
+    step = ik.step(q, task.join(target, MIDDLE(q) + 0.05 * random(20, 3, seed=2)))
+    upper = alone.step(q, target)
+    off_plane = (step.dq @ OnPlane.plane.normals).norm(dim=1)
+    # At limits the plane of the first level is held by stiff rows.
+    assert (off_plane <= 1e-4 * step.dq.norm(dim=1)).all()
+    assert_same_motion(ik.settings.evaluate(q)[1][:, :3], step.dq, upper.dq)
 
 
 def test_elastic_tendons_move_the_upper_task_first():
