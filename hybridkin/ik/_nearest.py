@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import one_hot
 
-from hybridkin._core.kernel_numbers import IK_CHANGES, IK_PROXIMAL
+from hybridkin._core.kernel_numbers import IK_CHANGES, IK_CLOSE, IK_PROXIMAL
 from hybridkin.ik._gram import apply_rows
 
 _ROUNDING = 2.0 / 3.0  # of a component of a unit vector: this power of eps
@@ -407,7 +407,11 @@ class _Live(NamedTuple):
         which = torch.where(every.gather(-1, which.clamp_min(0)) > 0.0, which, -1)
         factors = torch.cat([-multiples, torch.ones_like(missing)[:, None]], dim=-1)
         least, slot = which.max(-1)
-        has_row = stuck & (least >= first_row)
+        # What is as small as rounding is none; what comes again, or is more, is a contradiction.
+        close = 0.125 * IK_CLOSE * self.within.rounding(now.x)
+        size = close.gather(-1, now.chosen.clamp_min(0)[:, None])[:, 0]
+        ends = stuck & ((missing > size) | (now.close > 0.0))
+        has_row = ends & (least >= first_row)
         by = missing / factors.gather(-1, slot[:, None])[:, 0]
         row = (least - first_row).clamp_min(0)
         b = self.within.b
@@ -416,10 +420,6 @@ class _Live(NamedTuple):
             by = by + rounding * (by + b.gather(-1, row[:, None])[:, 0].abs())
             over = torch.where(has_row, by, 0.0)
             b = b.scatter_add(-1, row[:, None], over[:, None]).minimum(self.within.most)
-        # Where no row contradicts it is rounding, and nothing begins anew; what is more, or comes
-        # again, cannot be met.
-        size = 8.0 * torch.finfo(b.dtype).eps * now.x.abs().amax(-1)
-        ends = stuck & ((missing > size) | (now.close > 0.0))
         size = torch.where(ends, torch.inf, size)
         seen = now._replace(
             close=torch.where(stuck, size, now.close),

@@ -141,6 +141,17 @@ HK_INLINE real near_beyond(int n, int m, const near_problem *p, const near_state
     return sum;
 }
 
+/* The size of what is added in an inequality. */
+HK_INLINE real near_size(int n, int m, const near_problem *p, const near_state *s, int which) {
+    const int N = n + m;
+    if (which < N) return ik_abs(p->lower[which]) + ik_abs(s->x[which]);
+    if (which < 2 * N) return ik_abs(p->upper[which - N]) + ik_abs(s->x[which - N]);
+    const real *row = p->A + n * (which - 2 * N);
+    real sum = ik_abs(p->b[which - 2 * N]);
+    for (int j = 0; j < n; j++) sum += ik_abs(row[j] * s->x[j]);
+    return sum;
+}
+
 static inline real ik_largest(int n, const real *a) {
     real largest = R(0.0);
     for (int j = 0; j < n; j++) largest = ik_abs(a[j]) > largest ? ik_abs(a[j]) : largest;
@@ -234,24 +245,24 @@ HK_INLINE void near_next_round(int n, int m, const near_problem *p, near_state *
 }
 
 /* Relax the least important of the rows that contradict the one chosen, which is `missing` and a sum
-   of active normals with factors `shares`, none positive; all begins anew. Where none is a row it is
-   rounding, else the bounds contradict each other: returns 0. */
+   of active normals with factors `shares`, none positive; all begins anew. What is as small as rounding
+   is none. Where none is a row the bounds contradict each other: returns 0. */
 HK_INLINE int near_relax(int n, int m, const near_problem *p, near_state *s, real missing,
                              const real *shares) {
+    const real close = IK_CLOSE * HK_EPS * near_size(n, m, p, s, s->chosen);
     int least = NEAR_NONE;
     real factor = R(1.0);
+    if (missing <= close && !(s->close > R(0.0))) { /* rounding: nothing begins anew */
+        s->close = close, s->chosen = NEAR_NONE;
+        return 1;
+    }
     for (int c = m - 1; c < s->count; c++) {
         const int which = c < m ? s->chosen : s->which[c], row = which - 2 * (n + m);
         if (c >= m && !(shares[c] < -NEAR_ROUNDING)) continue;
         if (row < 0 || which <= least || (p->most && p->b[row] >= p->most[row])) continue;
         least = which, factor = c < m ? R(1.0) : -shares[c];
     }
-    if (least < 0) {
-        const real close = R(8.0) * HK_EPS * ik_largest(n + m, s->x);
-        if (missing > close || s->close > R(0.0)) return 0;
-        s->close = close, s->chosen = NEAR_NONE;
-        return 1;
-    }
+    if (least < 0) return 0;
     real *b = p->b + least - 2 * (n + m);
     *b += missing / factor + R(32.0) * HK_EPS * (ik_abs(*b) + missing / factor);
     if (p->most) *b = *b < p->most[least - 2 * (n + m)] ? *b : p->most[least - 2 * (n + m)];
