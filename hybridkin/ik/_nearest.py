@@ -408,7 +408,8 @@ class _Live(NamedTuple):
         factors = torch.cat([-multiples, torch.ones_like(missing)[:, None]], dim=-1)
         least, slot = which.max(-1)
         # What is as small as rounding is none; what comes again, or is more, is a contradiction.
-        close = 0.125 * IK_CLOSE * self.within.rounding(now.x)
+        rounding = self.within.rounding(now.x) + self.within.rounding(self.begun.x)
+        close = 0.125 * IK_CLOSE * rounding
         size = close.gather(-1, now.chosen.clamp_min(0)[:, None])[:, 0]
         ends = stuck & ((missing > size) | (now.close > 0.0))
         has_row = ends & (least >= first_row)

@@ -28,6 +28,7 @@ enum { NEAR_EQUATION = -1, NEAR_NONE = -2 };
 typedef struct {
     int count, rounds, refined, chosen, which[NEAR_MOST];
     real close; /* what rounding of all that led to x may be, once it has been seen */
+    real begun[NEAR_MOST]; /* x on the equations alone */
     real x[NEAR_MOST], first[IK_MOST_ROWS], e[IK_MOST_ROWS], force[NEAR_MOST];
     real pushed;   /* by the one chosen */
     real *free;    /* projector (N, N) onto the directions that they leave */
@@ -128,6 +129,7 @@ HK_INLINE void near_begin(int n, int m, const near_problem *p, near_state *s) {
         for (int j = 0; j < N; j++) s->x[j] += missing / size * way[j];
         near_add(n, m, s, way, size, shares, NEAR_EQUATION, R(INFINITY));
     }
+    for (int j = 0; j < N; j++) s->begun[j] = s->x[j];
 }
 
 /* By how much x violates an inequality. */
@@ -141,14 +143,15 @@ HK_INLINE real near_beyond(int n, int m, const near_problem *p, const near_state
     return sum;
 }
 
-/* The size of what is added in an inequality. */
+/* The size of what has been added in an inequality, here and at the beginning. */
 HK_INLINE real near_size(int n, int m, const near_problem *p, const near_state *s, int which) {
-    const int N = n + m;
-    if (which < N) return ik_abs(p->lower[which]) + ik_abs(s->x[which]);
-    if (which < 2 * N) return ik_abs(p->upper[which - N]) + ik_abs(s->x[which - N]);
+    const int N = n + m, j = which % N;
+    const real place = ik_abs(s->x[j]) + ik_abs(s->begun[j]);
+    if (which < N) return R(2.0) * ik_abs(p->lower[which]) + place;
+    if (which < 2 * N) return R(2.0) * ik_abs(p->upper[which - N]) + place;
     const real *row = p->A + n * (which - 2 * N);
-    real sum = ik_abs(p->b[which - 2 * N]);
-    for (int j = 0; j < n; j++) sum += ik_abs(row[j] * s->x[j]);
+    real sum = R(2.0) * ik_abs(p->b[which - 2 * N]);
+    for (int i = 0; i < n; i++) sum += ik_abs(row[i]) * (ik_abs(s->x[i]) + ik_abs(s->begun[i]));
     return sum;
 }
 
