@@ -2,12 +2,16 @@
 
     python examples/studies/obstacles.py --out results/obstacles
     python examples/studies/obstacles.py --ticks 1000000 --out results/obstacles  # some minutes
+    python examples/studies/obstacles.py --rest 100 --out results/obstacles
 
 Simulated. For every kind of model and set of limits, robots start free among one to six random
 spheres, capsules, boxes and half-spaces, and follow random targets, many of them out of reach or in
 an obstacle, for 400 periods each. Commands are computed in the compiled core, in torch and by the
 exported controller, and each of them is judged by torch: the largest excess of a limit, the deepest
 penetration of the gap that must be kept, targets that are called CONVERGED and are not, and NaN.
+
+With ``--rest`` robots of some kinds get one target for 1500 periods. They are at rest if none
+of the last 300 steps exceeds 1e-4 of the range of q. `solve` searches from the same start.
 """
 
 from __future__ import annotations
@@ -43,6 +47,8 @@ PERIODS = 400  # of one robot among its obstacles
 TARGETS = 4
 MOST_OBSTACLES = 6
 DT = 0.01  # [s]
+HELD = 1500  # periods of a target that is held
+LATE = 300  # of these, at the end
 AWAY = obstacles.Sphere([900.0, 900.0, 900.0], 0.1)  # in place of one that is not there
 TENDONS = {"lengths": [0.08, 0.08, 0.06], "routing": "base"}
 LINK = '<link name="l{0}"/>'
@@ -82,12 +88,20 @@ def main() -> None:
     """Run all cases, and write a table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--ticks", type=int, default=20_000, help="in all, in the compiled core")
+    parser.add_argument("--rest", type=int, default=0, help="targets of every robot, held")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("results/obstacles"))
     options = parser.parse_args()
     torch.set_num_threads(1)
     options.out.mkdir(parents=True, exist_ok=True)
     made = all_robots()
+    if options.rest > 0:
+        rows = [REST_HEAD]
+        for name in ("trunk", "tendons", "elastic tendons", "arm of 7 joints"):
+            rows.append(rest_among(name, made[name], options.rest, options.seed))
+            print(rows[-1], flush=True)
+        (options.out / "rest.md").write_text("\n".join(rows) + "\n")
+        return
     cases = [(name, limits) for name in made for limits in limit_sets(made[name], name)]
     rows = [HEAD]
     for name, limits in cases:
@@ -240,6 +254,50 @@ def judge(
     count.statuses.update(names)
 
 
+def rest_among(name: str, robot: Robot, n_targets: int, seed: int) -> str:
+    """Return a row of the table of targets that are held, for targets that obstacles block."""
+    draw = np.random.default_rng(seed)
+    tip = tip_of(robot)
+    span = robot.q_max - robot.q_min
+    late = []
+    ratios = []
+    gaps = []
+    while len(late) < n_targets:
+        scene = scene_about(robot, tip, draw)
+        ik = InverseKinematics(
+            robot.model,
+            q_min=robot.q_min,
+            q_max=robot.q_max,
+            dq_max=span,
+            dt=DT,
+            obstacles=scene,
+            body_points=robot.body_points,
+        )
+        clear = ik.settings.clear
+        start = torch.from_numpy(robot.start)[None]
+        target = tip + 0.5 * robot.reach * draw.normal(size=3)
+        if float(clear.smallest(start, clear.scene)) < 0.0:
+            continue
+        tracker = ik.tracker(robot.start)
+        steps = []
+        q = robot.start
+        for _ in range(HELD):
+            new = tracker.step(target)
+            steps.append(abs(new - q).max() / span)
+            q = new
+        if tracker.status != IKStatus.BLOCKED:
+            continue
+        solution = ik.solve(target, q0=robot.start, restarts=0)
+        late.append(max(steps[-LATE:]))
+        ratios.append(tracker.error / float(solution.error))
+        gaps.append(float(clear.smallest(torch.from_numpy(q)[None], clear.scene)))
+    at_rest = np.mean(np.array(late) <= 1e-4)
+    near = np.mean(np.array(ratios) <= 1.05)
+    return (
+        f"| {name} | {n_targets} | {at_rest:.2f} | {max(late):.1e} | {near:.2f} | {min(gaps):.1e} |"
+    )
+
+
 class InPython:
     """A tracker of NumPy arrays in the compiled core, or of tensors in torch."""
 
@@ -321,6 +379,10 @@ class Exported:
 
 
 FOLLOWERS = {"core": InPython, "C": Exported, "torch": InTorch}
+REST_HEAD = (
+    "| robot | blocked targets | at rest | largest late step [of the range] | within 5 % of solve "
+    "| least gap [m] |\n|---|---|---|---|---|---|"
+)
 HEAD = (
     "| robot | limits | program | ticks | deepest in the gap [m] | beyond limits [of the range] "
     "| false CONVERGED | NaN | µs per tick | outcomes |\n|---|---|---|---|---|---|---|---|---|---|"

@@ -92,11 +92,11 @@ class KeptClear(Portable):
         if not self:
             return -1
         places = [plan.node_of(model.stored()) for model in self.models]
-        one, other = self.meeting
-        reach = self.radii[one] + self.radii[other]
+        first, second = self.meeting
+        reach = self.radii[first] + self.radii[second]
         numbers = [as_array(part) for part in (self.keep, reach, self.along, self.base)]
-        pairs = [*one.tolist(), *other.tolist()]
-        return plan.node("body", n, 3, numbers, len(places), len(one), *places, *pairs)
+        pairs = [*first.tolist(), *second.tolist()]
+        return plan.node("body", n, 3, numbers, len(places), len(first), *places, *pairs)
 
     def points(self, q: Tensor) -> Tensor:
         """Return the points (N, P, 3) at q (N, n) [m]."""
@@ -120,11 +120,11 @@ class KeptClear(Portable):
         keep = self.keep.to(x)[:, None]
         distance, normal = distances(x, scene)
         free = torch.where(self._is_never_free(scene), math.inf, distance - keep).flatten(1)
-        one, other = self.meeting.to(x.device)
-        apart = x[:, other] - x[:, one]
+        first, second = self.meeting.to(x.device)
+        apart = x[:, second] - x[:, first]
         size = apart.norm(dim=-1)
         away = apart / torch.where(size > 0.0, size, 1.0)[..., None]
-        between = size - (self.radii[one] + self.radii[other]).to(x)
+        between = size - (self.radii[first] + self.radii[second]).to(x)
         gaps = torch.cat([free, between], dim=1)
         return gaps, torch.cat([normal.flatten(1, 2), away], dim=1)
 
@@ -145,9 +145,9 @@ class KeptClear(Portable):
 
     def relative(self, rows: Tensor, n_obstacles: int) -> Tensor:
         """Return values of points (N, P, ...) for the pairs of `gaps`, (N, p, ...)."""
-        one, other = self.meeting.to(rows.device)
+        first, second = self.meeting.to(rows.device)
         of_obstacles = rows.repeat_interleave(n_obstacles, 1)
-        return torch.cat([of_obstacles, rows[:, other] - rows[:, one]], dim=1)
+        return torch.cat([of_obstacles, rows[:, second] - rows[:, first]], dim=1)
 
     def smallest(self, q: Tensor, scene: Tensor) -> Tensor:
         """Return the smallest gaps (N,) to a scene at q (N, n) [m]; infinite without any."""
@@ -280,14 +280,14 @@ class Near(NamedTuple):
         taken = self.taken(way)
         longest = apply_rows(self.A.abs(), way.abs())
         watched = ~(2.0 * longest < self.gap).all(-1)
-        others = [dq + way_to_stop(dq, change, 2.0**k) for k in range(IK_BRAKED + 1)]
-        for other in (dq, *others):
-            goes_on = watched & ~self.is_broken(taken).any(-1) & (other != way).any(-1)
+        braking = [dq + way_to_stop(dq, change, 2.0**k) for k in range(IK_BRAKED + 1)]
+        for place in (dq, *braking):
+            goes_on = watched & ~self.is_broken(taken).any(-1) & (place != way).any(-1)
             if not goes_on.any():
                 continue
             goes_on = goes_on[:, None]
-            taken = torch.where(goes_on, self.taken(other), taken)
-            way = torch.where(goes_on, other, way)
+            taken = torch.where(goes_on, self.taken(place), taken)
+            way = torch.where(goes_on, place, way)
         return way, taken
 
     def is_broken(self, taken: Tensor) -> Tensor:

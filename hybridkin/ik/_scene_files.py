@@ -62,13 +62,13 @@ def described_obstacles(path: Path) -> list[DescribedObstacle]:
     needs["unit"] = among(*METRES)
     check_keys(content, needs, "the file")
     metres = METRES[content.pop("unit", "m")]
-    found = []
+    scene = []
     for kind, tables in content.items():
         for k, table in enumerate(tables):
             where = f"[[{kind}]] {k + 1}"
             _check_table(table, kind, where)
-            found.append(DescribedObstacle(kind, _arguments(table, metres), where))
-    return found
+            scene.append(DescribedObstacle(kind, _arguments(table, metres), where))
+    return scene
 
 
 def _check_table(table: Mapping[str, Any], kind: str, where: str) -> None:

@@ -248,8 +248,8 @@ def _above(polygon: NDArray, height: NDArray) -> NDArray:
         before = height[k - 1]
         here = height[k]
         if before * here < 0.0:
-            share = before / (before - here)
-            corners.append(polygon[k - 1] + share * (polygon[k] - polygon[k - 1]))
+            fraction = before / (before - here)
+            corners.append(polygon[k - 1] + fraction * (polygon[k] - polygon[k - 1]))
         if here >= 0.0:
             corners.append(polygon[k])
     return np.reshape(corners, (-1, 3))
