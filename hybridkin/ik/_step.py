@@ -223,9 +223,14 @@ class _Wish(NamedTuple):
             J, v, e = (uppermost(settings.task, part) for part in (self.J, self.v, self.e))
             step = _escaping(self.law, self.q, J, v, e, step, self.bounds)
         step = step._replace(promised=apply_rows(self.J, step.dq))
-        if pulls:
-            step = _arriving(self.law, self.q, self.J, self.allowed, step, self.bounds)
-        return step
+        if not pulls:
+            return step
+        arrived = _arriving(self.law, self.q, self.J, self.allowed, step, self.bounds)
+        beyond = limits.leaves_rows(arrived.dq)[:, None]  # arrival knows no rows
+        return step._replace(
+            dq=torch.where(beyond, step.dq, arrived.dq),
+            saturated=torch.where(beyond, step.saturated, arrived.saturated),
+        )
 
 
 def _clear_step(wish: _Wish, limits: StepLimits, change: Tensor, scene: Tensor) -> StepRows:

@@ -53,10 +53,13 @@ class StepLimits(NamedTuple):
 
     def broken(self, dq: Tensor) -> Tensor:
         """Return whether steps are beyond a bound, or by more than rounding a row, bool (N,)."""
+        return (self.clip(dq) != dq).any(-1) | self.leaves_rows(dq)
+
+    def leaves_rows(self, dq: Tensor) -> Tensor:
+        """Return whether steps are beyond a row by more than rounding, bool (N,)."""
         size = apply_rows(self.A.abs(), dq.abs()) + self.b.abs()
         rounding = 8.0 * torch.finfo(dq.dtype).eps * size
-        beyond = apply_rows(self.A, dq) > self.b + rounding
-        return (self.clip(dq) != dq).any(-1) | beyond.any(-1)
+        return (apply_rows(self.A, dq) > self.b + rounding).any(-1)
 
     def snapped(self, dq: Tensor) -> Tensor:
         """Return steps exactly at the bounds that they reach up to rounding.

@@ -625,6 +625,13 @@ typedef struct {
     const real *q, *x, *J, *e, *v, *allowed;
 } ik_wish_t;
 
+/* Whether a step goes beyond a row of other limits than its bounds, by more than rounding. */
+static inline int ik_leaves_rows(const ik_settings *ik, const ik_rows_t *limits, const real *dq) {
+    real own[HK_MAX_N];
+    for (int j = 0; j < ik->n; j++) own[j] = ik->flags & IK_WEIGHTS ? dq[j] / ik->unit[j] : dq[j];
+    return ik_breaks(ik->n, limits, own);
+}
+
 /* Propose a step within its bounds and rows: with the way out of a singular configuration, and where
    tendons can only pull it arrives. */
 static HK_NOINLINE void ik_propose(const ik_settings *ik, const ik_wish_t *wish,
@@ -633,7 +640,9 @@ static HK_NOINLINE void ik_propose(const ik_settings *ik, const ik_wish_t *wish,
     ik_limited_step(ik, J, wish->v, ik->flags & IK_POSTURE, NULL, limits, s);
     ik_motion(ik, J, s->dq, s->promised);
     if (ik->flags & IK_PULLS) {
+        const ik_step_t before = *s;
         if (ik_finite(ik->n, s->dq)) ik_arrive(ik, wish->q, wish->x, J, wish->allowed, s);
+        if (HK_LIMITS && ik_leaves_rows(ik, limits, s->dq)) *s = before; /* arrival knows no rows */
     } else if (!IK_IN_SPACES(ik)) {
         const real damping_sq = s->damping * s->damping;
         const int lost = !(s->sigma_min > R(0.0)) || damping_sq > R(1.001) * ik->least;
