@@ -237,14 +237,17 @@ def _clear_step(wish: _Wish, limits: StepLimits, change: Tensor, scene: Tensor) 
     """Return the step after which the body is clear of obstacles, and can stop before them.
 
     The rows of the gaps hold to first order. Where the model bends its way into an obstacle they
-    are tightened by what it took too much. If that does not help, the step is shortened towards the
-    hardest braking.
+    are tightened by what it took too much. If that does not help, or leads a free robot away from
+    its target, as in a wedge, the step is shortened towards the hardest braking.
     """
     bounds = wish.bounds
     near = wish.law.settings.clear.near(wish.q, change, scene)
     b = near.b
-    step = wish.step(limits.with_rows(*near.rows(b)))
+    target = wish.v
+    free = (near.gap >= 0.0).all(-1)
+    first = step = wish.step(limits.with_rows(*near.rows(b)))
     blocked = near.is_active(step.dq)
+    wedged = torch.zeros_like(blocked)
     for _ in range(IK_AROUND):
         way, taken = near.farthest(step.dq, change)
         broken = near.is_broken(taken).any(-1)
@@ -254,6 +257,9 @@ def _clear_step(wish: _Wish, limits: StepLimits, change: Tensor, scene: Tensor) 
         b, part = near.tightened(b, step.dq, way, taken)
         wish = wish.times(part)
         step = wish.step(limits.with_rows(*near.rows(b)))
+        towards = (step.promised * target).sum(-1) > 0.0
+        wedged = wedged | (broken & free & ~towards)
+        step = step._replace(dq=torch.where(wedged[:, None], first.dq, step.dq))
 
     brake = bounds.clip(torch.zeros_like(step.dq))
     wanted = step.dq

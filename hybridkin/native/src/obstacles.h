@@ -350,6 +350,19 @@ static inline real ik_tighten(const ik_settings *ik, const real *dq, const real 
     return part;
 }
 
+/* Whether no gap is negative. */
+static inline int ik_is_free(const ik_near_t *near) {
+    for (int p = 0; p < near->n_pairs; p++)
+        if (!(near->gap[p] >= R(0.0))) return 0;
+    return 1;
+}
+
+static inline real ik_dot(int n, const real *a, const real *b) {
+    real sum = R(0.0);
+    for (int i = 0; i < n; i++) sum += a[i] * b[i];
+    return sum;
+}
+
 /* The step after which the body is clear of obstacles, and can stop before them. Where the model bends
    its way into one, rows are tightened by what it took too much, and a part of the wish is tried;
    where that does not help, the step is shortened towards the hardest braking. `rows` holds those of
@@ -358,7 +371,7 @@ static HK_NOINLINE void ik_step_clear(const ik_settings *ik, const ik_wish_t *wi
                                       real seconds, ik_rows_t *rows, real *A, real *b,
                                       ik_step_t *s) {
     const int n = ik->n, first = rows->k;
-    real wanted[HK_MAX_N], way[HK_MAX_N], v[IK_ROWS], allowed[IK_ROWS], part = R(1.0);
+    real wanted[HK_MAX_N], first_step[HK_MAX_N], way[HK_MAX_N], v[IK_ROWS], allowed[IK_ROWS], part = R(1.0);
     const ik_wish_t tried = {wish->q, wish->x, wish->J, wish->e, v, allowed};
     ik_near_t near = ik_near_of(ik);
     for (int i = 0; i < ik->m; i++) v[i] = wish->v[i], allowed[i] = wish->allowed[i];
@@ -367,7 +380,13 @@ static HK_NOINLINE void ik_step_clear(const ik_settings *ik, const ik_wish_t *wi
     for (int round = 0; round <= IK_AROUND; round++) {
         rows->k = first + ik_gap_rows(ik, &near, seconds, A + n * first, b + first);
         ik_propose(ik, &tried, rows, s);
-        if (round == 0) s->blocked = ik_meets(ik, rows, first, s->dq);
+        if (round == 0) {
+            s->blocked = ik_meets(ik, rows, first, s->dq);
+            for (int j = 0; j < n; j++) first_step[j] = s->dq[j];
+        } else if (ik_is_free(&near) && !(ik_dot(ik->m, s->promised, wish->v) > R(0.0))) {
+            for (int j = 0; j < n; j++) s->dq[j] = first_step[j]; /* in a wedge */
+            break;
+        }
         if (!ik_leads_too_far(ik, wish->q, s->dq, seconds, &near, way)) return;
         s->blocked = 1;
         if (round == IK_AROUND) break;
