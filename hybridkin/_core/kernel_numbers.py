@@ -79,6 +79,7 @@ IK_HEALTHY = 0.02  # sigma_min / sigma_max above which no damping is needed
 IK_NEWTON = 60  # Newton steps in a box; a handful is usual
 IK_CHANGES = 400  # of the active constraints of a step; a handful is usual
 IK_CLOSE = 500.0  # rounding by which a step may end beside a bound [eps]
+IK_SAME = 64.0  # rounding of a limit that others contradict; more is a contradiction [eps]
 IK_SWEEPS = 30  # of Jacobi's method for eigenvalues; six are usual
 IK_PROXIMAL = 2  # rounds that remove the effect of the least damping
 IK_NORMALS = 6  # most normals of the plane of a log

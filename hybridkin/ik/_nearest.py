@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import one_hot
 
-from hybridkin._core.kernel_numbers import IK_CHANGES, IK_CLOSE, IK_PROXIMAL
+from hybridkin._core.kernel_numbers import IK_CHANGES, IK_PROXIMAL, IK_SAME
 from hybridkin.ik._gram import apply_rows
 
 _ROUNDING = 2.0 / 3.0  # of a component of a unit vector: this power of eps
@@ -409,7 +409,7 @@ class _Live(NamedTuple):
         least, slot = which.max(-1)
         # What is as small as rounding is none; what comes again, or is more, is a contradiction.
         rounding = self.within.rounding(now.x) + self.within.rounding(self.begun.x)
-        close = 0.125 * IK_CLOSE * rounding
+        close = 0.125 * IK_SAME * rounding
         size = close.gather(-1, now.chosen.clamp_min(0)[:, None])[:, 0]
         ends = stuck & ((missing > size) | (now.close > 0.0))
         has_row = ends & (least >= first_row)

@@ -109,7 +109,7 @@ def test_the_compiled_core_has_all_points(model, q):
 
 def test_files_and_pickles_keep_the_point(name, model, q, tmp_path):
     if name == "forces":
-        pytest.skip("is not saved")
+        pytest.skip("needs a chain that is saved")
     for at in places_of(model):
         point = model.with_tip(at)
         save_model(point, tmp_path / "point.safetensors")

@@ -252,7 +252,7 @@ HK_INLINE void near_next_round(int n, int m, const near_problem *p, near_state *
    is none. Where none is a row the bounds contradict each other: returns 0. */
 HK_INLINE int near_relax(int n, int m, const near_problem *p, near_state *s, real missing,
                              const real *shares) {
-    const real close = IK_CLOSE * HK_EPS * near_size(n, m, p, s, s->chosen);
+    const real close = IK_SAME * HK_EPS * near_size(n, m, p, s, s->chosen);
     int least = NEAR_NONE;
     real factor = R(1.0);
     if (missing <= close && !(s->close > R(0.0))) { /* rounding: nothing begins anew */
