@@ -107,7 +107,7 @@ def main() -> None:
     for name, limits in cases:
         robot = made[name]
         settings = limit_sets(robot, name)[limits]
-        for program, share in (("core", 1.0), ("C", 1.0), ("torch", 0.02)):
+        for program, share in (("core", 1.0), ("C", 1.0), ("torch", 0.005)):
             ticks = int(share * options.ticks / len(cases))
             count = run(robot, settings, program, max(ticks, PERIODS), options.seed)
             rows.append(as_row(name, limits, program, count))
