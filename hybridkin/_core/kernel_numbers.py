@@ -109,7 +109,7 @@ IK_PAIRS_MOST = 32  # pairs of a point and an obstacle, or of two points, in the
 IK_NEARER = 0.5  # of a gap: the largest part of it that one step takes, to first order
 IK_AROUND = 4  # steps that are tried where the curvature of the model would lead into an obstacle
 IK_BENT_WAY = 0.25  # of a way: what the curvature of the model may take of a gap in one step
-IK_BRAKED = 7  # doublings of the periods of braking after which the way to a stop is looked at
+IK_BRAKED = 40  # places on the way to a stop that are looked at, the first 16 period by period
 IK_SHORTER = 5  # halvings of a step after that; then it brakes
 IK_INSIDE_OBSTACLE = 1e-6  # a body so far in an obstacle has not reached its target [m]
 

@@ -18,7 +18,6 @@ from torch import Tensor
 from hybridkin._core.arrays import as_array, number, whole
 from hybridkin._core.kernel_numbers import (
     IK_BENT_WAY,
-    IK_BRAKED,
     IK_INSIDE_OBSTACLE,
     IK_NEARER,
     IK_OBSTACLE,
@@ -29,7 +28,7 @@ from hybridkin._core.plan import Plan
 from hybridkin._core.portable import Portable
 from hybridkin.ik._gram import apply_rows
 from hybridkin.ik._nearest import Polyhedron, nearest
-from hybridkin.ik._rates import stopping, way_to_stop
+from hybridkin.ik._rates import places_to_stop, stopping, way_to_stop
 from hybridkin.ik.obstacles import distances
 from hybridkin.ik.tasks import Task
 
@@ -280,11 +279,11 @@ class Near(NamedTuple):
         taken = self.taken(way)
         longest = apply_rows(self.A.abs(), way.abs())
         watched = ~(2.0 * longest < self.gap).all(-1)
-        braking = [dq + way_to_stop(dq, change, 2.0**k) for k in range(IK_BRAKED + 1)]
-        for place in (dq, *braking):
+        for periods in (0.0, *places_to_stop()):
+            place = dq + way_to_stop(dq, change, periods)
             goes_on = watched & ~self.is_broken(taken).any(-1) & (place != way).any(-1)
             if not goes_on.any():
-                continue
+                break
             goes_on = goes_on[:, None]
             taken = torch.where(goes_on, self.taken(place), taken)
             way = torch.where(goes_on, place, way)

@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from hybridkin._core.actuation import Actuation
-from hybridkin._core.kernel_numbers import IK_AT_REST_SHARE, IK_BRAKED, IK_SHORTER
+from hybridkin._core.kernel_numbers import IK_AT_REST_SHARE, IK_SHORTER
 from hybridkin.ik._clear import Near
 from hybridkin.ik._gram import apply_rows
-from hybridkin.ik._rates import stopping, way_to_stop
+from hybridkin.ik._rates import places_to_stop, stopping, way_to_stop
 from hybridkin.ik._settings import StepSettings
 from hybridkin.ik._step import StepRows
 from hybridkin.ik.limits import Bounds
@@ -186,7 +186,10 @@ class Lead:
     def _leads_into(self, near: Near, goal: Tensor, change: Tensor, seconds: float) -> bool:
         """Return whether commands, or those while they stop, lead into an obstacle."""
         step = goal - self.command
-        for periods in (math.inf, 0.0, *(2.0**k for k in range(IK_BRAKED + 1))):
+        most = float((step.abs() / change).amax())
+        for periods in (math.inf, 0.0, *places_to_stop()):
+            if most < periods < math.inf:
+                break
             command = goal + way_to_stop(step, change, periods)
             way = self._after(command, seconds) - self.effective
             if near.is_broken(near.taken(way)).any():

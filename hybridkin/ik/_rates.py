@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from hybridkin._core.arrays import number
+from hybridkin._core.kernel_numbers import IK_BRAKED
 
 
 class Rate(NamedTuple):
@@ -62,6 +63,17 @@ def stopping(way: Tensor, change: Tensor) -> Tensor:
     n_changes = way.clamp_min(0.0) / change
     stops = way / (0.5 + 0.5 * (1.0 + 2.0 * n_changes).sqrt())
     return torch.where((way > 0.0) & torch.isfinite(way), stops, way)
+
+
+def places_to_stop() -> list[float]:
+    """Return after how many periods a way to a stop is looked at: 1, ..., 16, 18, ...
+
+    The later ones are an eighth apart.
+    """
+    places = [1.0]
+    while len(places) < IK_BRAKED:
+        places.append(places[-1] + max(1.0, places[-1] // 8.0))
+    return places
 
 
 def way_to_stop(dq: Tensor, change: Tensor, periods: float = math.inf) -> Tensor:

@@ -879,7 +879,7 @@ static int ik_commands_lead_in(const ik_settings *ik, const ik_state *now, real 
         const real step = ik_abs(goal[j] - now->q[j]) / (ik->accel[j] * seconds * seconds);
         most = hk_larger(HK_MATH(floor)(step), most);
     }
-    for (int k = 0; k <= IK_BRAKED + 2; k++) {
+    for (int k = 0; k <= IK_BRAKED + 1; k++) {
         for (int j = 0; j < n; j++) {
             const real change = ik->accel[j] * seconds * seconds, step = goal[j] - now->q[j];
             command[j] = goal[j] + (stops ? ik_way_to_stop(step, change, periods) : R(0.0));
@@ -887,7 +887,7 @@ static int ik_commands_lead_in(const ik_settings *ik, const ik_state *now, real 
         ik_try(ik, now, seconds, command, way);
         for (int j = 0; j < n; j++) way[j] -= y[j];
         if (ik_take_gaps(ik, y, way, near)) return 1;
-        periods = k == 0 ? R(0.0) : k == 1 ? R(1.0) : R(2.0) * periods;
+        periods = k == 0 ? R(0.0) : ik_next_place(periods);
         if (!(periods < most)) return 0;
     }
     return 0;

@@ -297,6 +297,12 @@ static HK_NOINLINE int ik_passes_near(const ik_settings *ik, const real *way,
     return 0;
 }
 
+/* After how many periods a way to a stop is looked at next: 1, ..., 16, then an eighth more. */
+static inline real ik_next_place(real periods) {
+    const real eighth = HK_MATH(floor)(periods / R(8.0));
+    return periods + (eighth > R(1.0) ? eighth : R(1.0));
+}
+
 /* Whether a step leads too far, on the way (n) to a stop. Where this passes near something it is bent:
    then also the step alone, and parts of the way. `way` is the first one that does. */
 static int ik_leads_too_far(const ik_settings *ik, const real *q, const real *dq, real seconds,
@@ -313,11 +319,11 @@ static int ik_leads_too_far(const ik_settings *ik, const real *q, const real *dq
     if (ik_take_gaps(ik, q, way, near)) return 1;
     if (!(most > R(0.0) && ik_passes_near(ik, way, near))) return 0;
     real periods = R(0.0);
-    for (int k = 0; periods < most && k <= IK_BRAKED + 1; k++) {
+    for (int k = 0; periods < most && k <= IK_BRAKED; k++) {
         for (int j = 0; j < ik->n; j++)
             way[j] = dq[j] + ik_way_to_stop(dq[j], ik->accel[j] * seconds * seconds, periods);
         if (ik_take_gaps(ik, q, way, near)) return 1;
-        periods = periods > R(0.0) ? R(2.0) * periods : R(1.0);
+        periods = ik_next_place(periods);
     }
     return 0;
 }
