@@ -2,7 +2,7 @@
 Reach through a window
 ======================
 
-A trunk reaches through a window and moves to the side behind it. Its tip would have room enough,
+A trunk reaches through a window and moves to the side behind it. Its tip would fit through,
 but its body would meet the frame. With ``obstacles=`` the whole body keeps clear: the chambers that
 the tip does not need bend the trunk around the frame.
 

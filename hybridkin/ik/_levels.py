@@ -100,26 +100,26 @@ def _in_order(
     if settings.plane.n_normals:
         normals = (settings.plane.normals.to(J).mT * unit).expand(len(J), -1, -1)
     first, *lower = settings.task.by_level
-    room = _Room(dq / unit, inside, _orthonormal(normals))
-    room = room.without(J[:, first.rows])
+    so_far = _StepSoFar(dq / unit, inside, _orthonormal(normals))
+    so_far = so_far.without(J[:, first.rows])
     for k, level in enumerate(lower, start=1):
-        room = room.after(settings, level, J, v, least[k])
+        so_far = so_far.after(settings, level, J, v, least[k])
 
     # The posture may leave the plane, as far as the limits allow.
     z = posture / unit
     if not z.any():
-        return limits.clip(room.dq * unit)
-    every = room._replace(taken=normals[:, :0])
+        return limits.clip(so_far.dq * unit)
+    every = so_far._replace(taken=normals[:, :0])
     for level in settings.task.by_level:
         every = every.without(J[:, level.rows])
-    z = calmed(every.free(z), room.dq, (least > 0.0).any(0))
+    z = calmed(every.free(z), so_far.dq, (least > 0.0).any(0))
     if settings.plane.n_normals:
         every = every.towards(normals, apply_rows(normals, z), torch.zeros_like(z[:, 0]))
         every = every.without(normals)
     return limits.clip(every.nearest_to(z) * unit)
 
 
-class _Room(NamedTuple):
+class _StepSoFar(NamedTuple):
     """Steps, and what may be added to them: what moves nothing that comes before.
 
     Attributes
@@ -143,8 +143,8 @@ class _Room(NamedTuple):
             stacked = stacked - (stacked @ self.taken.mT) @ self.taken
         return stacked.reshape(rows.shape)
 
-    def without(self, J: Tensor) -> _Room:
-        """Return the room that motions J (N, m, n) leave."""
+    def without(self, J: Tensor) -> _StepSoFar:
+        """Return the same steps, with what may be added without motions J (N, m, n)."""
         taken = torch.cat([self.taken, _orthonormal(self.free(J), J)], dim=1)
         # Rows that are zero go last, and those that are zero everywhere go.
         is_row = (taken != 0.0).any(-1)
@@ -155,8 +155,8 @@ class _Room(NamedTuple):
 
     def after(
         self, settings: StepSettings, level: Level, J: Tensor, v: Tensor, least: Tensor
-    ) -> _Room:
-        """Return the room after a level, as far as it can go towards its v."""
+    ) -> _StepSoFar:
+        """Return the steps with a level, as far as it can go towards its v."""
         J = J[:, level.rows]
         missing = v[:, level.rows] - apply_rows(J, self.dq)
         largest = torch.linalg.matrix_norm(J, ord=2)
@@ -166,8 +166,8 @@ class _Room(NamedTuple):
 
     def towards(
         self, J: Tensor, missing: Tensor, least: Tensor, damping: Tensor | None = None
-    ) -> _Room:
-        """Return the room after the steps with the least |dq|^2 + |J y - missing|^2 / lambda^2.
+    ) -> _StepSoFar:
+        """Return the steps with the least |dq|^2 + |J y - missing|^2 / lambda^2.
 
         Every direction of J that is left has its own lambda: `damping` (N,), by default that of
         eq. (18), and at least the root of `least` (N,).
