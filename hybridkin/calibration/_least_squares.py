@@ -54,6 +54,7 @@ class Accuracy(NamedTuple):
 EXACT = Accuracy(1e-12, 12)
 HELD_OUT = Accuracy(1e-6, 12)  # for errors of held-out rows
 ROUGH = Accuracy(1e-5, 2)  # to compare initial guesses
+REFITTED = Accuracy(1e-4, 2)  # for errors of held-out rows, with corrections
 COMPARED = Accuracy(1e-4, 1)  # for errors of held-out rows, to compare sets
 
 

@@ -24,7 +24,7 @@ from hybridkin._core.arrays import (
 from hybridkin._core.distinct import distinct_rows, targets_that_count
 from hybridkin._core.groups import Groups
 from hybridkin._core.portable import Portable
-from hybridkin.calibration._least_squares import HELD_OUT, LOSSES, Fit, TipRows, solve
+from hybridkin.calibration._least_squares import HELD_OUT, LOSSES, REFITTED, Fit, TipRows, solve
 from hybridkin.calibration._search import NO_START, Start, search
 from hybridkin.calibration._unidentified import sentences
 from hybridkin.calibration.measured import evenly_spaced, points, with_missing_markers
@@ -281,7 +281,7 @@ def refitted(start: Start, q: Tensor, x: Tensor, weights: Tensor) -> Chain:
     like = start.problem.chain.geometry()["base"]
     rows = TipRows(q.to(like), x.to(like), weights.to(like))
     rows = rows.take(evenly_spaced(len(q), _ENOUGH))
-    return start.fitted(rows, "linear", HELD_OUT)
+    return start.fitted(rows, "linear", REFITTED)
 
 
 def _few(fit: Fit, rows: TipRows) -> list[str]:

@@ -50,6 +50,8 @@ _USUAL = (
 _EQUAL = 0.007  # of the score: within it the smaller set is taken
 _ALIKE = 0.01  # of the error: within it the first of two starts is taken
 _EXACT = 1e-6  # of the reach: smaller errors are equal
+_NEAR = 1.3  # times the score of the chosen set: a learned correction may make others the best
+_MOST_NEAR = 4
 _MOVES = 0.05  # of the largest motion of the tip
 
 _RIVAL = "elastic tendons: "  # prefix of sets that replace those of a plain chain
@@ -91,6 +93,9 @@ class GeometryChoice:
         The other sets whose errors are at most a tenth above those of the chosen one.
     starts : tuple of Start
         Starts of the fits of all sets.
+    near : tuple of GeometryChoice
+        The sets that a learned correction can make the best, the smaller ones first: those with a
+        score at most 1.3 times that of the chosen one, which is among them; at most four.
     usual : tuple of GeometryChoice
         The sets that suit few rows: nothing, the base, and base and radii of the given chain.
     """
@@ -103,6 +108,7 @@ class GeometryChoice:
     messages: tuple[str, ...] = ()
     rivals: tuple[GeometryChoice, ...] = ()
     starts: Starts = ()
+    near: tuple[GeometryChoice, ...] = ()
     usual: tuple[GeometryChoice, ...] = ()
 
     def __bool__(self) -> bool:
@@ -127,19 +133,6 @@ class GeometryChoice:
             Its warnings are not issued: they are its `messages`.
         """
         return fit_geometry(self.chain, q, x, self.parameters, loss, start=self.start)
-
-    def smaller(self, name: str) -> GeometryChoice:
-        """Return the usual set of this name in place of the chosen one, if there is one."""
-        for usual in self.usual:
-            if usual.name == name:
-                return replace(
-                    self,
-                    chain=usual.chain,
-                    parameters=usual.parameters,
-                    start=usual.start,
-                    name=usual.name,
-                )
-        return self
 
 
 NOT_CHOSEN = GeometryChoice(NO_START.problem.chain, ())
@@ -257,7 +250,8 @@ def choose_geometry(
         starts = _starts(candidates, rows, loss)
     starts = starts[: len(candidates)]
     best = 0
-    near = []
+    near = [0]
+    close = [0]
     errors = {}
     if len(candidates) > 1:
         splits = _splits(motions)
@@ -273,7 +267,8 @@ def choose_geometry(
         n_inner = len([*splits, *outer][-1].fitted)
         table = np.maximum([*errors.values()], _EXACT * float(chain.reach))
         best = _best(table, candidates, starts, len(chosen), n_inner)
-        near = np.flatnonzero(~(table > _WORSE * table[best]).any(axis=1)).tolist()
+        close = np.flatnonzero(~(table > _WORSE * table[best]).any(axis=1)).tolist()
+        near = _near(_scores(table), best)
 
     def choice(k: int) -> GeometryChoice:
         name, chosen_chain, names = candidates[k]
@@ -281,14 +276,31 @@ def choose_geometry(
             chosen_chain = nominal
         return GeometryChoice(chosen_chain, names, starts[k], name, errors, messages)
 
-    rivals = [choice(k) for k in near if k != best and candidates[k].parameters]
+    def among_others(k: int) -> GeometryChoice:
+        others = [choice(j) for j in close if j != k and candidates[j].parameters]
+        return replace(choice(k), rivals=tuple(others), starts=tuple(starts))
+
     usual = [k for k, candidate in enumerate(candidates) if candidate.name in _USUAL]
     return replace(
-        choice(best),
-        rivals=tuple(rivals),
-        starts=tuple(starts),
-        usual=tuple(choice(k) for k in usual),
+        among_others(best),
+        near=tuple(among_others(k) for k in near),
+        usual=tuple(among_others(k) for k in usual),
     )
+
+
+def _scores(errors: NDArray) -> NDArray:
+    """Return the scores (K,) of sets with `SetErrors` (K, 2)."""
+    cv, io = errors.T
+    if np.isnan(io).any():
+        return cv
+    return np.cbrt(cv * io**2)
+
+
+def _near(scores: NDArray, best: int) -> list[int]:
+    """Return the sets whose scores (K,) are near that of the chosen one, which is among them."""
+    order = np.argsort(scores, kind="stable")
+    near = order[scores[order] <= _NEAR * scores[best]][:_MOST_NEAR]
+    return sorted({best, *near.tolist()})
 
 
 def _best(
@@ -306,9 +318,7 @@ def _best(
     enough = n_free <= n_inner / _ROWS
     last = np.maximum.accumulate(np.where(enough, np.arange(len(cv)), 0))
     io = np.minimum(io, io[last] * cv / cv[last])
-    scores = cv
-    if not np.isnan(io).any():
-        scores = np.cbrt(cv * io**2)
+    scores = _scores(np.column_stack([cv, io]))
     # Sets for which all rows do not suffice must be clearly better.
     sure = usual | (n_free <= n_rows / _ROWS)
     sure = sure | (scores < _CLEARLY * scores[sure].min(initial=np.inf))

@@ -70,9 +70,12 @@ class ErrorModel(ABC):
         """Return this model for a fit that tells how many of its candidates are fitted."""
         return self
 
-    def refinement(self, spec: Spec, geometry: GeometryChoice, rows: Rows) -> Refinement:
-        """Return how the calibrated model is refined before this model learns its residual."""
-        return UNREFINED
+    def mechanics(self, spec: Spec, geometry: GeometryChoice, rows: Rows) -> Mechanics:
+        """Return what is calibrated and refined before this model learns the residual.
+
+        By default it is the set of parameters that was chosen by the errors of the mechanics alone.
+        """
+        return Mechanics(geometry)
 
     @abstractmethod
     def fit(self, rows: Rows, spec: Spec) -> FittedError:
@@ -166,15 +169,7 @@ class FittedError:
 
 
 class Refinement:
-    """What is learned of a mechanical model before its residual: by default nothing.
-
-    Attributes
-    ----------
-    geometry : str
-        Name of the calibrated parameters that it is made for. Empty: the chosen ones.
-    """
-
-    geometry = ""
+    """What is learned of a mechanical model before its residual: by default nothing."""
 
     def refine(self, mechanical: ForwardModel, rows: Rows) -> ForwardModel:
         """Return the mechanical model that fits the rows better."""
@@ -182,6 +177,13 @@ class Refinement:
 
 
 UNREFINED = Refinement()
+
+
+class Mechanics(NamedTuple):
+    """A geometry to calibrate, and how the calibrated model is refined."""
+
+    geometry: GeometryChoice
+    refinement: Refinement = UNREFINED
 
 
 @dataclass(frozen=True)
@@ -239,11 +241,14 @@ class Spec:
                 parameters=None if automatic else self.calibrate,
                 starts=self.starts,
             )
-        refinement = self.error_model.refinement(self, geometry, rows)
-        geometry = geometry.smaller(refinement.geometry)
+        return self.with_mechanics(self.error_model.mechanics(self, geometry, rows))
+
+    def with_mechanics(self, mechanics: Mechanics) -> Spec:
+        """Return the specification with a geometry to calibrate and a refinement."""
+        geometry = mechanics.geometry
         return replace(
             self,
-            refinement=refinement,
+            refinement=mechanics.refinement,
             mechanical=geometry.chain,
             calibrate=geometry.parameters,
             geometry=geometry,

@@ -300,6 +300,14 @@ class CrossFit:
         return float(self._mean_distances[chosen])
 
     @property
+    def outer_error(self) -> float:
+        """Mean distance of the chosen model on the outer rows, after fits to inner ones [m]."""
+        n = len(self.y)
+        chosen = 0 if self.weights[0] == 1.0 else -1
+        of_outer = self._distances_of_all[chosen, n:]
+        return float(np.average(of_outer, weights=self.outer.counts))
+
+    @property
     def groups_inside(self) -> NDArray:
         """Motions (K,) of the rows in the domain of the chosen model; without groups these rows."""
         return self.groups.labels[self.chosen.inside]

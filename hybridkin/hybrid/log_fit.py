@@ -17,18 +17,16 @@ from hybridkin._core.groups import Groups
 from hybridkin._core.progress import Progress, quiet
 from hybridkin.calibration.calibrate import CalibrationResult
 from hybridkin.calibration.choice import Starts
+from hybridkin.hybrid._candidates import Settled
 from hybridkin.hybrid._drift import Drift, too_far
 from hybridkin.hybrid._fit import few_rows, fit_hybrid, fit_messages
+from hybridkin.hybrid._kernel import folds_of
 from hybridkin.hybrid._module import Hybrid
 from hybridkin.hybrid._pace import Pace, PaceRange, each_pace, pace_range
 from hybridkin.hybrid._radius import Radius
 from hybridkin.hybrid._range import TrainingRange, state_range
 from hybridkin.hybrid._rows import Rows
-from hybridkin.hybrid._selection import (
-    Settled,
-    decided,
-    expected_with_new_choices,
-)
+from hybridkin.hybrid._selection import decided, expected_with_new_choices
 from hybridkin.hybrid._spec import (
     FittedError,
     FittedHybrid,
@@ -167,7 +165,8 @@ class FitOnce:
 
     def settled_table(self) -> CrossFit:
         """Return what the candidates predict with their choices, for folds and outer rows."""
-        return Settled.of(self.fitted, self.rows).table(self._outer_of_rows)
+        settled = Settled.of(self.fitted, self.rows)
+        return settled.table(self._outer_of_rows, folds_of(self.rows.groups))
 
     def decided(self, table: CrossFit) -> Self:
         """Return the fit with the blend of its candidates by the weights of a table."""
