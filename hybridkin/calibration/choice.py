@@ -98,6 +98,8 @@ class GeometryChoice:
         score at most 1.3 times that of the chosen one, which is among them; at most four.
     usual : tuple of GeometryChoice
         The sets that suit few rows: nothing, the base, and base and radii of the given chain.
+    corrected : dict of str to SetErrors
+        Errors that remain below quick corrections, by what was compared; empty if nothing was.
     """
 
     chain: Chain
@@ -110,6 +112,7 @@ class GeometryChoice:
     starts: Starts = ()
     near: tuple[GeometryChoice, ...] = ()
     usual: tuple[GeometryChoice, ...] = ()
+    corrected: Mapping[str, SetErrors] = field(default_factory=dict)
 
     def __bool__(self) -> bool:
         """Return whether there was a choice, maybe of nothing to calibrate."""

@@ -122,6 +122,11 @@ class Settled(NamedTuple):
         test = self.rows.take(outer)
         return Outer(self.held_out(inner, outer).tips, test.tips, test.counts, outer)
 
+    @property
+    def folds(self) -> list[Split]:
+        """The folds whose penalties were chosen: training and held-out rows."""
+        return folds_of(self.rows.groups)
+
     def table(self, outer: Outer, splits: Sequence[Split]) -> CrossFit:
         """Return the held-out predictions of folds of groups or rows, with those of `outer`."""
         held_out = starmap(self.held_out, splits)

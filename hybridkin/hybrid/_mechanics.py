@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from hybridkin._core.simplest import simplest_within
-from hybridkin.calibration.choice import GeometryChoice
+from hybridkin.calibration.choice import GeometryChoice, SetErrors
 from hybridkin.hybrid._candidates import Candidates, Settled
 from hybridkin.hybrid._error_models import (
     KernelModel,
@@ -17,14 +17,17 @@ from hybridkin.hybrid._error_models import (
 )
 from hybridkin.hybrid._fit import fit_hybrid
 from hybridkin.hybrid._rows import Rows
-from hybridkin.hybrid._spec import ErrorModel, FittedHybrid, Mechanics, Spec
+from hybridkin.hybrid._spec import ErrorModel, Mechanics, Spec
 from hybridkin.hybrid._structural_model import Structure
 from hybridkin.hybrid.held_out import CrossFit
 
 _MOST = 400  # rows by which the mechanics are chosen
 _FOLDS = 3
 _FEW = 40  # with fewer rows the outer ones do not count
-_WORSE = 1.15  # times the least held-out error: mechanics above are not taken
+# Mechanics whose held-out error exceeds the least one by more than this part of it, and by more than
+# this many standard errors of the difference, are not taken.
+_WORSE = 0.1
+_SURE = 2.0
 _EQUAL = 0.01  # of the score: within it the simpler mechanics are taken
 
 
@@ -33,51 +36,60 @@ def best_mechanics(spec: Spec, geometry: GeometryChoice, rows: Rows) -> Mechanic
 
     Mechanics are a set of calibrated parameters, with or without the errors of the structure. For
     each, a blend of few, quick corrections predicts the rows of three folds, and the outer rows
-    after a fit to the inner ones. Among those with a held-out error at most a tenth above the
-    least, the simplest one with nearly the least ``(cv * io**2)**(1/3)`` is taken.
+    after a fit to the inner ones. Among those with a held-out error `cv` at most 15 % above
+    the least, the simplest one with nearly the least ``(cv * io**2)**(1/3)`` is taken, with the
+    error `io` of the outer rows; of few rows that with the least `cv`.
     """
     options = [*_options(spec, geometry)]
     if len(options) < 2:
         return options[0]
     rows = rows.thinned(_MOST)
     rows = replace(rows, groups=rows.groups.divided())
-    corrections: ErrorModel = Candidates(
+    models = _quick_corrections(spec.with_mechanics(Mechanics(geometry)), rows)
+    tables = []
+    for mechanics in options:
+        settled = Settled(spec.with_mechanics(mechanics), rows, models)
+        folds = rows.groups.folds(_FOLDS, shuffle=True)
+        tables.append(settled.table(settled.outer(), folds))
+    chosen = options[_best(tables)]
+    errors = {}
+    for mechanics, table in zip(options, tables, strict=True):
+        errors[mechanics.name] = SetErrors(table.expected_error, table.outer_error)
+    return chosen._replace(geometry=replace(chosen.geometry, corrected=errors))
+
+
+def _best(tables: Sequence[CrossFit]) -> int:
+    """Return the place of the best of several tables, those of simpler mechanics first."""
+    cv = np.array([table.expected_error for table in tables])
+    io = np.array([table.outer_error for table in tables])
+    scores = cv
+    if len(tables[0].y) >= _FEW:
+        scores = np.cbrt(cv * io**2)
+    least = tables[int(np.argmin(cv))]
+    for k, table in enumerate(tables):
+        excess = table.excess_over(least)
+        if excess.mean > max(_WORSE * cv.min(), _SURE * excess.std_error):
+            scores[k] = np.inf
+    return simplest_within(scores, _EQUAL)
+
+
+def _quick_corrections(spec: Spec, rows: Rows) -> dict[str, ErrorModel]:
+    """Return corrections with the penalties that suit these mechanics."""
+    corrections = Candidates(
         {"none": NoCorrection(), "quadratic": QuadraticModel("serial"), "kernel": KernelModel()}
     )
-    cv = []
-    io = []
-    for mechanics in options:
-        of_option = replace(spec.with_mechanics(mechanics), error_model=corrections)
-        fitted = fit_hybrid(of_option.without_errors(), rows)
-        corrections = fitted.error.settled  # the next search of penalties starts at these
-        table = _table(fitted, rows)
-        cv.append(table.expected_error)
-        io.append(table.outer_error)
-    scores = np.array(cv)
-    if len(rows) >= _FEW:
-        scores = np.cbrt(scores * np.square(io))
-    good = np.array(cv) <= _WORSE * min(cv)
-    return options[simplest_within(np.where(good, scores, np.inf), _EQUAL)]
+    quick = replace(spec, error_model=corrections).without_errors()
+    return Settled.of(fit_hybrid(quick, rows), rows).models
 
 
 def _options(spec: Spec, geometry: GeometryChoice) -> Iterator[Mechanics]:
     """Yield the mechanics to compare, the simpler ones first."""
-    bases = []
+    if spec.output == "pose":
+        yield Mechanics(geometry)
+        return
     for near in geometry.near:
         yield Mechanics(near)
-        if near.name == geometry.name:
-            bases.append(near)
-    if spec.output == "pose":
-        return
-    for usual in geometry.usual[-1:]:
-        if usual.name != geometry.name:
-            bases.insert(0, usual)
-    for base in bases:
+    bases = {base.name: base for base in (*geometry.usual[-1:], geometry)}
+    for base in bases.values():
         if base.chain.has_one_arc_per_segment:
             yield Mechanics(base, Structure())
-
-
-def _table(fitted: FittedHybrid, rows: Rows) -> CrossFit:
-    """Return what the candidates of a fit predict for held-out and for outer rows."""
-    settled = Settled.of(fitted, rows)
-    return settled.table(settled.outer(), rows.groups.folds(_FOLDS, shuffle=True))

@@ -169,7 +169,15 @@ class FittedError:
 
 
 class Refinement:
-    """What is learned of a mechanical model before its residual: by default nothing."""
+    """What is learned of a mechanical model before its residual: by default nothing.
+
+    Attributes
+    ----------
+    suffix : str
+        What it adds to the name of a set of calibrated parameters.
+    """
+
+    suffix = ""
 
     def refine(self, mechanical: ForwardModel, rows: Rows) -> ForwardModel:
         """Return the mechanical model that fits the rows better."""
@@ -184,6 +192,11 @@ class Mechanics(NamedTuple):
 
     geometry: GeometryChoice
     refinement: Refinement = UNREFINED
+
+    @property
+    def name(self) -> str:
+        """What is calibrated, and what is learned below corrections."""
+        return self.geometry.name + self.refinement.suffix
 
 
 @dataclass(frozen=True)

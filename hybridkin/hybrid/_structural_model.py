@@ -23,6 +23,8 @@ ENOUGH = 5000
 class Structure(Refinement):
     """The errors of a chain's structure below another error model, see `fit_structure`."""
 
+    suffix = ", structure"
+
     def refine(self, mechanical: ForwardModel, rows: Rows) -> ForwardModel:
         """Return the chain with the errors of its structure."""
         chain = mechanical.without_errors

@@ -19,3 +19,4 @@ class CvResults(TypedDict):
     weights: dict[str, float]
     parameters: str
     mechanical_model: dict[str, dict[str, float]]
+    corrected: dict[str, dict[str, float]]

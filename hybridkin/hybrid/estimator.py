@@ -101,15 +101,14 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         - "kernel": Gaussian kernel ridge tuned on 5 folds, for up to 10 000 rows;
         - "drop": the mechanical model alone;
         - "auto": the blend of these models with the least error on held-out groups, or rows; rows
-          outside the fitted ones have a small weight in it. All of them correct the errors of the
-          structure, too, if these lower the errors of the mechanical model on three folds; they
-          stand on the chosen geometry, or on radii and base. Linear and quadratic features are
-          serial, pose features in both couplings; mechanical models without a shape have parallel
-          quadratic features instead. Kernel ridge takes part up to 2000 rows. If the gain over the
-          model without further corrections is within its standard error, twice that over errors of
-          the structure, nothing is added. Group
-          rows by what will be new in use. Without a mechanical model: a linear function, a network
-          and kernel ridge.
+          outside the fitted ones have a small weight in it. What is calibrated below all of them,
+          and whether they stand on the errors of the structure, is chosen by the errors that remain
+          below quick corrections. Linear and quadratic features are serial, pose features in both
+          couplings; mechanical models without a shape have parallel quadratic features instead.
+          Kernel ridge takes part up to 2000 rows. If the gain over the model without further
+          corrections is within its standard error, twice that over errors of the structure, nothing
+          is added. Group rows by what will be new in use. Without a mechanical model: a linear
+          function, a network and kernel ridge.
     coupling : {"parallel", "serial"}, default="parallel"
         Where the correction acts. "parallel": at the tip, f_mech(q) + eps(q), eq. (2). "serial":
         inside the robot, f_mech(z(q) + delta(q)). z holds the lengths and bendings of a chain's
@@ -120,9 +119,10 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Parameters of the mechanical model to calibrate first, see `hybridkin.calibrate`. Every
         fold of a cross-validation repeats this. "auto" chooses among sets of parameters, from none
         to the whole geometry, by the errors on held-out groups, or rows, and on the outer rows
-        after a fit to the inner ones (for error_model="drop" by the first errors only). If tendons
-        of a `ConstantCurvatureChain` contradict each other, it also tries an `ElasticTendonChain`.
-        So does error_model="auto" with a list. "default": the chain's own list. None: "auto" for a
+        after a fit to the inner ones (for error_model="drop" by the first errors only); for
+        error_model="auto" by these errors with corrections. If tendons of a
+        `ConstantCurvatureChain` contradict each other, it also tries an `ElasticTendonChain`. So
+        does error_model="auto" with a list. "default": the chain's own list. None: "auto" for a
         chain with error_model="auto", else nothing.
     guard : {"leverage", None}, default="leverage"
         Where eps is used. "leverage": the domain is where inputs are as close to the training rows
@@ -175,9 +175,10 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         the mean distance on held-out rows and its standard deviation over the folds [m], and
         ``io_distance``, the mean distance on the outer 35 % of the rows after a fit to the inner
         40 % [m]. ``weights`` of the blend; ``chosen``: "blend", or the only candidate with a
-        weight. ``parameters``: the set that was calibrated, of which errors of the structure may
-        prefer radii and base; ``mechanical_model``: the same two errors of every set without such
-        errors, "cv" and "io", without backlash [m]. On each fold the blend has weights chosen
+        weight. ``parameters``: the set that was calibrated; ``mechanical_model``: the same two
+        errors of every set without corrections, "cv" and "io", without backlash [m];
+        ``corrected``: these errors with quick corrections, of the sets that were compared with
+        them, also on errors of the structure [m]. On each fold the blend has weights chosen
         without that fold. ``expected_distance``: the mean distance to expect on new motions like
         those of the log [m]. With few groups or rows, the penalties are for this chosen without
         each of three folds.

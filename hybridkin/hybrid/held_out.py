@@ -307,6 +307,14 @@ class CrossFit:
         of_outer = self._distances_of_all[chosen, n:]
         return float(np.average(of_outer, weights=self.outer.counts))
 
+    def excess_over(self, other: CrossFit) -> HeldOutError:
+        """Return how much larger the errors of the chosen model are than those of another table.
+
+        Both tables are of the same rows.
+        """
+        excess = distance(self.chosen.tips, self.y) - distance(other.chosen.tips, self.y)
+        return HeldOutError.of(excess, self.groups.labels, self.counts)
+
     @property
     def groups_inside(self) -> NDArray:
         """Motions (K,) of the rows in the domain of the chosen model; without groups these rows."""
@@ -360,6 +368,7 @@ class CrossFit:
             "weights": dict(zip(self.names, self.weights.tolist(), strict=True)),
             "parameters": parameters,
             "mechanical_model": {name: both.known() for name, both in tried.items()},
+            "corrected": {name: both.known() for name, both in geometry.corrected.items()},
         }
 
 

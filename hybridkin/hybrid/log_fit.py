@@ -20,7 +20,6 @@ from hybridkin.calibration.choice import Starts
 from hybridkin.hybrid._candidates import Settled
 from hybridkin.hybrid._drift import Drift, too_far
 from hybridkin.hybrid._fit import few_rows, fit_hybrid, fit_messages
-from hybridkin.hybrid._kernel import folds_of
 from hybridkin.hybrid._module import Hybrid
 from hybridkin.hybrid._pace import Pace, PaceRange, each_pace, pace_range
 from hybridkin.hybrid._radius import Radius
@@ -166,7 +165,7 @@ class FitOnce:
     def settled_table(self) -> CrossFit:
         """Return what the candidates predict with their choices, for folds and outer rows."""
         settled = Settled.of(self.fitted, self.rows)
-        return settled.table(self._outer_of_rows, folds_of(self.rows.groups))
+        return settled.table(self._outer_of_rows, settled.folds)
 
     def decided(self, table: CrossFit) -> Self:
         """Return the fit with the blend of its candidates by the weights of a table."""

@@ -8,6 +8,7 @@ from sklearn.linear_model import Ridge
 
 from hybridkin import ConstantCurvatureChain, ELMRegressorCV, HybridForwardModel, calibrate
 from hybridkin.calibration.measured import inner_and_outer
+from hybridkin.hybrid._candidates import Settled
 from hybridkin.hybrid._error_models import (
     LinearModel,
     NoCorrection,
@@ -16,7 +17,7 @@ from hybridkin.hybrid._error_models import (
 )
 from hybridkin.hybrid._fit import fit_hybrid
 from hybridkin.hybrid._rows import Rows
-from hybridkin.hybrid._selection import Auto, Settled
+from hybridkin.hybrid._selection import Auto
 from hybridkin.hybrid._spec import Spec
 from hybridkin.hybrid.log_fit import fit_once
 
@@ -79,7 +80,7 @@ def test_the_candidates_of_auto_hold_out_motions(part):
     fits = [fit_hybrid(spec, Rows.of(q, x, groups=groups)) for groups in (None, motions)]
     rows = Rows.of(q, x, groups=motions)
     settled = Settled.of(fits[1], rows)
-    assert settled.table(settled.outer()).results()["chosen"] == "mechanical"
+    assert settled.table(settled.outer(), settled.folds).results()["chosen"] == "mechanical"
     if part:  # with a start that suits the noise
         near = spec.starting_at(fits[0].error.settled, ())
         fits[1] = fit_hybrid(near, rows)
@@ -97,7 +98,7 @@ def test_the_gain_of_a_blend_is_that_of_whole_motions():
     q, x, motions, _ = learnable()
     rows = Rows.of(q, x, groups=motions)
     settled = Settled.of(fit_hybrid(Spec(CHAIN, FewAtTip(0), guard=None), rows), rows)
-    table = settled.table(settled.outer())
+    table = settled.table(settled.outer(), settled.folds)
     assert_array_equal(table.groups.labels, motions)
     scored = table._all_rows
     outer = inner_and_outer(q)[1]

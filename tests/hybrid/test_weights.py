@@ -27,7 +27,7 @@ from hybridkin.calibration.measured import inner_and_outer
 from hybridkin.hybrid._error_models import NoCorrection, RegressorModel
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._selection import Auto
-from hybridkin.hybrid._spec import UNREFINED, Spec
+from hybridkin.hybrid._spec import Mechanics, Spec
 from hybridkin.hybrid.held_out import CrossFit, Outer, Predictions
 from hybridkin.hybrid.log_fit import fit_to_log
 
@@ -179,8 +179,8 @@ def test_the_radius_is_that_of_weighted_fits_and_weighted_errors(log):
 class Few(Auto):
     """The choice of "auto" among three models, each in closed form, on the plain chain."""
 
-    def refinement(self, spec, geometry, rows):
-        return UNREFINED
+    def mechanics(self, spec, geometry, rows):
+        return Mechanics(geometry)
 
     def _candidates(self, spec, n_rows):
         ridges = {f"ridge {alpha:g}": RegressorModel(Ridge(alpha)) for alpha in (1e-3, 0.1)}

@@ -88,6 +88,14 @@ def auto_in_words(model: HybridForwardModel, unit: LogUnit) -> list[str]:
         if not math.isnan(errors.get("io", math.nan)):
             words += f", {millimetres(errors['io'], '.2f')} outside the fitted rows"
         sentences.append(f"Of {len(tried)} sets of parameters, auto calibrates {taken}: {words}.")
+    if results["corrected"]:
+        listed = []
+        for name, both in results["corrected"].items():
+            listed.append(f"{name} {1e3 * both['cv']:.2f} and {1e3 * both['io']:.2f}")
+        sentences.append(
+            "With quick corrections, mean errors on held-out motions and outside the fitted rows "
+            f"in mm: {'; '.join(listed)}."
+        )
     errors = dict(zip(results["candidate"], results["mean_distance"], strict=True))
     listed = [f"{name} {1e3 * error:.2f}" for name, error in errors.items()]
     expected = millimetres(results["expected_distance"], ".2f")
