@@ -51,7 +51,7 @@ _EQUAL = 0.007  # of the score: within it the smaller set is taken
 _ALIKE = 0.01  # of the error: within it the first of two starts is taken
 _EXACT = 1e-6  # of the reach: smaller errors are equal
 _NEAR = 1.3  # times the score of the chosen set: a learned correction may make others the best
-_MOST_NEAR = 4
+_MOST_NEAR = 5
 _MOVES = 0.05  # of the largest motion of the tip
 
 _RIVAL = "elastic tendons: "  # prefix of sets that replace those of a plain chain
@@ -95,7 +95,7 @@ class GeometryChoice:
         Starts of the fits of all sets.
     near : tuple of GeometryChoice
         The sets that a learned correction can make the best, the smaller ones first: those with a
-        score at most 1.3 times that of the chosen one, which is among them; at most four.
+        score at most 1.3 times that of the chosen one, which is among them; at most five.
     usual : tuple of GeometryChoice
         The sets that suit few rows: nothing, the base, and base and radii of the given chain.
     corrected : dict of str to SetErrors

@@ -24,8 +24,8 @@ from hybridkin.hybrid.held_out import CrossFit
 _MOST = 400  # rows by which the mechanics are chosen
 _FOLDS = 3
 _FEW = 40  # with fewer rows the outer ones do not count
-# Mechanics whose held-out error exceeds the least one by more than this part of it, and by more than
-# this many standard errors of the difference, are not taken.
+# Mechanics are not taken whose held-out error exceeds the least one by more than this part of it,
+# and by more than this many standard errors of the difference.
 _WORSE = 0.1
 _SURE = 2.0
 _EQUAL = 0.01  # of the score: within it the simpler mechanics are taken
@@ -48,7 +48,8 @@ def best_mechanics(spec: Spec, geometry: GeometryChoice, rows: Rows) -> Mechanic
     models = _quick_corrections(spec.with_mechanics(Mechanics(geometry)), rows)
     tables = []
     for mechanics in options:
-        settled = Settled(spec.with_mechanics(mechanics), rows, models)
+        calibrated = replace(spec.with_mechanics(mechanics), calibrate=())  # by every part itself
+        settled = Settled(calibrated, rows, models)
         folds = rows.groups.folds(_FOLDS, shuffle=True)
         tables.append(settled.table(settled.outer(), folds))
     chosen = options[_best(tables)]
