@@ -170,9 +170,7 @@ def _limit(value: ArrayLike | None, name: str, usual: NDArray) -> NDArray:
         return usual
     limit = real_array(value, name).astype(float)
     if limit.shape not in ((), usual.shape) or not np.isfinite(limit).all():
-        raise ValueError(
-            f"`{name}` must be one finite number or {len(usual)}, got {value!r:.200}."
-        )
+        raise ValueError(f"`{name}` must be one finite number or {len(usual)}, got {value!r:.200}.")
     return np.broadcast_to(limit, usual.shape)
 
 
@@ -335,7 +333,7 @@ class _ArcMotions:
         return q
 
     def bent(self, bends: dict[int, NDArray]) -> NDArray:
-        """Return arcs (3 m,): those of the straight robot, but for the bendings of some segments."""
+        """Return the arcs (3 m,) of the straight robot with other bendings of some segments."""
         z = self.straight.copy()
         for k, bend in bends.items():
             z[self.m + k] = bend[0]
