@@ -4,17 +4,17 @@ The table of the docs page "When the past matters", section "What was tried"::
 
     python examples/studies/history.py
 
-About three minutes of processor time. The model is x = f(z(y) + W [1, y] + sum_k W_k (a_k - q)): f
-is the calibrated chain, z are its arcs, a_k are averages of the commands q until now, with four time
-constants from a step of the log to the length of a run, and y is what the actuators do. Ridge finds
-all weights, with one penalty for W and one for the W_k; whole groups of the training rows choose both
-among values up to infinity. The way by which the last sum moves the tip is subtracted from the
-measured tips before the error model is fitted, and added to its predictions.
+About three minutes of processor time. The model is x = f(z(y) + W [1, y] + sum_k W_k (a_k - q)):
+f is the calibrated chain, z are its arcs, a_k are averages of the commands q until now, with four
+time constants from a step of the log to the length of a run, and y is what the actuators do. Ridge
+finds all weights, with one penalty for W and one for the W_k; whole groups of the training rows
+choose both among values up to infinity. The way by which the last sum moves the tip is subtracted
+from the measured tips before the error model is fitted, and added to its predictions.
 
-With ``--error-model auto`` the error model is "auto" instead of serial quadratic features; this takes
-a quarter of an hour. The recordings are in the folder that ``--data`` or HYBRIDKIN_DATA names; an absent
-one is left out. They have no times, but for asu_bellows: the number of a row in its run stands for
-them.
+With ``--error-model auto`` the error model is "auto" instead of serial quadratic features; this
+takes a quarter of an hour. The recordings are in the folder that ``--data`` or HYBRIDKIN_DATA
+names; an absent one is left out. They have no times, but for asu_bellows: the number of a row in
+its run stands for them.
 """
 
 from __future__ import annotations

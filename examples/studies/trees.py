@@ -45,7 +45,7 @@ QUADRATIC = make_pipeline(
     PolynomialFeatures(2, include_bias=False),
     RidgeCV(np.logspace(-6, 3, 19)),
 )
-MOST = 1000  # training rows
+MOST = 500  # training rows
 
 
 def models(robot: Robot) -> dict[str, Any]:
@@ -113,10 +113,11 @@ def main() -> None:
     options = parser.parse_args()
     warnings.simplefilter("ignore")
     columns: dict[str, dict[str, str]] = {}
-    for load in (armlab, plain_ftdcr, asl_trunk, bellows):
+    for load in (bellows, plain_ftdcr, asl_trunk, armlab):
         robot = load(options.data)
         if robot is not None:
             head, column = cells(robot)
+            print(head, column, time.process_time(), flush=True)  # TMP
             columns[head] = column
     print("| model | " + " | ".join(columns) + " |")
     print("| --- " * (1 + len(columns)) + "|")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import permutations
 from typing import NamedTuple
 
@@ -16,6 +16,7 @@ from hybridkin._core.arrays import Numbers, real_array
 from hybridkin._core.model import ForwardModel
 from hybridkin._core.units import LogUnit
 from hybridkin.calibration._least_squares import TipRows
+from hybridkin.calibration._search import search
 from hybridkin.calibration.calibrate import check_data, refitted
 from hybridkin.calibration.choice import GeometryChoice
 from hybridkin.calibration.measured import evenly_spaced, points
@@ -155,13 +156,22 @@ def separating_motions(
     if not choice.rivals:
         return ()
     log = TipRows(q, x, q.new_ones(len(q))).take(evenly_spaced(len(q), _MOST))
-    chosen = _Calibrated.of(choice, log)
+    chosen = _Calibrated.of(_started(choice, log), log)
     with torch.no_grad():
         motions = _motions(chosen.chain, rows, low, high)
     found = []
     for rival in choice.rivals:
-        found.append(_separating(chosen, _Calibrated.of(rival, log), log, motions))
+        other = _Calibrated.of(_started(rival, log), log)
+        found.append(_separating(chosen, other, log, motions))
     return tuple(found)
+
+
+def _started(choice: GeometryChoice, log: TipRows) -> GeometryChoice:
+    """Return a choice with a start of its fit, which is searched if there is none."""
+    if choice.start.n_free or not choice.parameters:
+        return choice
+    chain = choice.chain.frozen().cpu()
+    return replace(choice, start=search(chain, log, choice.parameters, "linear"))
 
 
 def _limit(value: ArrayLike | None, name: str, usual: NDArray) -> NDArray:
@@ -185,7 +195,7 @@ class _Calibrated(NamedTuple):
     def of(cls, choice: GeometryChoice, rows: TipRows) -> _Calibrated:
         """Return the calibration of a set on rows."""
         chain = choice.chain.frozen().cpu()
-        if choice.start.n_free:
+        if choice.parameters:
             chain = refitted(choice.start, rows.q, rows.x, rows.weight)
         residual = rows.x.numpy() - _tips(chain, rows.q.numpy())
         weights = np.where(np.isnan(residual), 0.0, rows.weight.numpy()[:, None])

@@ -254,11 +254,12 @@ class StepSettings(Portable):
         if not any(model.is_stepwise for model in self.task.models):
             return []
         return [
-            "`model` has a regressor that is constant between steps, as trees and nearest neighbours "
-            "are: its derivative is zero almost everywhere. Steps follow the derivative of the "
-            "mechanical model alone (without one no step approaches the target), and targets within "
-            "a step of the regressor are not reached. Use such regressors for predictions, and a "
-            "smooth error model for inverse kinematics, for example error_model='auto'."
+            "`model` has a regressor that is constant between steps, as trees and nearest "
+            "neighbours are: its derivative is zero almost everywhere. Steps follow the derivative "
+            "of the mechanical model alone (without one no step approaches the target), and "
+            "targets within a step of the regressor are not reached. Use such regressors for "
+            "predictions, and a smooth error model for inverse kinematics, for example "
+            "error_model='auto'."
         ]
 
     def posture_messages(self, q: Tensor, name: str) -> list[str]:
