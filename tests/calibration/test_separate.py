@@ -125,6 +125,8 @@ def test_narrow_limits_leave_no_motion_that_separates():
     for motion in separating_motions(choice, q, x, q_min=low, q_max=high):
         assert not motion.separates
         assert str(motion).startswith("no motion within the limits separates")
+    locked = separating_motions(choice, q, x, q_min=0.0, q_max=0.0)
+    assert [motion.separates for motion in locked] == [False] * len(choice.rivals)
 
 
 def test_a_clear_choice_has_nothing_to_separate():
