@@ -1,7 +1,7 @@
 """Logs that cannot show which parameters of a robot are wrong, and the motion that can.
 
 The table of the docs page "Which configurations to measure next", section "Which motion shows what
-is wrong with the robot"; simulated robots, two minutes of processor time::
+is wrong with the robot"; simulated robots, half a minute of processor time::
 
     python examples/studies/separating.py
 """
