@@ -4,7 +4,7 @@ The table of the docs page "When the past matters", section "What was tried"::
 
     python examples/studies/history.py
 
-About three minutes of processor time. The model is x = f(z(y) + W [1, y] + sum_k W_k (a_k - q)):
+About four minutes of processor time. The model is x = f(z(y) + W [1, y] + sum_k W_k (a_k - q)):
 f is the calibrated chain, z are its arcs, a_k are averages of the commands q until now, with four
 time constants from a step of the log to the length of a run, and y is what the actuators do. Ridge
 finds all weights, with one penalty for W and one for the W_k; whole groups of the training rows

@@ -4,7 +4,7 @@ The table of the docs page "Choosing coupling and error model", section "Trees":
 
     python examples/studies/trees.py
 
-About four minutes of processor time. The recordings are in the folder that ``--data`` or
+About five minutes of processor time. The recordings are in the folder that ``--data`` or
 HYBRIDKIN_DATA names; an absent one is left out. Whole groups (lines of a grid, motions, runs, days)
 are held out in five folds.
 """
@@ -117,7 +117,6 @@ def main() -> None:
         robot = load(options.data)
         if robot is not None:
             head, column = cells(robot)
-            print(head, column, time.process_time(), flush=True)  # TMP
             columns[head] = column
     print("| model | " + " | ".join(columns) + " |")
     print("| --- " * (1 + len(columns)) + "|")
