@@ -1,20 +1,27 @@
 """Logs that cannot show which parameters of a robot are wrong, and the motion that can.
 
 The table of the docs page "Which configurations to measure next", section "Which motion shows what
-is wrong with the robot"; simulated robots, half a minute of processor time::
+is wrong with the robot"; simulated robots and armlab_3cable, two
+minutes of processor time::
 
     python examples/studies/separating.py
 """
 
 from __future__ import annotations
 
+import argparse
+from pathlib import Path
+
 import numpy as np
 import torch
+from hybrid_cases import armlab
 from numpy.typing import NDArray
 
 from hybridkin import ConstantCurvatureChain, choose_geometry, separating_motions
 
 SEEDS = 3
+DRAWS = 5
+PULL = 4e-3  # [m]
 ROWS = 60
 NOISE = 3e-4  # [m]
 RADIUS = 0.006  # [m]
@@ -54,7 +61,10 @@ LOGS = {
 
 
 def main() -> None:
-    """Print the table: mean tip errors in mm, one number for each seed."""
+    """Print the tables: mean tip errors in mm, one number for each seed."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--data", type=Path, help="folder of the recordings")
+    small_pulls(parser.parse_args().data)
     print("| log | set | on the log | on the motion | on the motion, with it |")
     print("| --- | --- | --- | --- | --- |")
     for name, (make, low, high, pair) in LOGS.items():
@@ -84,6 +94,42 @@ def main() -> None:
             cells = [", ".join(f"{value:.2f}" for value in column) for column in columns]
             print(f"| {name} | {one} | {' | '.join(cells)} |")
         print("\n".join(words), flush=True)
+
+
+def small_pulls(data_home: Path | None) -> None:
+    """Print errors of armlab_3cable outside a log of 40 rows with pulls up to 4 mm [mm].
+
+    Eight rows are added: those nearest to the named motion, or random ones of the whole range.
+    """
+    robot = armlab(data_home)
+    if robot is None:
+        return
+    near = (robot.q >= -PULL).all(axis=1)
+    beyond = np.flatnonzero(~near)[::7]
+    print("\n| draw | log alone | with the motion | with random rows |")
+    print("| --- | --- | --- | --- |")
+    for seed in range(DRAWS):
+        rng = np.random.default_rng(seed)
+        log = rng.permutation(np.flatnonzero(near))[:40]
+        choice = choose_geometry(robot.chain, robot.q[log], robot.x[log])
+        low = robot.q.min(axis=0)
+        high = robot.q.max(axis=0)
+        motions = separating_motions(choice, robot.q[log], robot.x[log], q_min=low, q_max=high)
+        if not motions:
+            print(f"| {seed} | {choice.name!r} alone |  |  |")
+            continue
+        motion = max(motions, key=lambda m: m.remaining / m.noise)
+        far = np.linalg.norm((robot.q[:, None] - motion.q) / (high - low), axis=2)
+        added = np.unique(far.argmin(axis=0))
+        others = rng.permutation(len(robot.q))[: len(added)]
+        cells = []
+        for more in (log[:0], added, others):
+            rows = np.concatenate([log, more])
+            chosen = choose_geometry(robot.chain, robot.q[rows], robot.x[rows])
+            chain = chosen.calibrate(robot.q[rows], robot.x[rows]).chain
+            miss = error(chain, robot.q[beyond], robot.x[beyond])
+            cells.append(f"{miss:.2f} ({chosen.name})")
+        print(f"| {seed} | {' | '.join(cells)} |  {motion}", flush=True)
 
 
 def error(chain: Chain, q: NDArray, x: NDArray) -> float:
