@@ -62,28 +62,36 @@ ROUGH = Accuracy(1e-5, 2)  # to compare initial guesses
 COMPARED = Accuracy(1e-4, 1)  # for errors of held-out rows, to compare sets
 
 
-class Reduced(NamedTuple):
-    """Linearised rows without the unknowns of their own, at the result of a fit.
+class Slopes(NamedTuple):
+    """Derivatives of rows by the free directions, which the unknowns of the rows follow.
 
     Attributes
     ----------
-    jacobian : ndarray of shape (R, P)
-        Derivative of the residuals while the unknowns follow the free directions.
-    unknowns_by_theta : ndarray of shape (U, P)
-        How the unknowns follow.
+    residual : ndarray of shape (3 M, P)
+        Of the residual, times the roots of the weights [m].
+    ties : ndarray of shape (D, P)
+        Of the ties, over their noise.
+    unknowns : ndarray of shape (U, P)
+        Of the unknowns.
     root : ndarray of shape (U, U)
-        Triangular; the squared residuals have the curvature ``root.T @ root`` by the unknowns.
+        Triangular; ``root.T @ root`` is the inverse covariance of the unknowns for known theta.
     """
 
-    jacobian: NDArray
-    unknowns_by_theta: NDArray
+    residual: NDArray
+    ties: NDArray
+    unknowns: NDArray
     root: NDArray
 
-    def covariance(self, of_theta: NDArray, noise: float) -> NDArray:
+    @classmethod
+    def of_known(cls, residual: NDArray) -> Slopes:
+        """Return the slopes of rows without unknowns."""
+        n_free = residual.shape[1]
+        return cls(residual, np.empty((0, n_free)), np.empty((0, n_free)), np.empty((0, 0)))
+
+    def covariance(self, of_theta: NDArray) -> NDArray:
         """Return the covariance (U, U) of the unknowns from that of the free directions."""
-        alone = np.linalg.solve(self.root, noise * np.eye(len(self.root)))
-        following = self.unknowns_by_theta
-        return alone @ alone.T + following @ of_theta @ following.T
+        alone = np.linalg.solve(self.root, np.eye(len(self.root)))
+        return alone @ alone.T + self.unknowns @ of_theta @ self.unknowns.T
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,36 +141,46 @@ class TipRows:
         """Number of coordinates that the unknowns of the rows use up."""
         return 0.0
 
-    def first_unknowns(self, chain: Chain) -> NDArray:
-        """Return the start of the unknowns (U,) for a chain."""
-        return np.empty(0)
+    def first_unknowns(self, tips: NDArray) -> NDArray:
+        """Return a rough guess of the unknowns (U,) from tips (N, m)."""
+        return NO_UNKNOWNS
+
+    def unknowns(self, tips: NDArray, sigma: float, loss: str) -> NDArray:
+        """Return the unknowns (U,) that suit the tips (N, m) best, for the noise of coordinates."""
+        return NO_UNKNOWNS
+
+    def tips(self, chain: Chain) -> NDArray:
+        """Return the tips (N, m) of a chain."""
+        return evaluate(chain, self.q.numpy())[0]
 
     @property
     def determined(self) -> NDArray[np.bool_]:
         """Which unknowns the rows determine, (U,)."""
         return np.empty(0, dtype=bool)
 
-    def known_after(self, fitted: TipRows, unknowns: NDArray, chain: Chain) -> NDArray:
-        """Return the unknowns (U,) of held-out rows after a fit to other rows."""
+    def known_after(self, fitted: TipRows, unknowns: NDArray, tips: NDArray) -> NDArray:
+        """Return the unknowns (U,) of held-out rows with these tips after a fit to other rows."""
         return unknowns
 
     def at_scale_of(self, unknowns: NDArray) -> TipRows:
         """Return rows with the residuals of these at the scale of present unknowns."""
         return self
 
-    def residual(self, chain: Chain, unknowns: NDArray = NO_UNKNOWNS) -> NDArray:
+    def residual(self, chain: Chain) -> NDArray:
         """Return the coordinate errors (M, 3), predicted minus measured."""
-        predicted = evaluate(chain, self.q.numpy())[0]
-        return points(predicted - self.x.numpy())[self.seen]
+        return self.errors(self.tips(chain), NO_UNKNOWNS)
 
-    def jacobian(
-        self, problem: Problem, theta: NDArray, chain: Chain, unknowns: NDArray
-    ) -> NDArray:
-        """Return the derivative of the residual, times the roots of the weights, (3 M, P + U)."""
-        J = self.tip_slopes(problem, theta, chain)
-        roots = np.sqrt(self.weights)[:, None, None]
-        weighted = roots * J[self.seen]
-        return weighted.reshape(-1, theta.size)
+    def errors(self, tips: NDArray, unknowns: NDArray) -> NDArray:
+        """Return the coordinate errors (M, 3) of tips (N, m)."""
+        return points(tips - self.x.numpy())[self.seen]
+
+    def ties(self, unknowns: NDArray) -> NDArray:
+        """Return the errors (D,) of what is known of the unknowns, over their noise."""
+        return np.empty(0)
+
+    def slopes(self, J: NDArray, residual: NDArray, unknowns: NDArray, sigma: float) -> Slopes:
+        """Return the derivatives of the errors and of the ties, from `tip_slopes` J."""
+        return Slopes.of_known(self.weighted(J[self.seen]))
 
     def tip_slopes(self, problem: Problem, theta: NDArray, chain: Chain) -> NDArray:
         """Return the derivatives (N, K, 3, P) of all markers by the free directions."""
@@ -170,25 +188,22 @@ class TipRows:
             tangents = problem.tangents(torch.from_numpy(theta).to(self.q))
             return chain.geometry_jacobian(self.q, tangents).unflatten(1, (-1, 3)).numpy()
 
-    def ties(self, unknowns: NDArray) -> NDArray:
-        """Return the errors (D,) of what is known of the unknowns, over their noise."""
-        return np.empty(0)
-
-    def ties_jacobian(self, unknowns: NDArray) -> NDArray:
-        """Return the derivative (D, U) of the ties."""
-        return np.empty((0, unknowns.size))
-
-    def reduced(self, jacobian: NDArray, unknowns: NDArray, noise: float) -> Reduced:
-        """Return the linearised rows without their unknowns, from their jacobian (3 M, P + U)."""
-        return Reduced(jacobian, np.empty((0, jacobian.shape[1])), np.empty((0, 0)))
+    def weighted(self, J: NDArray) -> NDArray:
+        """Return derivatives (M, 3, P) of errors, times the roots of the weights, (3 M, P)."""
+        roots = np.sqrt(self.weights)[:, None, None]
+        return (roots * J).reshape(-1, J.shape[2])
 
     def centred(self, unknowns: NDArray) -> NDArray:
         """Return where the tips should be (M, 3), from the middle of all."""
         return points((self.x - self.x.nanmedian(dim=0).values).numpy())[self.seen]
 
-    def rmse(self, chain: Chain, unknowns: NDArray = NO_UNKNOWNS) -> float:
+    def rmse(self, chain: Chain) -> float:
         """Return the root mean square tip distance of a chain [m]."""
-        squares = _squares(self.residual(chain, unknowns))
+        return self.rms(self.residual(chain))
+
+    def rms(self, residual: NDArray) -> float:
+        """Return the root mean square length of errors (M, 3)."""
+        squares = _squares(residual)
         return float(np.sqrt(np.average(squares, weights=self.weights)))
 
     def noise(self, residual: NDArray, robust: bool) -> float:
@@ -254,15 +269,20 @@ class Fit:
         return self.problem.chain_at(self.theta)
 
     @cached_property
-    def reduced(self) -> Reduced:
-        """The linearised rows at the result, without their unknowns."""
-        J = self.rows.jacobian(self.problem, self.theta, self.chain(), self.unknowns)
-        return self.rows.reduced(J, self.unknowns, self.noise)
+    def residual(self) -> NDArray:
+        """Errors of the coordinates at the result (M, 3)."""
+        return self.rows.errors(self.rows.tips(self.chain()), self.unknowns)
+
+    @cached_property
+    def slopes(self) -> Slopes:
+        """Derivatives of the rows at the result."""
+        J = self.rows.tip_slopes(self.problem, self.theta, self.chain())
+        return self.rows.slopes(J, self.residual, self.unknowns, self.noise)
 
     @property
     def jacobian(self) -> NDArray:
-        """Derivative of the residual at the result (R, P), with R = 3 N for measured tips."""
-        return self.reduced.jacobian
+        """Derivative of the residual and of the ties at the result (3 M + D, P)."""
+        return np.vstack([self.slopes.residual, self.noise * self.slopes.ties])
 
 
 def solve(
@@ -272,63 +292,63 @@ def solve(
     loss: str,
     accuracy: Accuracy = EXACT,
 ) -> Fit:
-    """Return a fit that alternates least squares and the noise level, the weight of the prior."""
+    """Return a fit that alternates least squares and the noise level, the weight of the prior.
+
+    The unknowns of the rows always follow theta (variable projection).
+    """
     weight = rows.weights
     root = np.sqrt(weight)[:, None]
     floor = 1e-12 * float(problem.chain.reach)
     robust = loss != "linear"
-    n_free = theta.size
+    share = 1.0 - rows.n_used / (3.0 * weight.sum())
 
     searched = replace(problem, chain=problem.chain.near_last_shapes())
 
     @lru_cache(1)
-    def chain_and_residual(scaled: TipRows, key: bytes) -> tuple[Chain, NDArray]:
-        z = np.frombuffer(key).copy()
-        chain = searched.chain_at(z[:n_free])
-        return chain, scaled.residual(chain, z[n_free:])
+    def chain_and_tips(key: bytes) -> tuple[Chain, NDArray]:
+        chain = searched.chain_at(np.frombuffer(key).copy())
+        return chain, rows.tips(chain)
 
     @lru_cache(1)  # a round starts where the last one ended
-    def jacobian(scaled: TipRows, key: bytes) -> NDArray:
-        z = np.frombuffer(key).copy()
-        chain, _ = chain_and_residual(scaled, key)
-        return scaled.jacobian(problem, z[:n_free], chain, z[n_free:])
+    def tip_slopes(key: bytes) -> NDArray:
+        chain, _ = chain_and_tips(key)
+        return rows.tip_slopes(problem, np.frombuffer(key).copy(), chain)
 
-    def noise(z: NDArray) -> float:
-        _, residual = chain_and_residual(rows, z.tobytes())
-        share = 1.0 - rows.n_used / (3.0 * weight.sum())
+    @lru_cache(1)
+    def errors_and_unknowns(scaled: TipRows, key: bytes, sigma: float) -> tuple[NDArray, NDArray]:
+        _, tips = chain_and_tips(key)
+        unknowns = scaled.unknowns(tips, sigma, loss)
+        return scaled.errors(tips, unknowns), unknowns
+
+    def noise(residual: NDArray) -> float:
         return max(rows.noise(residual, robust) / share**0.5, floor)
 
-    def whitened(z: NDArray, sigma: float) -> NDArray:
-        _, residual = chain_and_residual(rows, z.tobytes())
+    def whitened(theta: NDArray, sigma: float) -> NDArray:
+        residual, unknowns = errors_and_unknowns(rows, theta.tobytes(), sigma)
         of_rows = (root * residual).ravel() / sigma
-        theta, unknowns = np.split(z, [n_free])
         return np.concatenate([of_rows, theta / problem.prior_std, rows.ties(unknowns)])
 
-    def slope(z: NDArray, sigma: float) -> NDArray:
-        of_rows = jacobian(rows, z.tobytes()) / sigma
-        of_unknowns = rows.ties_jacobian(z[n_free:])
-        of_prior = np.zeros((n_free, z.size))
-        of_prior[:, :n_free] = np.diag(1.0 / problem.prior_std)
-        of_ties = np.zeros((len(of_unknowns), z.size))
-        of_ties[:, n_free:] = of_unknowns
-        return np.vstack([of_rows, of_prior, of_ties])
+    def slope(theta: NDArray, sigma: float) -> NDArray:
+        key = theta.tobytes()
+        residual, unknowns = errors_and_unknowns(rows, key, sigma)
+        slopes = rows.slopes(tip_slopes(key), residual, unknowns, sigma)
+        of_prior = np.diag(1.0 / problem.prior_std)
+        return np.vstack([slopes.residual / sigma, of_prior, slopes.ties])
 
     functions: dict[str, Any] = {"jac": slope}
     if robust:
         functions["loss"] = partial(row_loss, weight=weight, loss=loss)
-    unknowns = rows.first_unknowns(searched.chain_at(theta))
+    _, tips = chain_and_tips(theta.tobytes())
+    unknowns = rows.first_unknowns(tips)
     rows = rows.at_scale_of(unknowns)
-    unbounded = np.full(unknowns.size, np.inf)
-    low = np.append(problem.low, -unbounded)
-    high = np.append(problem.high, unbounded)
-    z = np.append(theta, unknowns)
-    sigma = noise(z)
+    residual = rows.errors(tips, unknowns)
+    sigma = noise(residual)
     converged = False
     for _ in range(accuracy.rounds):
         solution = least_squares(
             whitened,
-            z,
-            bounds=(low, high),
+            theta,
+            bounds=(problem.low, problem.high),
             ftol=accuracy.tolerance,
             xtol=accuracy.tolerance,
             gtol=accuracy.tolerance,
@@ -336,17 +356,19 @@ def solve(
             args=(sigma,),
             **functions,
         )
-        z = solution.x
-        rows = rows.at_scale_of(z[n_free:])
+        theta = solution.x
         converged = solution.status > 0
+        _, unknowns = errors_and_unknowns(rows, theta.tobytes(), sigma)
+        rows = rows.at_scale_of(unknowns)
+        _, tips = chain_and_tips(theta.tobytes())
+        residual = rows.errors(tips, unknowns)
         previous = sigma
-        sigma = noise(z)
+        sigma = noise(residual)
         if abs(sigma - previous) <= 0.02 * previous:
             break
-    theta, unknowns = np.split(z, [n_free])
-    rmse = rows.rmse(problem.chain_at(theta), unknowns)
+    rmse = rows.rms(residual)
     if not robust:
         count = float(weight.sum())
-        n_left = max(3.0 * count - rows.n_used - n_free, 1.0)
+        n_left = max(3.0 * count - rows.n_used - theta.size, 1.0)
         sigma = max(rmse * (count / n_left) ** 0.5, floor)
     return Fit(problem, rows, theta, unknowns, sigma, rmse, bool(converged))

@@ -19,7 +19,7 @@ from hybridkin.chains.chain import Chain
 DISTANCE_STD = 1e-4
 """Standard error of a distance between two points that calipers measured [m]."""
 
-_SIZELESS = 1e-6  # of the robot's reach: far below the size of any set of points
+_SIZELESS = 1e-4  # of the robot's reach: far below the size of any set of points
 _KNOWN = 0.05  # largest standard error of the size of the points that is no assumption
 _COLLAPSED = 0.5  # a tip that moves less than this fraction
 _SHOWN = 5  # labels in a message
@@ -64,7 +64,7 @@ class Touches:
     @property
     def touching(self) -> NDArray[np.bool_]:
         """Which rows touched a point, (N,)."""
-        return self.point != NO_POINT
+        return np.asarray(self.point != NO_POINT)
 
     def tips(self, x: Any) -> Any:
         """Return measured tips (N, 3), NaN for None if there are touches."""
@@ -164,9 +164,9 @@ def _labels(touched: ArrayLike | Tensor, n_rows: int) -> list[Any]:
     if isinstance(touched, Tensor):
         as_tensor(touched, "touched")
         touched = touched.tolist()
-    if isinstance(touched, np.ma.MaskedArray):
-        touched = [None if label is np.ma.masked else label for label in touched]
     labels = np.asarray(touched, dtype=object)
+    if isinstance(touched, np.ma.MaskedArray):
+        labels = np.where(np.ma.getmaskarray(touched), np.nan, labels)
     check_shape(labels, "touched", [n_rows], "one label for each row of `q`")
     for row, label in enumerate(labels):
         if not isinstance(label, Hashable):

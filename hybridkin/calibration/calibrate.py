@@ -351,7 +351,7 @@ def refitted(start: Start, q: Tensor, x: Tensor, weights: Tensor) -> Chain:
 def _unexplained(fit: Fit) -> list[str]:
     """Return a warning if the median residual is large, which a few outliers cannot cause."""
     rows = fit.rows
-    residual = np.median(np.linalg.norm(rows.residual(fit.chain(), fit.unknowns), axis=1))
+    residual = np.median(np.linalg.norm(fit.residual, axis=1))
     spread = np.median(np.linalg.norm(rows.centred(fit.unknowns), axis=1))
     if len(rows.x) < _FEW or not 0 < _LEFT * spread < residual:
         return []
@@ -424,7 +424,7 @@ def _result(
         std_errors[part.name] = torch.from_numpy(errors) if returns_tensors else errors
     unidentified = directions[narrowed * _IDENTIFIED < 1.0]
     n_rows = float(fit.rows.weights.sum())
-    of_points = fit.reduced.covariance(covariance, fit.noise)
+    of_points = fit.slopes.covariance(covariance)
     points, point_errors = touches.points(fit.unknowns, of_points, returns_tensors)
     safe = np.where(std > 0, std, 1.0)
     return CalibrationResult(
@@ -454,10 +454,10 @@ def _cross_validate(best: Fit, rows: TipRows, motions: Groups, loss: str) -> flo
     for train, test in motions.folds():
         fit = solve(best.problem, rows.take(train), best.theta, loss, HELD_OUT)
         held_out = rows.take(test)
-        chain = fit.chain()
-        unknowns = held_out.known_after(fit.rows, fit.unknowns, chain)
-        held_out = held_out.at_scale_of(unknowns)
-        squares += held_out.rmse(chain, unknowns) ** 2 * float(held_out.weights.sum())
+        tips = held_out.tips(fit.chain())
+        unknowns = held_out.known_after(fit.rows, fit.unknowns, tips)
+        errors = held_out.at_scale_of(unknowns).errors(tips, unknowns)
+        squares += held_out.rms(errors) ** 2 * float(held_out.weights.sum())
     return float(np.sqrt(squares / float(rows.weights.sum())))
 
 
