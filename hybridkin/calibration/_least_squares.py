@@ -75,23 +75,30 @@ class Slopes(NamedTuple):
         Of the unknowns.
     root : ndarray of shape (U, U)
         Triangular; ``root.T @ root`` is the inverse covariance of the unknowns for known theta.
+    growth : ndarray of shape (P,)
+        Relative growth of what the unknowns span; 0 without unknowns.
     """
 
     residual: NDArray
     ties: NDArray
     unknowns: NDArray
     root: NDArray
+    growth: NDArray
 
     @classmethod
     def of_known(cls, residual: NDArray) -> Slopes:
         """Return the slopes of rows without unknowns."""
         n_free = residual.shape[1]
-        return cls(residual, np.empty((0, n_free)), np.empty((0, n_free)), np.empty((0, 0)))
+        none = np.empty((0, n_free))
+        return cls(residual, none, none, np.empty((0, 0)), np.zeros(n_free))
 
-    def covariance(self, of_theta: NDArray) -> NDArray:
-        """Return the covariance (U, U) of the unknowns from that of the free directions."""
+    def std_of_unknowns(self, factor: NDArray) -> NDArray:
+        """Return the standard errors (U,) of the unknowns.
+
+        `factor` (P, P) times its transpose is the covariance of the free directions.
+        """
         alone = np.linalg.solve(self.root, np.eye(len(self.root)))
-        return alone @ alone.T + self.unknowns @ of_theta @ self.unknowns.T
+        return np.linalg.norm(np.hstack([alone, self.unknowns @ factor]), axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,8 +169,8 @@ class TipRows:
         """Return the unknowns (U,) of held-out rows with these tips after a fit to other rows."""
         return unknowns
 
-    def at_scale_of(self, unknowns: NDArray) -> TipRows:
-        """Return rows with the residuals of these at the scale of present unknowns."""
+    def at_scale_of(self, tips: NDArray) -> TipRows:
+        """Return these rows with errors in metres for a robot with these tips (N, m)."""
         return self
 
     def residual(self, chain: Chain) -> NDArray:
@@ -178,7 +185,7 @@ class TipRows:
         """Return the errors (D,) of what is known of the unknowns, over their noise."""
         return np.empty(0)
 
-    def slopes(self, J: NDArray, residual: NDArray, unknowns: NDArray, sigma: float) -> Slopes:
+    def slopes(self, J: NDArray, tips: NDArray, unknowns: NDArray, sigma: float) -> Slopes:
         """Return the derivatives of the errors and of the ties, from `tip_slopes` J."""
         return Slopes.of_known(self.weighted(J[self.seen]))
 
@@ -216,10 +223,6 @@ class TipRows:
         counts = np.cumsum(weight[order])
         middle = np.searchsorted(counts, 0.5 * weight.sum())
         return float(np.sqrt(squares[order][middle] / _MEDIAN))
-
-    def size_error(self, unknowns: NDArray, covariance: NDArray) -> float:
-        """Return the standard error of the size of what the tips reach, relative to it."""
-        return 0.0
 
     def few_messages(self, n_free: int) -> list[str]:
         """Return a warning if there are fewer rows than free parameters: `rmse` is too small."""
@@ -269,15 +272,20 @@ class Fit:
         return self.problem.chain_at(self.theta)
 
     @cached_property
+    def tips(self) -> NDArray:
+        """The tips at the result (N, m)."""
+        return self.rows.tips(self.chain())
+
+    @property
     def residual(self) -> NDArray:
         """Errors of the coordinates at the result (M, 3)."""
-        return self.rows.errors(self.rows.tips(self.chain()), self.unknowns)
+        return self.rows.errors(self.tips, self.unknowns)
 
     @cached_property
     def slopes(self) -> Slopes:
         """Derivatives of the rows at the result."""
         J = self.rows.tip_slopes(self.problem, self.theta, self.chain())
-        return self.rows.slopes(J, self.residual, self.unknowns, self.noise)
+        return self.rows.slopes(J, self.tips, self.unknowns, self.noise)
 
     @property
     def jacobian(self) -> NDArray:
@@ -330,8 +338,9 @@ def solve(
 
     def slope(theta: NDArray, sigma: float) -> NDArray:
         key = theta.tobytes()
-        residual, unknowns = errors_and_unknowns(rows, key, sigma)
-        slopes = rows.slopes(tip_slopes(key), residual, unknowns, sigma)
+        _, tips = chain_and_tips(key)
+        _, unknowns = errors_and_unknowns(rows, key, sigma)
+        slopes = rows.slopes(tip_slopes(key), tips, unknowns, sigma)
         of_prior = np.diag(1.0 / problem.prior_std)
         return np.vstack([slopes.residual / sigma, of_prior, slopes.ties])
 
@@ -340,7 +349,7 @@ def solve(
         functions["loss"] = partial(row_loss, weight=weight, loss=loss)
     _, tips = chain_and_tips(theta.tobytes())
     unknowns = rows.first_unknowns(tips)
-    rows = rows.at_scale_of(unknowns)
+    rows = rows.at_scale_of(tips)
     residual = rows.errors(tips, unknowns)
     sigma = noise(residual)
     converged = False
@@ -359,8 +368,8 @@ def solve(
         theta = solution.x
         converged = solution.status > 0
         _, unknowns = errors_and_unknowns(rows, theta.tobytes(), sigma)
-        rows = rows.at_scale_of(unknowns)
         _, tips = chain_and_tips(theta.tobytes())
+        rows = rows.at_scale_of(tips)
         residual = rows.errors(tips, unknowns)
         previous = sigma
         sigma = noise(residual)

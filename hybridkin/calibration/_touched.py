@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 from typing_extensions import Self
 
 from hybridkin._core.rotations import cross_matrix
-from hybridkin.calibration._least_squares import Slopes, TipRows, row_loss
+from hybridkin.calibration._least_squares import LOSSES, Slopes, TipRows
 from hybridkin.chains.chain import Chain
 
 NO_POINT = -1
 """In place of a point, for rows that touched none."""
-_EXACT = 1e-14
+_EXACT = 1e-13  # relative change of a step
+_MOST_STEPS = 100
 _THIN = 1e-6  # of the moment of inertia of a set of points: about this axis it is a line
 
 
@@ -66,14 +65,22 @@ class Ties(NamedTuple):
         return J.reshape(len(self.pairs), places.size)
 
 
+class _TouchLoss(NamedTuple):
+    """The loss of touches for some points: its value, errors (T, 3) and weights (T,) of these."""
+
+    value: float
+    errors: NDArray
+    weights: NDArray
+
+
 @dataclass(frozen=True, eq=False)
 class TouchedRows(TipRows):
     """Rows in some of which the tip touched one of K points, the unknowns (3 K,) of these rows.
 
     The residual of such a row is the tip minus its point. It follows those of the measured tips;
     a row can have both. A robot shrunk to a point would touch all of them at once, so residuals are
-    divided by the size of the set of points: the fit then has no reason to shrink the robot. At the
-    size to which the rows are scaled the residuals are in metres.
+    divided by the size of the set of mean tips, one for each point: the fit then has no reason to
+    shrink the robot. At the size to which the rows are scaled the residuals are in metres.
 
     Attributes
     ----------
@@ -143,69 +150,58 @@ class TouchedRows(TipRows):
 
     def first_unknowns(self, tips: NDArray) -> NDArray:
         """Return the mean of the tips at every point; without any, the mean of all tips."""
-        places = np.tile(tips.mean(axis=0), (self.n_points, 1))
-        for k in np.unique(self.touched):
-            here = self.point == k
-            places[k] = np.average(tips[here], axis=0, weights=self.weight.numpy()[here])
-        return places.ravel()
+        means = np.where(self.counts[:, None] > 0.0, self._means(tips), tips.mean(axis=0))
+        return means.ravel()
 
     def unknowns(self, tips: NDArray, sigma: float, loss: str) -> NDArray:
+        """Return the points (3 K,) with the least loss: weighted means of tips, moved by ties.
+
+        Damped Gauss-Newton steps, in which each touch has the weight that its loss gives it.
+        """
+        places = self.first_unknowns(tips)
+        factor = self.scale / self._size(tips) / sigma
+        ridge = _EXACT * np.eye(places.size)
+        damping = 0.0
+        at = self._loss(tips, places, sigma, loss)
+        for _ in range(_MOST_STEPS):
+            of_points = factor**2 * np.bincount(self.touched, at.weights, self.n_points)
+            ties = self.known.jacobian(places.reshape(-1, 3))
+            curvature = np.diag(np.repeat(of_points, 3)) + ties.T @ ties
+            pull = np.zeros((self.n_points, 3))
+            np.add.at(pull, self.touched, factor * at.weights[:, None] * at.errors)
+            pull = pull.ravel() - ties.T @ self.ties(places)
+            size = np.diag(curvature).max()
+            step = np.linalg.solve(curvature + size * (damping * np.eye(len(pull)) + ridge), pull)
+            moved = self._loss(tips, places + step, sigma, loss)
+            if moved.value > (1.0 + _EXACT) * at.value:
+                damping = max(10.0 * damping, 1e-3)
+                continue
+            places = places + step
+            at = moved
+            damping = 0.1 * damping if damping > 1e-6 else 0.0
+            if np.abs(step).max() <= _EXACT * np.abs(places).max():
+                break
+        return places
+
+    def _loss(self, tips: NDArray, unknowns: NDArray, sigma: float, loss: str) -> _TouchLoss:
+        """Return the loss of the touches and ties for points (3 K,)."""
+        errors = self._touch_errors(tips, unknowns) / sigma
+        rho, slope, _ = LOSSES[loss]((errors**2).sum(axis=1) / 3.0)
         weight = self.touch_weights
-        root = np.sqrt(weight)[:, None]
-
-        def whitened(unknowns: NDArray) -> NDArray:
-            of_touches = (root * self._touch_errors(tips, unknowns)).ravel() / sigma
-            return np.append(of_touches, self.ties(unknowns))
-
-        def slope(unknowns: NDArray) -> NDArray:
-            errors = self._touch_errors(tips, unknowns)
-            J = root[:, :, None] * self._slopes_by_points(errors, unknowns)
-            of_touches = J.reshape(-1, unknowns.size) / sigma
-            return np.vstack([of_touches, self._ties_by_points(unknowns)])
-
-        functions: dict[str, Any] = {"jac": slope}
-        if loss != "linear":
-            functions["loss"] = partial(row_loss, weight=weight, loss=loss)
-        solution = least_squares(
-            whitened,
-            self.first_unknowns(tips),
-            ftol=_EXACT,
-            xtol=_EXACT,
-            gtol=_EXACT,
-            max_nfev=50,
-            **functions,
-        )
-        return solution.x
+        value = 3.0 * weight @ rho + (self.ties(unknowns) ** 2).sum()
+        return _TouchLoss(float(value), errors, weight * slope)
 
     def known_after(self, fitted: TipRows, unknowns: NDArray, tips: NDArray) -> NDArray:
         """Return the points of a fit; those that its rows did not touch are at their mean tips."""
         return np.where(fitted.determined, unknowns, self.first_unknowns(tips))
 
-    def at_scale_of(self, unknowns: NDArray) -> Self:
-        size, _ = self.size(unknowns)
-        return replace(self, scale=size)
-
-    def size(self, unknowns: NDArray) -> tuple[float, NDArray]:
-        """Return the size of the set of touched points, and the derivative of its logarithm.
-
-        It is the rms distance [m] of the tips at their points from the mean of all.
-        """
-        shares, centred = self._centred(unknowns)
-        square = (shares * centred**2).sum() + self.least_size**2
-        return float(np.sqrt(square)), (shares * centred / square).ravel()
+    def at_scale_of(self, tips: NDArray) -> Self:
+        return replace(self, scale=self._size(tips))
 
     def residual(self, chain: Chain) -> NDArray:
         """Return the errors (M, 3) of a chain, with each point at the mean of its tips."""
         tips = self.tips(chain)
-        unknowns = self.first_unknowns(tips)
-        return self.at_scale_of(unknowns).errors(tips, unknowns)
-
-    def _centred(self, unknowns: NDArray) -> tuple[NDArray, NDArray]:
-        """Return the share of the touches at each point (K, 1), and the points from their mean."""
-        places = unknowns.reshape(-1, 3)
-        counts = self.counts[:, None]
-        shares = counts / max(counts.sum(), np.finfo(np.float64).tiny)
-        return shares, places - (shares * places).sum(axis=0)
+        return self.at_scale_of(tips).errors(tips, self.first_unknowns(tips))
 
     def errors(self, tips: NDArray, unknowns: NDArray) -> NDArray:
         measured = super().errors(tips, unknowns)
@@ -214,14 +210,17 @@ class TouchedRows(TipRows):
     def ties(self, unknowns: NDArray) -> NDArray:
         return self.known.residual(unknowns.reshape(-1, 3))
 
-    def slopes(self, J: NDArray, residual: NDArray, unknowns: NDArray, sigma: float) -> Slopes:
-        size, _ = self.size(unknowns)
-        of_touches = self.scale / size * J[self.touching, 0]
+    def slopes(self, J: NDArray, tips: NDArray, unknowns: NDArray, sigma: float) -> Slopes:
+        errors = self._touch_errors(tips, unknowns)
+        factor = self.scale / self._size(tips)
+        growth = self._growth(J, tips)
+        carried = errors[:, :, None] * growth + self._turned(J, tips, errors)
+        of_touches = factor * J[self.touching, 0] - carried
         by_theta = self.weighted(np.concatenate([J[self.seen], of_touches]))
-        n_measured = len(residual) - len(self.touched)
-        by_points = np.zeros((len(residual), 3, unknowns.size))
-        by_points[n_measured:] = self._slopes_by_points(residual[n_measured:], unknowns)
-        ties = self._ties_by_points(unknowns)
+        by_points = np.zeros((*by_theta.shape[:1], unknowns.size)).reshape(-1, 3, unknowns.size)
+        first = len(by_points) - len(errors)
+        by_points[first:] = -factor * self._points_of_touches()
+        ties = self.known.jacobian(unknowns.reshape(-1, 3))
         by_unknowns = np.vstack([self.weighted(by_points) / sigma, ties])[:, self.determined]
         # The unknowns follow theta: what they can make good is projected out.
         by_theta = np.vstack([by_theta / sigma, np.zeros((len(ties), by_theta.shape[1]))])
@@ -230,46 +229,62 @@ class TouchedRows(TipRows):
         by_theta = by_theta - directions @ along
         of_unknowns = np.zeros((unknowns.size, by_theta.shape[1]))
         of_unknowns[self.determined] = -np.linalg.solve(root, along)
-        of_residual, of_ties = np.split(by_theta, [3 * len(residual)])
-        turned = np.zeros((len(residual), 3, by_theta.shape[1]))
-        turned[n_measured:] = self._turned(residual[n_measured:], unknowns, of_unknowns)
-        of_residual = sigma * of_residual - self.weighted(turned)
-        return Slopes(of_residual, of_ties, of_unknowns, root)
+        of_residual, of_ties = np.split(by_theta, [3 * len(by_points)])
+        return Slopes(sigma * of_residual, of_ties, of_unknowns, root, growth)
 
-    def _turned(self, errors: NDArray, unknowns: NDArray, of_unknowns: NDArray) -> NDArray:
-        """Return derivatives (T, 3, P) of the errors (T, 3) that turn like the set of points.
+    def _growth(self, J: NDArray, tips: NDArray) -> NDArray:
+        """Return the relative growth (P,) of the set of mean tips, by which errors are divided."""
+        shares, centred = self._set_of(tips)
+        moved = self._means(J[:, 0])
+        return np.einsum("k,ki,kip->p", shares, centred, moved) / self._size(tips) ** 2
 
-        They do not change the length of an error, so no loss depends on them. Without them a turn
-        of the robot together with all points is a direction that changes nothing.
+    def _turned(self, J: NDArray, tips: NDArray, errors: NDArray) -> NDArray:
+        """Return the derivatives (T, 3, P) of errors that turn with the set of mean tips.
+
+        A turn does not change the length of an error, so no loss depends on it. Without it, the
+        direction in which the robot turns together with all points changes no error at all.
         """
-        shares, centred = self._centred(unknowns)
-        size, _ = self.size(unknowns)
-        # A turn w moves the points by w x c = -[c]x w.
+        shares, centred = self._set_of(tips)
+        moved = self._means(J[:, 0])
+        # A turn w moves the means by w x c = -[c]x w.
         spins = cross_matrix(torch.from_numpy(centred)).numpy()
-        weighted = (shares[..., None] * spins).reshape(-1, 3)
-        inertia = spins.reshape(-1, 3).T @ weighted + _THIN * size**2 * np.eye(3)
-        turns = -np.linalg.solve(inertia, weighted.T @ of_unknowns)
+        inertia = np.einsum("k,kji,kjl->il", shares, spins, spins)
+        inertia += _THIN * self._size(tips) ** 2 * np.eye(3)
+        turns = -np.linalg.solve(inertia, np.einsum("k,kji,kjp->ip", shares, spins, moved))
         return -cross_matrix(torch.from_numpy(errors)).numpy() @ turns
+
+    def _means(self, values: NDArray) -> NDArray:
+        """Return the means (K, ...) of values (N, ...) of the rows at every point; 0 without."""
+        sums = np.zeros((self.n_points, *values.shape[1:]))
+        weights = self.touch_weights.reshape(-1, *[1] * (values.ndim - 1))
+        np.add.at(sums, self.touched, weights * values[self.touching])
+        counts = np.where(self.counts > 0.0, self.counts, 1.0)
+        return sums / counts.reshape(-1, *[1] * (values.ndim - 1))
+
+    def _set_of(self, tips: NDArray) -> tuple[NDArray, NDArray]:
+        """Return the shares of the touches at every point (K,), and the mean tips from their mean.
+
+        Points without touches have no share.
+        """
+        shares = self.counts / max(self.counts.sum(), np.finfo(np.float64).tiny)
+        means = self._means(tips)
+        return shares, means - shares @ means
+
+    def _size(self, tips: NDArray) -> float:
+        """Return the rms distance of the mean tips from their mean [m]."""
+        shares, centred = self._set_of(tips)
+        return float(np.sqrt(shares @ (centred**2).sum(axis=1) + self.least_size**2))
 
     def _touch_errors(self, tips: NDArray, unknowns: NDArray) -> NDArray:
         """Return the errors (T, 3) of the touches."""
-        size, _ = self.size(unknowns)
         apart = tips[self.touching] - unknowns.reshape(-1, 3)[self.touched]
-        return self.scale / size * apart
+        return self.scale / self._size(tips) * apart
 
-    def _slopes_by_points(self, errors: NDArray, unknowns: NDArray) -> NDArray:
-        """Return the derivatives (T, 3, 3 K) of the errors (T, 3) of the touches by the points."""
-        size, of_size = self.size(unknowns)
-        n_touches = len(errors)
-        # An error is a factor times (tip - point), and the factor falls with the size.
-        J = -errors[:, :, None] * of_size
-        by_point = J.reshape(n_touches, 3, self.n_points, 3)
-        by_point[np.arange(n_touches), :, self.touched] -= self.scale / size * np.eye(3)
-        return J
-
-    def _ties_by_points(self, unknowns: NDArray) -> NDArray:
-        """Return the derivatives (D, 3 K) of the ties by the points."""
-        return self.known.jacobian(unknowns.reshape(-1, 3))
+    def _points_of_touches(self) -> NDArray:
+        """Return the derivative (T, 3, 3 K) of the touched point by all points."""
+        return np.kron(np.eye(self.n_points)[self.touched], np.eye(3)).reshape(
+            -1, 3, 3 * self.n_points
+        )
 
     def centred(self, unknowns: NDArray) -> NDArray:
         places = unknowns.reshape(-1, 3)[self.touched]
@@ -277,10 +292,6 @@ class TouchedRows(TipRows):
         if not self.seen.any():
             return from_middle
         return np.vstack([super().centred(unknowns), from_middle])
-
-    def size_error(self, unknowns: NDArray, covariance: NDArray) -> float:
-        _, of_size = self.size(unknowns)
-        return float(np.sqrt(of_size @ covariance @ of_size))
 
     def few_messages(self, n_free: int) -> list[str]:
         n_touches = len(self.touched)

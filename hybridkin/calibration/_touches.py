@@ -66,10 +66,10 @@ class Touches:
         """Which rows touched a point, (N,)."""
         return np.asarray(self.point != NO_POINT)
 
-    def tips(self, x: Any) -> Any:
-        """Return measured tips (N, 3), NaN for None if there are touches."""
+    def tips(self, x: Any, n_outputs: int) -> Any:
+        """Return measured tips (N, n_outputs), NaN for None if there are touches."""
         if x is None and self.names:
-            return np.full((len(self.point), 3), np.nan)
+            return np.full((len(self.point), n_outputs), np.nan)
         return x
 
     def rows(self, chain: Chain, names: tuple[str, ...], rows: TipRows, first: NDArray) -> TipRows:
@@ -91,17 +91,11 @@ class Touches:
             _SIZELESS * chain.size,
         )
 
-    def points(
-        self, unknowns: NDArray, covariance: NDArray, as_tensors: bool
-    ) -> tuple[dict[Any, Any], dict[Any, Any]]:
-        """Return the points (3 K,) by name, and their standard errors from the covariance."""
-        places = unknowns.reshape(-1, 3)
-        errors = np.sqrt(np.diag(covariance)).reshape(-1, 3)
-        if as_tensors:
-            places = torch.from_numpy(places)
-            errors = torch.from_numpy(errors)
-        by_name = dict(zip(self.names, places, strict=True))
-        return by_name, dict(zip(self.names, errors, strict=True))
+    def by_name(self, unknowns: NDArray, as_tensors: bool) -> dict[Any, Any]:
+        """Return coordinates (3 K,) of the points as arrays or tensors (3,) by name."""
+        rows = unknowns.reshape(-1, 3)
+        values = torch.from_numpy(rows) if as_tensors else rows
+        return dict(zip(self.names, values, strict=True))
 
     def size_sentences(self, error: float) -> list[str]:
         """Return a sentence if the relative standard error of the size of the points is large."""

@@ -306,7 +306,7 @@ def fit_geometry(
     check_shape(q, "q", ("N", "n_actuators"))
     weights = _check_weights(sample_weight, q)
     touches = Touches.of(touched, distances, distance_std, weights.numpy())
-    x = targets_that_count(touches.tips(x), sample_weight, "x")
+    x = targets_that_count(touches.tips(x, chain.n_outputs), sample_weight, "x")
     may_lack_tip = touches.touching | (weights.numpy() == 0.0)
     q, x, unit_messages = check_data(chain, q, x, may_lack_tip)
     motions = Groups.of(groups, len(q))
@@ -424,8 +424,8 @@ def _result(
         std_errors[part.name] = torch.from_numpy(errors) if returns_tensors else errors
     unidentified = directions[narrowed * _IDENTIFIED < 1.0]
     n_rows = float(fit.rows.weights.sum())
-    of_points = fit.slopes.covariance(covariance)
-    points, point_errors = touches.points(fit.unknowns, of_points, returns_tensors)
+    size_error = float(np.linalg.norm(fit.slopes.growth @ factor))
+    point_errors = fit.slopes.std_of_unknowns(factor)
     safe = np.where(std > 0, std, 1.0)
     return CalibrationResult(
         chain=chain,
@@ -437,15 +437,15 @@ def _result(
         identifiable=identifiable,
         singular_values=narrowed,
         unidentified=(
-            *touches.size_sentences(fit.rows.size_error(fit.unknowns, of_points)),
+            *touches.size_sentences(size_error),
             *sentences(fit, unidentified, covariance, n_rows),
         ),
         unphysical=unphysical,
         rmse=fit.rmse,
         cv_rmse=cv_rmse,
         converged=fit.converged,
-        points=points,
-        point_errors=point_errors,
+        points=touches.by_name(fit.unknowns, returns_tensors),
+        point_errors=touches.by_name(point_errors, returns_tensors),
     )
 
 
@@ -456,7 +456,7 @@ def _cross_validate(best: Fit, rows: TipRows, motions: Groups, loss: str) -> flo
         held_out = rows.take(test)
         tips = held_out.tips(fit.chain())
         unknowns = held_out.known_after(fit.rows, fit.unknowns, tips)
-        errors = held_out.at_scale_of(unknowns).errors(tips, unknowns)
+        errors = held_out.at_scale_of(tips).errors(tips, unknowns)
         squares += held_out.rms(errors) ** 2 * float(held_out.weights.sum())
     return float(np.sqrt(squares / float(rows.weights.sum())))
 
