@@ -18,6 +18,7 @@ NO_POINT = -1
 """In place of a point, for rows that touched none."""
 _EXACT = 1e-13  # relative change of a step
 _MOST_STEPS = 100
+_BENT = 0.95  # largest part of the curvature of a loss that its bend takes away
 _THIN = 1e-6  # of the moment of inertia of a set of points: about this axis it is a line
 
 
@@ -65,12 +66,24 @@ class Ties(NamedTuple):
         return J.reshape(len(self.pairs), places.size)
 
 
+def block_diagonal(blocks: NDArray) -> NDArray:
+    """Return the matrix (3 K, 3 K) with blocks (K, 3, 3) on its diagonal."""
+    n_blocks = len(blocks)
+    matrix = np.zeros((n_blocks, 3, n_blocks, 3))
+    each = np.arange(n_blocks)
+    matrix[each, :, each] = blocks
+    return matrix.reshape(3 * n_blocks, 3 * n_blocks)
+
+
 class _TouchLoss(NamedTuple):
-    """The loss of touches for some points: its value, errors (T, 3) and weights (T,) of these."""
+    """The loss for some points, and half of what each touch adds to its derivatives by its point.
+
+    These are the negative slope (T, 3) and the curvature (T, 3, 3).
+    """
 
     value: float
-    errors: NDArray
-    weights: NDArray
+    forces: NDArray
+    curvatures: NDArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,24 +167,17 @@ class TouchedRows(TipRows):
         return means.ravel()
 
     def unknowns(self, tips: NDArray, sigma: float, loss: str) -> NDArray:
-        """Return the points (3 K,) with the least loss: weighted means of tips, moved by ties.
-
-        Damped Gauss-Newton steps, in which each touch has the weight that its loss gives it.
-        """
+        """Return the points (3 K,) with the least loss, by damped Newton steps from mean tips."""
         places = self.first_unknowns(tips)
         factor = self.scale / self._size(tips) / sigma
-        ridge = _EXACT * np.eye(places.size)
         damping = 0.0
         at = self._loss(tips, places, sigma, loss)
         for _ in range(_MOST_STEPS):
-            of_points = factor**2 * np.bincount(self.touched, at.weights, self.n_points)
             ties = self.known.jacobian(places.reshape(-1, 3))
-            curvature = np.diag(np.repeat(of_points, 3)) + ties.T @ ties
-            pull = np.zeros((self.n_points, 3))
-            np.add.at(pull, self.touched, factor * at.weights[:, None] * at.errors)
-            pull = pull.ravel() - ties.T @ self.ties(places)
-            size = np.diag(curvature).max()
-            step = np.linalg.solve(curvature + size * (damping * np.eye(len(pull)) + ridge), pull)
+            pull = factor * self._sums(at.forces).ravel() - ties.T @ self.ties(places)
+            curvature = factor**2 * block_diagonal(self._sums(at.curvatures)) + ties.T @ ties
+            ridge = (damping + _EXACT) * np.diag(curvature).max()
+            step = np.linalg.solve(curvature + ridge * np.eye(len(pull)), pull)
             moved = self._loss(tips, places + step, sigma, loss)
             if moved.value > (1.0 + _EXACT) * at.value:
                 damping = max(10.0 * damping, 1e-3)
@@ -186,10 +192,25 @@ class TouchedRows(TipRows):
     def _loss(self, tips: NDArray, unknowns: NDArray, sigma: float, loss: str) -> _TouchLoss:
         """Return the loss of the touches and ties for points (3 K,)."""
         errors = self._touch_errors(tips, unknowns) / sigma
-        rho, slope, _ = LOSSES[loss]((errors**2).sum(axis=1) / 3.0)
+        squares = (errors**2).sum(axis=1)
+        rho, slope, bend = LOSSES[loss](squares / 3.0)
         weight = self.touch_weights
-        value = 3.0 * weight @ rho + (self.ties(unknowns) ** 2).sum()
-        return _TouchLoss(float(value), errors, weight * slope)
+        # Along the error the curvature stays positive, also where that of the loss is not.
+        least = -_BENT * slope / np.maximum(squares, np.finfo(np.float64).tiny)
+        bend = np.maximum(2.0 / 3.0 * bend, least)[:, None, None]
+        outer = errors[:, :, None] * errors[:, None, :]
+        curvatures = slope[:, None, None] * np.eye(3) + bend * outer
+        return _TouchLoss(
+            float(3.0 * weight @ rho + (self.ties(unknowns) ** 2).sum()),
+            (weight * slope)[:, None] * errors,
+            weight[:, None, None] * curvatures,
+        )
+
+    def _sums(self, values: NDArray) -> NDArray:
+        """Return the sums (K, ...) of values (T, ...) of the touches of every point."""
+        sums = np.zeros((self.n_points, *values.shape[1:]))
+        np.add.at(sums, self.touched, values)
+        return sums
 
     def known_after(self, fitted: TipRows, unknowns: NDArray, tips: NDArray) -> NDArray:
         """Return the points of a fit; those that its rows did not touch are at their mean tips."""
@@ -255,11 +276,10 @@ class TouchedRows(TipRows):
 
     def _means(self, values: NDArray) -> NDArray:
         """Return the means (K, ...) of values (N, ...) of the rows at every point; 0 without."""
-        sums = np.zeros((self.n_points, *values.shape[1:]))
-        weights = self.touch_weights.reshape(-1, *[1] * (values.ndim - 1))
-        np.add.at(sums, self.touched, weights * values[self.touching])
+        ones = [1] * (values.ndim - 1)
+        sums = self._sums(self.touch_weights.reshape(-1, *ones) * values[self.touching])
         counts = np.where(self.counts > 0.0, self.counts, 1.0)
-        return sums / counts.reshape(-1, *[1] * (values.ndim - 1))
+        return sums / counts.reshape(-1, *ones)
 
     def _set_of(self, tips: NDArray) -> tuple[NDArray, NDArray]:
         """Return the shares of the touches at every point (K,), and the mean tips from their mean.

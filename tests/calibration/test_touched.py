@@ -234,7 +234,7 @@ def example(seed=0):
     x = truth(q) + 0.01 * torch.from_numpy(rng.standard_normal((14, 3)))
     x[4:] = np.nan
     point = np.array([-1, -1, 0, 1, 0, 0, 0, 1, 1, 1, 2, 2, 2, 1])
-    known = Ties(np.array([[0, 1], [1, 2]]), np.array([0.3, 0.2]), 0.02)
+    known = Ties(np.array([[0, 1], [1, 2]]), np.array([0.3, 0.2]), 0.1)
     weight = torch.from_numpy(rng.uniform(0.5, 2.0, 14))
     rows = TouchedRows(q, x, weight, point, 3, known, 1e-4)
     problem = Problem.of(arm(tool=[0.0, 0.0, 0.1]), ("joint_zeros", "tool"))
@@ -245,7 +245,7 @@ def example(seed=0):
 @pytest.mark.parametrize("loss", LOSSES)
 def test_slopes_are_central_differences(loss):
     rows, problem, theta = example()
-    sigma = 0.05
+    sigma = 0.3
 
     def cost(theta):
         """Return half the loss that the solver minimises, without the prior."""
@@ -266,8 +266,7 @@ def test_slopes_are_central_differences(loss):
     gradient = (rho * residual) @ np.vstack([slopes.residual / sigma, slopes.ties])
     steps = 1e-5 * np.eye(9)
     expected = [(cost(theta + step) - cost(theta - step)) / 2e-5 for step in steps]
-    # The points follow to 1e-7 of a step, as half of the digits of a loss say where it is least.
-    np.testing.assert_allclose(gradient, expected, rtol=1e-5, atol=1e-4)
+    np.testing.assert_allclose(gradient, expected, rtol=1e-6, atol=1e-6)
 
 
 def test_points_and_distances_follow_the_geometry():
@@ -289,6 +288,7 @@ def test_points_and_distances_follow_the_geometry():
     np.testing.assert_allclose(slopes.residual[:, 0], 0.0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_standard_errors_are_the_spread_of_the_estimates(seeded):
     """Few touches of each point: the points use up a third of the coordinates."""
     truth = gantry(TOOL)
