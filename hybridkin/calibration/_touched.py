@@ -17,8 +17,7 @@ from hybridkin.chains.chain import Chain
 NO_POINT = -1
 """In place of a point, for rows that touched none."""
 _EXACT = 1e-13  # relative change of a step
-_MOST_STEPS = 100
-_BENT = 0.95  # largest part of the curvature of a loss that its bend takes away
+_MOST_STEPS = 50
 _THIN = 1e-6  # of the moment of inertia of a set of points: about this axis it is a line
 
 
@@ -59,11 +58,25 @@ class Ties(NamedTuple):
         between, lengths = self._between(places)
         lengths = np.maximum(lengths, np.finfo(np.float64).tiny)
         along = between / lengths[:, None] / self.std
-        J = np.zeros((len(self.pairs), *places.shape))
-        each = np.arange(len(self.pairs))
-        J[each, self.pairs[:, 0]] = along
-        J[each, self.pairs[:, 1]] = -along
-        return J.reshape(len(self.pairs), places.size)
+        by_pair = along[:, None] * self._ends(len(places))[:, :, None]
+        return by_pair.reshape(len(self.pairs), places.size)
+
+    def bend(self, places: NDArray) -> NDArray:
+        """Return what the curvature (3 K, 3 K) of half the squared residual has beside J'J."""
+        between, lengths = self._between(places)
+        lengths = np.maximum(lengths, np.finfo(np.float64).tiny)
+        along = between / lengths[:, None]
+        across = np.eye(3) - along[:, :, None] * along[:, None, :]
+        stretch = np.maximum(1.0 - self.distances / lengths, -1.0) / self.std**2
+        ends = self._ends(len(places))
+        size = places.size
+        return np.einsum("d,dk,dl,dij->kilj", stretch, ends, ends, across).reshape(size, size)
+
+    def _ends(self, n_points: int) -> NDArray:
+        """Return 1 for the first and -1 for the second point of every pair, (D, K)."""
+        first, second = self.pairs.T
+        each = np.eye(n_points)
+        return each[first] - each[second]
 
 
 def block_diagonal(blocks: NDArray) -> NDArray:
@@ -176,6 +189,7 @@ class TouchedRows(TipRows):
             ties = self.known.jacobian(places.reshape(-1, 3))
             pull = factor * self._sums(at.forces).ravel() - ties.T @ self.ties(places)
             curvature = factor**2 * block_diagonal(self._sums(at.curvatures)) + ties.T @ ties
+            curvature += self.known.bend(places.reshape(-1, 3))
             ridge = (damping + _EXACT) * np.diag(curvature).max()
             step = np.linalg.solve(curvature + ridge * np.eye(len(pull)), pull)
             moved = self._loss(tips, places + step, sigma, loss)
@@ -195,11 +209,8 @@ class TouchedRows(TipRows):
         squares = (errors**2).sum(axis=1)
         rho, slope, bend = LOSSES[loss](squares / 3.0)
         weight = self.touch_weights
-        # Along the error the curvature stays positive, also where that of the loss is not.
-        least = -_BENT * slope / np.maximum(squares, np.finfo(np.float64).tiny)
-        bend = np.maximum(2.0 / 3.0 * bend, least)[:, None, None]
-        outer = errors[:, :, None] * errors[:, None, :]
-        curvatures = slope[:, None, None] * np.eye(3) + bend * outer
+        outer = 2.0 / 3.0 * errors[:, :, None] * errors[:, None, :]
+        curvatures = slope[:, None, None] * np.eye(3) + bend[:, None, None] * outer
         return _TouchLoss(
             float(3.0 * weight @ rho + (self.ties(unknowns) ** 2).sum()),
             (weight * slope)[:, None] * errors,
