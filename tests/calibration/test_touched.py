@@ -366,9 +366,10 @@ def test_a_robot_that_shrinks_to_touch_its_only_point_warns(seeded):
 def test_contradictory_distances_are_for_the_fit_to_show(seeded):
     q, point = touches(gantry(TOOL), SOCKETS[:3], 6, seeded, noise=1e-4)
     distances = {("a", "b"): 0.1, ("b", "c"): 0.1, ("a", "c"): 0.9}
-    known = calibrate(gantry(), q, None, ["tool"], touched=NAMES[point], distances=distances)
+    with pytest.warns(UserWarning, match="the calibrated model has a median residual of"):
+        known = calibrate(gantry(), q, None, ["tool"], touched=NAMES[point], distances=distances)
     plain = calibrate(gantry(), q, None, ["tool"], touched=NAMES[point])
-    assert known.rmse > 20 * plain.rmse
+    assert known.rmse > 100 * plain.rmse
 
 
 def test_whole_points_and_motions_are_held_out(seeded):
