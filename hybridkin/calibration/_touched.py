@@ -168,7 +168,9 @@ class TouchedRows(TipRows):
 
     @property
     def n_used(self) -> float:
-        return max(float(self.determined.sum()) - len(self.known.distances), 0.0)
+        n_coordinates = float(self.determined.sum())
+        # Distances leave the six coordinates of a rigid body.
+        return max(n_coordinates - len(self.known.distances), min(n_coordinates, 6.0))
 
     @property
     def determined(self) -> NDArray[np.bool_]:
@@ -191,6 +193,7 @@ class TouchedRows(TipRows):
             curvature = factor**2 * block_diagonal(self._sums(at.curvatures)) + ties.T @ ties
             curvature += self.known.bend(places.reshape(-1, 3))
             ridge = (damping + _EXACT) * np.diag(curvature).max()
+            ridge = max(ridge, np.finfo(np.float64).tiny)  # points that no row touched stay
             step = np.linalg.solve(curvature + ridge * np.eye(len(pull)), pull)
             moved = self._loss(tips, places + step, sigma, loss)
             if moved.value > (1.0 + _EXACT) * at.value:
@@ -249,7 +252,7 @@ class TouchedRows(TipRows):
         carried = errors[:, :, None] * growth + self._turned(J, tips, errors)
         of_touches = factor * J[self.touching, 0] - carried
         by_theta = self.weighted(np.concatenate([J[self.seen], of_touches]))
-        by_points = np.zeros((*by_theta.shape[:1], unknowns.size)).reshape(-1, 3, unknowns.size)
+        by_points = np.zeros((len(self.weights), 3, unknowns.size))
         first = len(by_points) - len(errors)
         by_points[first:] = -factor * self._points_of_touches()
         ties = self.known.jacobian(unknowns.reshape(-1, 3))

@@ -104,7 +104,7 @@ class Touches:
         return [
             "touches do not fix the size of this robot: the size of the set of points is known to "
             f"{100 * error:.0f} % (std. error), from the prior. Give `distances` between points, "
-            "or leave a length of the robot out."
+            "or list fewer lengths in `parameters`."
         ]
 
     def messages(self, start: Chain, fit: Fit) -> list[str]:

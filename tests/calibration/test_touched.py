@@ -396,6 +396,24 @@ def test_whole_points_and_motions_are_held_out(seeded):
     assert cv_rmse == pytest.approx(np.mean(squares) ** 0.5, rel=1e-4)
 
 
+def test_a_fold_without_touches_predicts_them(seeded):
+    truth = gantry(TOOL)
+    q, point = touches(truth, SOCKETS[:2], 6, seeded, noise=1e-3)
+    camera = seeded.uniform(-0.5, 0.5, (9, 5))
+    x = truth(torch.from_numpy(camera)).numpy()
+    rows = {"q": np.vstack([q, camera]), "x": np.vstack([np.full((12, 3), np.nan), x])}
+    labels = [*NAMES[point], *[""] * 9]
+    groups = np.repeat([0, 1], [12, 9])
+    start = gantry(base=np.eye(4))
+    result = calibrate(start, **rows, parameters=["tool"], touched=labels, groups=groups)
+    # From the camera the tool is exact: the touches are apart from their means by their noise.
+    tips = truth(torch.from_numpy(q)).numpy().reshape(2, 6, 3)
+    of_touches = ((tips - tips.mean(axis=1, keepdims=True)) ** 2).sum()
+    tool = calibrate(start, q, None, ["tool"], touched=NAMES[point])
+    of_camera = ((tool.chain(torch.from_numpy(camera)).numpy() - x) ** 2).sum()
+    assert result.cv_rmse == pytest.approx(((of_touches + of_camera) / 21) ** 0.5, rel=1e-3)
+
+
 def test_too_few_touches_warn(seeded):
     q, point = touches(gantry(TOOL), SOCKETS[:2], 2, seeded, noise=1e-4)
     message = "4 touches of 2 points and 0 measured tips count as 2 rows"
