@@ -23,6 +23,8 @@ from hybridkin import Chain, ConstantCurvatureChain, InverseKinematics, RigidCha
 
 CALIPER = 5e-5  # standard error of measured distances [m]
 N_TEST = 500
+_STARTS = 30
+_WITHIN = 0.7  # part of the range of q in which points are drawn, so that many postures touch them
 
 
 @dataclass(frozen=True)
@@ -52,9 +54,10 @@ class Robot:
     more: tuple[str, ...]
     changes: Mapping[str, float]
 
-    def draw(self, rng: np.random.Generator, n: int) -> NDArray:
-        """Return random actuator vectors (n, n_actuators)."""
-        return rng.uniform(self.low, self.high, (n, len(self.low)))
+    def draw(self, rng: np.random.Generator, n: int, within: float = 1.0) -> NDArray:
+        """Return random actuator vectors (n, n_actuators) in a part of the range."""
+        middle = 0.5 * (self.low + self.high)
+        return middle + within * (rng.uniform(self.low, self.high, (n, len(self.low))) - middle)
 
     def real(self, rng: np.random.Generator) -> Chain:
         """Return a real robot."""
@@ -74,18 +77,23 @@ class Robot:
     def touch(
         self, real: Chain, points: NDArray, each: int, rng: np.random.Generator
     ) -> tuple[NDArray, NDArray]:
-        """Return actuator vectors (K * each, n) that touch points (K, 3), and the labels."""
+        """Return actuator vectors (n_touches, n) that touch points (K, 3), and the labels.
+
+        Touches that are out of reach after many starts are left out.
+        """
         ik = InverseKinematics(real, q_min=self.low, q_max=self.high, beta=0.0)
         labels = np.repeat(np.arange(len(points)), each)
         x = points[labels] + self.noise * rng.standard_normal((len(labels), 3))
         q = np.empty((len(labels), len(self.low)))
         left = np.arange(len(labels))
-        while left.size:
+        for _ in range(_STARTS):
             solved = ik.solve(x[left], self.draw(rng, left.size), tol=1e-9, max_iter=300).q
             missed = np.linalg.norm(tips(real, solved) - x[left], axis=1)
             q[left] = solved
             left = left[missed > 1e-7]
-        return q, labels
+            if not left.size:
+                break
+        return np.delete(q, left, axis=0), np.delete(labels, left)
 
 
 def arm() -> Robot:
@@ -125,8 +133,8 @@ def tendons() -> Robot:
     """Return a robot of three segments of tendons with radii 10 % and lengths 3 % off."""
     return Robot(
         ConstantCurvatureChain([0.02] * 3, lengths=[0.1] * 3),
-        np.full(9, -0.012),
-        np.full(9, 0.012),
+        np.full(9, -0.02),
+        np.full(9, 0.02),
         5e-4,
         ("radii",),
         ("radii", "lengths"),
@@ -162,7 +170,7 @@ def cases(robot: Robot, seed: int, n_points: int, each: int) -> dict[str, tuple[
     """Return the errors of all calibrations of one real robot."""
     rng = np.random.default_rng(seed)
     real = robot.real(rng)
-    points = tips(real, robot.draw(rng, n_points))
+    points = tips(real, robot.draw(rng, n_points, _WITHIN))
     q, labels = robot.touch(real, points, each, rng)
     distances = {}
     for i in range(n_points):
