@@ -221,7 +221,7 @@ def calibrate(
         a quarter of the variance of the tips remains, e.g. with columns of q in a wrong order. If
         a value is at a bound or not physical. If the mirror image of the given robot fits the data
         far better; it is then returned. If tendons of a ConstantCurvatureChain contradict each
-            other, e.g. slack tendons. If the robot shrinks to touch all points at once.
+        other, e.g. slack tendons. If the robot shrinks to touch all points at once.
 
     References
     ----------
