@@ -172,6 +172,7 @@ def test_names_of_points_and_order_of_rows_do_not_matter(seeded):
         np.testing.assert_allclose(renamed.points[k + 2], known.points[name], atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loss", LOSSES)
 def test_weights_are_repeated_touches(loss, seeded):
     q, point = touches(gantry(TOOL), SOCKETS[:3], 6, seeded, noise=1e-3)
