@@ -55,12 +55,13 @@ from hybridkin import (
     plots,
     robots,
     save_model,
+    separating_motions,
     tasks,
     trajectories,
 )
 from hybridkin.app import check_log, workflow
 from hybridkin.app.workflow import FitSettings
-from hybridkin.calibration.choice import choose_geometry
+from hybridkin.calibration.choice import GeometryChoice, choose_geometry
 from hybridkin.datasets import Log, paper_split
 
 
@@ -138,6 +139,9 @@ CALIBRATE = {
     "prior": 0.5,
     "groups": GROUPS,
     "sample_weight": np.ones(24),
+    "touched": np.arange(24) % 3,
+    "distances": {(0, 1): 0.1, (1, 2): 0.2},
+    "distance_std": 1e-4,
 }
 
 
@@ -461,11 +465,20 @@ ENTRIES = {
 }
 
 
+TWO_SETS = GeometryChoice(
+    trunk(), ("base",), name="base", rivals=(GeometryChoice(trunk(), ("radii",), name="radii"),)
+)
+
+
 COSTLY = {
     "calibrate": (calibrate, CALIBRATE),
     "choose_geometry": (
         choose_geometry,
         {"chain": trunk(), "q": Q, "x": X, "groups": GROUPS},
+    ),
+    "separating_motions": (
+        separating_motions,
+        {"choice": TWO_SETS, "q": Q, "x": X, "q_min": 0.1, "q_max": np.full(3, 0.4)},
     ),
     "HybridForwardModel.was_fitted": (LOADED.was_fitted, {"X": Q, "y": X}),
     "RobotDescription.to_log": (DESCRIPTION.to_log, {"q": Q}),
@@ -775,6 +788,10 @@ META = ROWS.to("meta")
         ("random_state", lambda: paper_split(np.full(5, 3), -1, n_test=2)),
         ("x", lambda: calibrate(trunk(), Q, HUGE, ("radii",))),
         ("groups", lambda: calibrate(trunk(), Q, X, ("radii",), groups=NAN_GROUPS)),
+        ("touched", lambda: calibrate(trunk(), Q, None, ("radii",), touched=Q)),
+        ("touched", lambda: calibrate(trunk(), Q, X, ("radii",), touched=META[:, 0])),
+        ("distances", lambda: calibrate(trunk(), Q, X, ("radii",), distances={(0, 1): 0.1})),
+        ("distance_std", lambda: calibrate(trunk(), Q, X, ("radii",), distance_std=np.nan)),
         ("groups", lambda: choose_geometry(trunk(), Q, X, groups=GROUPS[:3])),
         ("row", lambda: plots.WorkspaceDisplay(X, X, row=0.5)),
         ("names", lambda: plots.ActuatorDisplay({"a": Q}, [3], names=["a"])),

@@ -58,7 +58,7 @@ def search(
 ) -> Start:
     """Return the best start of a fit of the parameters with these names."""
     with torch.no_grad():
-        guesses = initial_guesses(chain, rows, names)
+        guesses = initial_guesses(chain, rows.measured, names)
     starts = []
     for guess in guesses:
         problem = Problem.of(guess.chain, names, prior)
