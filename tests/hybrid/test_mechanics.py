@@ -44,8 +44,9 @@ def test_a_correction_makes_a_larger_geometry_needless(seed):
     assert "offsets" in of_mechanics.parameters
     model = HybridForwardModel(NOMINAL, "auto", random_state=0).fit(q, x)
     results = model.cv_results_
-    assert results["parameters"] == "base"
-    assert results["corrected"]["base"]["cv"] < results["mechanical_model"]["base"]["cv"] / 5
+    chosen = results["parameters"]
+    assert chosen in ("nothing", "base")  # both are exact here
+    assert results["corrected"][chosen]["cv"] < results["mechanical_model"][chosen]["cv"] / 5
     assert [*results["corrected"]][:5] == [near.name for near in of_mechanics.near]
     larger = HybridForwardModel(
         NOMINAL, "auto", calibrate=of_mechanics.parameters, random_state=0
