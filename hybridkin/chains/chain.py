@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, ClassVar, TypeVar
 
 import torch
@@ -122,6 +122,15 @@ class Chain(PoseModel):
     def scale_of(self, entry: str) -> Scale:
         """Return the natural scale of the numbers of an entry; of most it is the robot's length."""
         return Scale(float(self.reach), "m")
+
+    @property
+    def reversible(self) -> tuple[int, ...]:
+        """Actuators whose motors may count in the opposite direction; by default none."""
+        return ()
+
+    def with_reversed(self, actuators: Sequence[int]) -> Chain:
+        """Return the robot with some of the `reversible` actuators in the opposite direction."""
+        return self
 
     def free_rings(self, names: tuple[str, ...]) -> set[str]:
         """Return what these parameters free of the actuator rings that must be searched."""
