@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hybridkin._core.simplest import simplest_within
 from hybridkin.calibration._initial_guesses import aligned
