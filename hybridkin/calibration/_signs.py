@@ -9,22 +9,22 @@ import numpy as np
 
 from hybridkin._core.simplest import simplest_within
 from hybridkin.calibration._initial_guesses import aligned
-from hybridkin.calibration._least_squares import ROUGH, TipRows, solve
+from hybridkin.calibration._least_squares import COMPARED, TipRows, solve
 from hybridkin.calibration._parameters import Problem
 from hybridkin.calibration.measured import evenly_spaced, points
 from hybridkin.chains.chain import Chain
 
-_ROWS = 150  # enough to compare signs
+_ROWS = 100  # enough to compare signs
 _ENOUGH = 1.5  # coordinates for each free number; with fewer, wrong signs may fit as well
 _EXPLAINED = 0.02  # of the motion of the tips: with this error the given signs are right
 _FAR_BETTER = 0.5  # other signs must lower the error to this fraction,
 _LEFT = 0.25  # and to this part of the motion of the tips
 _MANY = 8  # of more actuators, at most three are reversed
 _MOST_OF_MANY = 3
-_FITTED = 16  # the most likely signs, by the alignment of the tips alone
+_FITTED = 12  # the most likely signs, by the alignment of the tips alone
 _EQUAL = 0.1  # of errors: the fewest reversed actuators are taken
 # What is fitted for each set of signs, as far as a chain has it.
-_ROUGHLY = ("base", "tool", "joint_zeros")
+_COMPAREDLY = ("base", "tool", "joint_zeros")
 
 
 def with_likely_signs(
@@ -35,7 +35,7 @@ def with_likely_signs(
     They are reversed only if the tips then fit clearly better. A warning says so; there is
     none if nothing is reversed.
     """
-    names = tuple(name for name in _ROUGHLY if free_base or name != "base")
+    names = tuple(name for name in _COMPAREDLY if free_base or name != "base")
     few = rows.take(evenly_spaced(len(rows.q), _ROWS))
     tips = points(few.x.numpy())[few.seen]
     motion = float(np.sqrt(np.square(tips - tips.mean(axis=0)).sum(axis=1).mean()))
@@ -46,7 +46,7 @@ def with_likely_signs(
 
     def error(reversed_ones: tuple[int, ...]) -> float:
         problem = Problem.of(placed(reversed_ones), names)
-        return solve(problem, few, np.zeros(len(problem.low)), "linear", ROUGH).rmse
+        return solve(problem, few, np.zeros(len(problem.low)), "linear", COMPARED).rmse
 
     n_free = len(Problem.of(chain, names).low)
     if tips.size < _ENOUGH * n_free:

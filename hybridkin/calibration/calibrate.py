@@ -144,8 +144,8 @@ def calibrate(
     from the residuals, so exact data override it. With a free base or free angles several initial
     guesses are tried, including other turns and mirror images of the actuator rings: a robot with
     actuators in the opposite order is recognised. So are motors of a rigid arm that count in the
-    opposite direction, if its base or its gains are free. Tendons on a backbone of given length identify
-    only the ratio of gains and radii, which `unidentified` then contains.
+    opposite direction, if its base or its gains are free. Tendons on a backbone of given length
+    identify only the ratio of gains and radii, which `unidentified` then contains.
 
     Parameters
     ----------
@@ -172,9 +172,9 @@ def calibrate(
         lengths, gains and stiffnesses; of the mean radius (over the mean gain if q is not a length)
         for actuator and tendon zeros; of the robot's length for "offsets", "links", "tool", zeros
         of sliding joints and the base position; radians for angles, rest bends, zeros of turning
-        joints, "axes" and the base orientation. ``inf`` turns it off. Values also stay within a factor of 5
-        of the start for radii, lengths and gains and of 10 000 for stiffnesses, half a turn for
-        rest bends, and above minus a tenth of the robot's length for offsets.
+        joints, "axes" and the base orientation. ``inf`` turns it off. Values also stay within a
+        factor of 5 of the start for radii, lengths and gains and of 10 000 for stiffnesses, half a
+        turn for rest bends, and above minus a tenth of the robot's length for offsets.
     groups : array-like of shape (N,), optional
         Motion of every row; required for `cv_rmse` on held-out motions.
     sample_weight : array-like of shape (N,), optional
@@ -196,9 +196,9 @@ def calibrate(
     UserWarning
         If q or x look like millimetres. If there are fewer different rows than free parameters. If
         a quarter of the variance of the tips remains, e.g. with columns of q in a wrong order. If
-        a value is at a bound or not physical. If the mirror image of the given robot, or a rigid arm
-        with some actuators reversed, fits the data far better; it is then returned. If tendons of a ConstantCurvatureChain contradict each
-        other, e.g. slack tendons.
+        a value is at a bound or not physical. If the mirror image of the given robot, or a rigid
+        arm with some actuators reversed, fits the data far better; it is then returned. If tendons
+        of a ConstantCurvatureChain contradict each other, e.g. slack tendons.
 
     References
     ----------

@@ -54,6 +54,9 @@ class Chain(PoseModel):
 
     # Names of parts of entries that `calibrate` knows too, and those entries.
     aliases: ClassVar[dict[str, str]] = {}
+    # Rows that a choice of parameters needs for each of them. Those of soft robots also compensate
+    # for what the model does not describe, and then fail outside the log.
+    rows_per_parameter: ClassVar[float] = 7.0
     # Entry of the geometry with the zeros of the actuators [unit of q]; empty: none.
     _zeros: ClassVar[str] = ""
 

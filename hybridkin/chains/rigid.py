@@ -178,6 +178,8 @@ class RigidChain(Chain):
     _zeros = "joint_zeros"
     _units: ClassVar[dict[str, str]] = {**Chain._units, "axes": "-", "couplings": "-"}
     aliases: ClassVar[dict[str, str]] = {"gains": "couplings"}
+    # A rigid arm is what its model says; a third of the parameters are redundant.
+    rows_per_parameter: ClassVar[float] = 1.0
     _structure = ("n_actuators", "kinds", "names", "tip_at")
     _limits = ("q_min", "q_max", "dq_max", "ddq_max")
     _arrays = ("origins", "axes", "tip", "tool", *_limits, "base")
