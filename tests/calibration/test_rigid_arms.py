@@ -69,6 +69,11 @@ def error_of(model, arm):
     return np.linalg.norm(predicted - arm(torch.from_numpy(q)).numpy(), axis=1).mean()
 
 
+def searched(q, x):
+    rows = TipRows(torch.from_numpy(q), torch.from_numpy(x), torch.ones(len(q)).double())
+    return search(nominal(), rows, ("base",), "linear")
+
+
 def tips_of(chain):
     return lambda q: chain(torch.from_numpy(q)).numpy()
 
@@ -106,21 +111,18 @@ def test_motors_that_count_the_other_way_round_are_found(reversed_ones):
     signs = torch.ones(5, dtype=torch.float64)
     signs[[*reversed_ones]] = -1.0
     assert_close(result.chain.couplings, torch.diag(signs), rtol=0, atol=0)
-    start = search(
-        nominal(), TipRows(*map(torch.from_numpy, (q, x, np.ones(60)))), ("base",), "linear"
-    )
+    start = searched(q, x)
     assert_close(start.problem.chain.couplings, torch.diag(signs), rtol=0, atol=0)
 
 
 def test_signs_are_kept_where_others_explain_no_more():
     """Nothing but noise, and a few rows that any signs explain: no sign is flipped, no warning."""
     rng = np.random.default_rng(0)
-    for n in (3, 60):
+    for n in (3, 40):
         q = rng.uniform(-1.5, 1.5, (n, 5))
-        x = 0.2 * rng.standard_normal((n, 3))
-        choice = choose_geometry(nominal(), q, x)
-        assert choice.start.problem.chain.couplings.equal(nominal().couplings)
-        assert not choice.start.messages
+        start = searched(q, 0.2 * rng.standard_normal((n, 3)))
+        assert_close(start.problem.chain.couplings, nominal().couplings, rtol=0, atol=0)
+        assert not start.messages
 
 
 def test_reversed_actuators_keep_the_limits_of_their_joints():
@@ -153,10 +155,9 @@ def test_axes_turn_on_the_unit_sphere(rng):
     arm = RigidChain(np.tile(np.eye(4), (5, 1, 1)), axes)
     turned = parameter(arm, "axes")
     assert turned.size == 10
-    assert turned.labels[:6] == ("axes[0, x]", "axes[0, y]", "axes[1, x]", "axes[1, z]") + (
-        "axes[2, y]",
-        "axes[2, z]",
-    )
+    towards = [label.partition(", ")[2] for label in turned.labels]
+    assert towards[:6] == ["x]", "y]", "x]", "z]", "y]", "z]"]
+    assert turned.labels[3] == "axes[1, z]"
     directions = turned.tangents(torch.zeros(10, dtype=torch.float64))
     assert_close((directions * arm.axes).sum(-1), 0 * directions[..., 0], rtol=0, atol=1e-15)
     flat = directions.flatten(1)
