@@ -13,6 +13,7 @@ from hybridkin import HybridForwardModel, RigidChain, calibrate, load_model, sav
 from hybridkin.calibration._least_squares import TipRows
 from hybridkin.calibration._parameters import Problem, parameter
 from hybridkin.calibration._search import search
+from hybridkin.calibration.calibrate import fit_geometry
 from hybridkin.calibration.choice import choose_geometry
 
 NOISE = 5e-5
@@ -211,6 +212,15 @@ def test_redundant_parameters_are_named():
     assert re.search(r"links\[2, y\] \+1 mm with tool\[1\] -1 mm does not move", said)
     turned = "\n".join(calibrate(arm, q, x, (*names, "axes")).unidentified)
     assert re.search(r"base\[rot x\] \+1 deg with axes\[0, y\] \+1 deg, axes\[1, y\]", turned)
+
+
+def test_parameters_that_compensate_each_other_need_rows_once():
+    """39 numbers of which tips identify 23: 24 rows are enough not to warn, 20 are not."""
+    q, x = log_of(nominal(tool=[0.05, 0.02, 0.1]), 24)
+    start = nominal(tool=[0.05, 0.0, 0.1])
+    assert not fit_geometry(start, q, x, ALL).messages
+    (message,) = fit_geometry(start, q[:20], x[:20], ALL).messages
+    assert "holds 20 different rows for 23 free parameters" in message
 
 
 def test_a_calibrated_arm_is_saved_and_loaded(tmp_path):
