@@ -138,6 +138,9 @@ CALIBRATE = {
     "prior": 0.5,
     "groups": GROUPS,
     "sample_weight": np.ones(24),
+    "touched": np.arange(24) % 3,
+    "distances": {(0, 1): 0.1, (1, 2): 0.2},
+    "distance_std": 1e-4,
 }
 
 
@@ -775,6 +778,10 @@ META = ROWS.to("meta")
         ("random_state", lambda: paper_split(np.full(5, 3), -1, n_test=2)),
         ("x", lambda: calibrate(trunk(), Q, HUGE, ("radii",))),
         ("groups", lambda: calibrate(trunk(), Q, X, ("radii",), groups=NAN_GROUPS)),
+        ("touched", lambda: calibrate(trunk(), Q, None, ("radii",), touched=Q)),
+        ("touched", lambda: calibrate(trunk(), Q, X, ("radii",), touched=META[:, 0])),
+        ("distances", lambda: calibrate(trunk(), Q, X, ("radii",), distances={(0, 1): 0.1})),
+        ("distance_std", lambda: calibrate(trunk(), Q, X, ("radii",), distance_std=np.nan)),
         ("groups", lambda: choose_geometry(trunk(), Q, X, groups=GROUPS[:3])),
         ("row", lambda: plots.WorkspaceDisplay(X, X, row=0.5)),
         ("names", lambda: plots.ActuatorDisplay({"a": Q}, [3], names=["a"])),

@@ -204,10 +204,10 @@ def _is_missing(names: NDArray) -> NDArray[np.bool_]:
         return np.zeros(names.shape, dtype=bool)
     if names.dtype != object:
         return ~np.isfinite(names)
-    return np.array([not _is_label(entry) for entry in names], dtype=bool)
+    return np.array([not is_label(entry) for entry in names], dtype=bool)
 
 
-def _is_label(entry: Any) -> bool:
+def is_label(entry: Any) -> bool:
     """Return whether an object can name a motion: it equals itself, and is not infinite."""
     try:
         equal = bool(entry == entry)

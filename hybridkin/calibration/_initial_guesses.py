@@ -40,9 +40,12 @@ def initial_guesses(chain: Chain, rows: TipRows, names: tuple[str, ...]) -> list
     """Return the guesses to try, the given chain first.
 
     A free base is aligned with the tips. Free rings are turned and mirrored, one after the other.
-    If only the base is free, the mirror image of the whole robot is a guess.
+    If only the base is free, the mirror image of the whole robot is a guess. Without rows the given
+    chain is the only guess.
     """
     guesses = [Guess(chain)]
+    if not len(rows.q):
+        return guesses
     free_base = "base" in names
     if free_base:
         guesses.append(Guess(aligned(chain, rows)))

@@ -63,7 +63,7 @@ def search(
     if chain.reversible and (free_base or "gains" in names):
         chain, messages = with_likely_signs(chain, rows, free_base)
     with torch.no_grad():
-        guesses = initial_guesses(chain, rows, names)
+        guesses = initial_guesses(chain, rows.measured, names)
     starts = []
     for guess in guesses:
         problem = Problem.of(guess.chain, names, prior)

@@ -36,8 +36,12 @@ def with_likely_signs(
     none if nothing is reversed.
     """
     names = tuple(name for name in _COMPAREDLY if free_base or name != "base")
-    few = rows.take(evenly_spaced(len(rows.q), _ROWS))
+    measured = rows.measured
+    few = measured.take(evenly_spaced(len(measured.q), _ROWS))
     tips = points(few.x.numpy())[few.seen]
+    n_free = len(Problem.of(chain, names).low)
+    if tips.size < _ENOUGH * n_free:
+        return chain, ()
     motion = float(np.sqrt(np.square(tips - tips.mean(axis=0)).sum(axis=1).mean()))
 
     def placed(reversed_ones: tuple[int, ...]) -> Chain:
@@ -48,9 +52,6 @@ def with_likely_signs(
         problem = Problem.of(placed(reversed_ones), names)
         return solve(problem, few, np.zeros(len(problem.low)), "linear", COMPARED).rmse
 
-    n_free = len(Problem.of(chain, names).low)
-    if tips.size < _ENOUGH * n_free:
-        return chain, ()
     declared = error(())
     if declared <= _EXPLAINED * motion:
         return chain, ()

@@ -51,9 +51,9 @@ def sentences(fit: Fit, directions: NDArray, covariance: NDArray, n_rows: float)
         direction = direction / (direction[lead] * to_steps[lead])
         change = np.round(direction * to_steps, _DIGITS)  # equal changes are equal numbers
         tips = float(np.linalg.norm(columns @ direction))
-        effect = "does not move the tips"
+        effect = f"does not move {fit.rows.moved}"
         if tips >= _STILL:
-            effect = f"moves the tips by {tips:.2g} mm rms"
+            effect = f"moves {fit.rows.moved} by {tips:.2g} mm rms"
         terms = _terms(problem, change, lead)
         shown = [term for term in terms if abs(term.size) > _SMALL][:_N_TERMS]
         alone = np.abs(direction) * np.linalg.norm(columns, axis=0)

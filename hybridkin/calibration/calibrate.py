@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import difflib
 import warnings
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -26,8 +26,9 @@ from hybridkin._core.groups import Groups
 from hybridkin._core.portable import Portable
 from hybridkin.calibration._least_squares import HELD_OUT, LOSSES, Fit, TipRows, solve
 from hybridkin.calibration._search import NO_START, Start, search
+from hybridkin.calibration._touches import DISTANCE_STD, Touches
 from hybridkin.calibration._unidentified import sentences
-from hybridkin.calibration.measured import evenly_spaced, points, with_missing_markers
+from hybridkin.calibration.measured import evenly_spaced, with_missing_markers
 from hybridkin.calibration.natural_scales import GEOMETRY
 from hybridkin.chains.chain import Chain
 
@@ -79,13 +80,18 @@ class CalibrationResult(Portable):
         Parameters, e.g. "lengths", with a value at a bound or outside the physical range. They
         compensate for effects that the model does not describe, even if they are identified.
     rmse : float
-        Root mean square tip distance on the given data, over all markers [m].
+        Root mean square tip distance on the given data, over all markers [m]: from the measured
+        tip, and from the calibrated position of a touched point.
     cv_rmse : float or None
         The same on held-out groups (at most 5 folds), if `groups` was given [m].
     converged : bool
         Whether the solver met its tolerance.
     messages : tuple of str
         The warnings that `calibrate` issued.
+    points : dict of label to array of shape (3,)
+        Calibrated positions of the points of `touched`, in the measuring frame [m]; empty without.
+    point_errors : dict of label to array of shape (3,)
+        Their standard errors [m].
     """
 
     chain: Chain
@@ -102,12 +108,16 @@ class CalibrationResult(Portable):
     cv_rmse: float | None
     converged: bool
     messages: tuple[str, ...] = ()
+    points: dict[Any, Any] = field(default_factory=dict)
+    point_errors: dict[Any, Any] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         lines = [f"CalibrationResult(rmse={self.rmse:.3e} m, converged={self.converged})"]
         for name, value in self.values.items():
             lines.append(f"  {name}: {_shown(value)}")
             lines.append(f"    std. error {_shown(self.std_errors[name])}")
+        if self.points:
+            lines.append(f"  {len(self.points)} touched points")
         if self.unidentified:
             lines.append("  Not identified by the data, the values are from the prior:")
         for sentence in self.unidentified:
@@ -128,13 +138,16 @@ def _shown(value: Numbers) -> str:
 def calibrate(
     chain: Chain,
     q: Numbers,
-    x: Numbers,
+    x: Numbers | None,
     parameters: Sequence[str] = ("radii", "base"),
     *,
     loss: str = "linear",
     prior: float = GEOMETRY,
     groups: ArrayLike | None = None,
     sample_weight: Numbers | None = None,
+    touched: ArrayLike | None = None,
+    distances: Mapping[tuple[Any, Any], float] | None = None,
+    distance_std: float = DISTANCE_STD,
 ) -> CalibrationResult:
     """Return the chain with the geometry that fits measured tips best, with standard errors.
 
@@ -147,6 +160,11 @@ def calibrate(
     opposite direction, if its base or its gains are free. Tendons on a backbone of given length
     identify only the ratio of gains and radii, which `unidentified` then contains.
 
+    No camera is needed where the tip touches the same points again and again, e.g. sockets, in
+    different postures. The points are unknowns of the fit, each with its rows of `touched`. Touches
+    do not show where the base is, whether the robot is its mirror image, nor how large it is if all
+    of its lengths are free; `distances` between points fix its size.
+
     Parameters
     ----------
     chain : ConstantCurvatureChain, ElasticTendonChain, RigidChain or another Chain
@@ -155,7 +173,8 @@ def calibrate(
         Actuator vectors [m, or unit of q of a chain with gains]; [rad] for revolute joints.
     x : array or Tensor of shape (N, 3) or (N, 3 K)
         Measured tip positions [m]; for a chain with K markers all of these, NaN if one was not
-        measured. All have the same weight.
+        measured. All have the same weight. Rows of NaN were not measured, which is allowed for rows
+        of `touched`; None: no row was.
     parameters : sequence of str, default=("radii", "base")
         Entries of ``chain.geometry()``: "radii", "angles" (of every actuator), "lengths" (tendon
         chains), "offsets", "rest_bends", "actuator_zeros", "gains", "base" (pose); for elastic
@@ -180,6 +199,14 @@ def calibrate(
     sample_weight : array-like of shape (N,), optional
         How often each row counts: 2 is the same as the row twice, 0 drops it, whatever x holds
         there. Equal rows are held out together.
+    touched : array-like of shape (N,), optional
+        Label of the point that the tip touched in each row, a text or a number; "", None or NaN:
+        none. Rows with the same label touched the same point, whose position is not known. Its
+        position errors have the same noise as measured tips.
+    distances : dict of (label, label) to float, optional
+        Known distances between touched points [m].
+    distance_std : float, default=1e-4
+        Standard error of each of `distances` [m].
 
     Returns
     -------
@@ -189,7 +216,8 @@ def calibrate(
     Raises
     ------
     ValueError
-        For unknown parameters, wrong shapes, or data that are not finite.
+        For unknown parameters, wrong shapes, or data that are not finite. For points touched in one
+        row, distances between others, and "base" among `parameters` if no tip was measured.
 
     Warns
     -----
@@ -198,7 +226,8 @@ def calibrate(
         a quarter of the variance of the tips remains, e.g. with columns of q in a wrong order. If
         a value is at a bound or not physical. If the mirror image of the given robot, or a rigid
         arm with some actuators reversed, fits the data far better; it is then returned. If tendons
-        of a ConstantCurvatureChain contradict each other, e.g. slack tendons.
+        of a ConstantCurvatureChain contradict each other, e.g. slack tendons. If the robot shrinks
+        to touch all points at once.
 
     References
     ----------
@@ -213,8 +242,34 @@ def calibrate(
     >>> result = calibrate(ConstantCurvatureChain([0.06, 0.06]), q, truth(q), ("radii",))
     >>> result.values["radii"]
     tensor([0.0500, 0.0400], dtype=torch.float64)
+
+    Without a camera: the tip of the same robot touches each of two sockets in eight postures.
+
+    >>> from hybridkin import InverseKinematics
+    >>> sockets = truth(q[:2]).repeat_interleave(8, dim=0)
+    >>> ik = InverseKinematics(truth, q_min=0.2, q_max=0.3, beta=0.0)
+    >>> touching = ik.solve(sockets, q[2:18], tol=1e-9, max_iter=1000).q
+    >>> start = ConstantCurvatureChain([0.06, 0.06])
+    >>> labels = ["left"] * 8 + ["right"] * 8
+    >>> result = calibrate(start, touching, None, ["radii"], touched=labels)
+    >>> result.values["radii"]
+    tensor([0.0500, 0.0400], dtype=torch.float64)
+    >>> [*result.points]
+    ['left', 'right']
     """
-    result = fit_geometry(chain, q, x, parameters, loss, prior, groups, sample_weight)
+    result = fit_geometry(
+        chain,
+        q,
+        x,
+        parameters,
+        loss,
+        prior,
+        groups,
+        sample_weight,
+        touched=touched,
+        distances=distances,
+        distance_std=distance_std,
+    )
     for message in result.messages:
         warnings.warn(message, stacklevel=2)
     return result
@@ -223,13 +278,16 @@ def calibrate(
 def fit_geometry(
     chain: Chain,
     q: Numbers,
-    x: Numbers,
+    x: Numbers | None,
     parameters: Sequence[str],
     loss: str = "linear",
     prior: float = GEOMETRY,
     groups: ArrayLike | Groups | None = None,
     sample_weight: Numbers | None = None,
     start: Start = NO_START,
+    touched: ArrayLike | None = None,
+    distances: Mapping[tuple[Any, Any], float] | None = None,
+    distance_std: float = DISTANCE_STD,
 ) -> CalibrationResult:
     """Return the result of `calibrate`; no warning is issued.
 
@@ -250,12 +308,18 @@ def fit_geometry(
     returns_tensors = isinstance(q, Tensor)
     device = chain.geometry()["base"].device
     chain = chain.frozen().cpu()  # the solver runs on the CPU, without a graph
-    x = targets_that_count(x, sample_weight, "x")
-    q, x, unit_messages = check_data(chain, q, x)
-    motions = Groups.of(groups, len(q))
+    q = as_tensor(q, "q").to("cpu", chain.geometry()["base"].dtype)
+    check_shape(q, "q", ("N", "n_actuators"))
     weights = _check_weights(sample_weight, q)
-    first, counts, _ = distinct_rows(q, x, weights, motions.apart)
+    touches = Touches.of(touched, distances, distance_std, weights.numpy())
+    x = targets_that_count(touches.tips(x, chain.n_outputs), sample_weight, "x")
+    may_lack_tip = touches.touching | (weights.numpy() == 0.0)
+    q, x, unit_messages = check_data(chain, q, x, may_lack_tip)
+    motions = Groups.of(groups, len(q))
+    apart = np.column_stack([motions.apart, touches.point])
+    first, counts, _ = distinct_rows(q, x, weights, apart)
     rows = TipRows(q[first], x[first], torch.from_numpy(counts).to(q))
+    rows = touches.rows(chain, names, rows, first)
     if not start.n_free:
         start = search(chain, rows, names, loss, prior)
     best = solve(start.problem, rows, start.theta, loss)
@@ -263,16 +327,17 @@ def fit_geometry(
     messages = [
         *unit_messages,
         *start.messages,
-        *_few(best, rows),
+        *rows.few_messages(_n_independent(best)),
         *doubts,
         *best.chain().contradictions(q),
     ]
     if not unit_messages:
-        messages += _unexplained(best, rows)
+        messages += _unexplained(best)
+    messages += touches.messages(chain, best)
     cv_rmse = None
     if motions.whole:
         cv_rmse = _cross_validate(best, rows, motions.take(first), loss)
-    result = _result(best, rows, cv_rmse, unphysical, returns_tensors)
+    result = _result(best, touches, cv_rmse, unphysical, returns_tensors)
     result.chain.to(device)
     return replace(result, messages=tuple(messages))
 
@@ -289,38 +354,28 @@ def refitted(start: Start, q: Tensor, x: Tensor, weights: Tensor) -> Chain:
     return start.fitted(rows, "linear", HELD_OUT)
 
 
-def _few(fit: Fit, rows: TipRows) -> list[str]:
-    """Return a warning if there are fewer rows than free parameters: `rmse` is then too small.
+def _n_independent(fit: Fit) -> int:
+    """Return the number of free parameters; those that compensate each other count once.
 
-    Parameters that compensate each other count once, where the rows suffice to see it.
+    They all count where the rows suffice for them, or are too few to see it.
     """
-    n_rows = len(rows.q)
     n_free = fit.theta.size
-    if n_rows >= n_free:
-        return []
-    if fit.jacobian.shape[0] > n_free:
-        columns = fit.jacobian * fit.problem.prior_std
-        n_free = int(np.linalg.matrix_rank(columns, _REDUNDANT * np.linalg.norm(columns, 2)))
-    if n_rows >= n_free:
-        return []
-    return [
-        f"`q` holds {n_rows} different rows for {n_free} free parameters: `rmse` is far below the "
-        f"error on new rows. Record at least {4 * n_free}, or list fewer `parameters`."
-    ]
+    if not len(fit.rows.q) < n_free < len(fit.jacobian):
+        return n_free
+    columns = fit.jacobian * fit.problem.prior_std
+    return int(np.linalg.matrix_rank(columns, _REDUNDANT * np.linalg.norm(columns, 2)))
 
 
-def _unexplained(fit: Fit, rows: TipRows) -> list[str]:
+def _unexplained(fit: Fit) -> list[str]:
     """Return a warning if the median residual is large, which a few outliers cannot cause."""
-    residual = np.median(np.linalg.norm(rows.residual(fit.chain()), axis=1))
-    centred = points((rows.x - rows.x.nanmedian(dim=0).values).numpy())[rows.seen]
-    spread = np.median(np.linalg.norm(centred, axis=1))
+    rows = fit.rows
+    residual = np.median(np.linalg.norm(fit.residual, axis=1))
+    spread = np.median(np.linalg.norm(rows.centred(fit.unknowns), axis=1))
     if len(rows.x) < _FEW or not 0 < _LEFT * spread < residual:
         return []
     return [
         f"the calibrated model has a median residual of {1e3 * residual:.3g} mm, but the tip moves "
-        f"by only {1e3 * spread:.3g} mm. Order or sign of the columns of `q`, or the description "
-        "of the robot, may be wrong: app.check_log(Log(q, x), chain=chain) looks for better "
-        "ones."
+        f"by only {1e3 * spread:.3g} mm. Order or sign of the columns of `q`, {rows.may_be_wrong}"
     ]
 
 
@@ -360,7 +415,7 @@ def _unphysical(fit: Fit) -> tuple[tuple[str, ...], list[str]]:
 
 def _result(
     fit: Fit,
-    rows: TipRows,
+    touches: Touches,
     cv_rmse: float | None,
     unphysical: tuple[str, ...],
     returns_tensors: bool,
@@ -386,7 +441,9 @@ def _result(
         values[part.name] = value if returns_tensors else value.numpy()
         std_errors[part.name] = torch.from_numpy(errors) if returns_tensors else errors
     unidentified = directions[narrowed * _IDENTIFIED < 1.0]
-    n_rows = float(rows.weights.sum())
+    n_rows = float(fit.rows.weights.sum())
+    size_error = float(np.linalg.norm(fit.slopes.growth @ factor))
+    point_errors = fit.slopes.std_of_unknowns(factor)
     safe = np.where(std > 0, std, 1.0)
     return CalibrationResult(
         chain=chain,
@@ -397,11 +454,16 @@ def _result(
         narrowing=prior_std / safe,
         identifiable=identifiable,
         singular_values=narrowed,
-        unidentified=sentences(fit, unidentified, covariance, n_rows),
+        unidentified=(
+            *touches.size_sentences(size_error),
+            *sentences(fit, unidentified, covariance, n_rows),
+        ),
         unphysical=unphysical,
         rmse=fit.rmse,
         cv_rmse=cv_rmse,
         converged=fit.converged,
+        points=touches.by_name(fit.unknowns, returns_tensors),
+        point_errors=touches.by_name(point_errors, returns_tensors),
     )
 
 
@@ -410,7 +472,10 @@ def _cross_validate(best: Fit, rows: TipRows, motions: Groups, loss: str) -> flo
     for train, test in motions.folds():
         fit = solve(best.problem, rows.take(train), best.theta, loss, HELD_OUT)
         held_out = rows.take(test)
-        squares += held_out.rmse(fit.chain()) ** 2 * float(held_out.weights.sum())
+        tips = held_out.tips(fit.chain())
+        unknowns = held_out.known_after(fit.rows, fit.unknowns, tips)
+        errors = held_out.at_scale_of(tips).errors(tips, unknowns)
+        squares += held_out.rms(errors) ** 2 * float(held_out.weights.sum())
     return float(np.sqrt(squares / float(rows.weights.sum())))
 
 
@@ -435,8 +500,13 @@ def _check_parameters(chain: Chain, parameters: Sequence[str]) -> tuple[str, ...
     return names
 
 
-def check_data(chain: Chain, q: Numbers, x: Numbers) -> tuple[Tensor, Tensor, list[str]]:
-    """Return the data as tensors in the dtype of the chain, and warnings about their units."""
+def check_data(
+    chain: Chain, q: Numbers, x: Any, may_lack_tip: ArrayLike = False
+) -> tuple[Tensor, Tensor, list[str]]:
+    """Return the data as tensors in the dtype of the chain, and warnings about their units.
+
+    Rows (N,) that may lack their tip may have NaN in all columns of x.
+    """
     dtype = chain.geometry()["base"].dtype
     q = as_tensor(q, "q").to("cpu", dtype)
     x = as_tensor(x, "x").to("cpu", dtype)
@@ -445,7 +515,11 @@ def check_data(chain: Chain, q: Numbers, x: Numbers) -> tuple[Tensor, Tensor, li
     if len(q) == 0:
         raise ValueError("`q` must hold at least one row, got none.")
     messages = chain.check_actuators(q)
-    x = torch.from_numpy(with_missing_markers(x.numpy(force=True), "x"))
+    tips = x.numpy(force=True)
+    lacking = np.logical_and(may_lack_tip, np.isnan(tips).all(axis=1))
+    present = np.where(lacking[:, None], 0.0, tips)
+    checked = with_missing_markers(present.astype(tips.dtype), "x")
+    x = torch.from_numpy(np.where(lacking[:, None], np.nan, checked).astype(tips.dtype))
     return q, x, [*messages, *chain.tip_messages(q, x, "x")]
 
 
