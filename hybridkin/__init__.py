@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from hybridkin._core.model import ForwardModel, as_forward_model, jacobian
     from hybridkin.calibration.calibrate import CalibrationResult, calibrate
     from hybridkin.calibration.choice import GeometryChoice, choose_geometry
+    from hybridkin.calibration.separate import SeparatingMotion, separating_motions
     from hybridkin.chains import robots
     from hybridkin.chains.chain import Chain
     from hybridkin.chains.constant_curvature import ConstantCurvatureChain
@@ -54,6 +55,7 @@ __all__ = [
     "LengthDrivenChain",
     "ModelDescription",
     "RigidChain",
+    "SeparatingMotion",
     "Step",
     "Track",
     "Tracker",
@@ -72,6 +74,7 @@ __all__ = [
     "plots",
     "robots",
     "save_model",
+    "separating_motions",
     "tasks",
     "trajectories",
 ]
@@ -81,6 +84,7 @@ _NAMES_OF = {
     "_core.model": ("ForwardModel", "as_forward_model", "jacobian"),
     "calibration.calibrate": ("CalibrationResult", "calibrate"),
     "calibration.choice": ("GeometryChoice", "choose_geometry"),
+    "calibration.separate": ("SeparatingMotion", "separating_motions"),
     "chains.chain": ("Chain",),
     "chains.constant_curvature": ("ConstantCurvatureChain",),
     "chains.elastic_tendons": ("ElasticTendonChain",),

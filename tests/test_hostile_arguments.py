@@ -55,12 +55,13 @@ from hybridkin import (
     plots,
     robots,
     save_model,
+    separating_motions,
     tasks,
     trajectories,
 )
 from hybridkin.app import check_log, workflow
 from hybridkin.app.workflow import FitSettings
-from hybridkin.calibration.choice import choose_geometry
+from hybridkin.calibration.choice import GeometryChoice, choose_geometry
 from hybridkin.datasets import Log, paper_split
 
 
@@ -464,11 +465,20 @@ ENTRIES = {
 }
 
 
+TWO_SETS = GeometryChoice(
+    trunk(), ("base",), name="base", rivals=(GeometryChoice(trunk(), ("radii",), name="radii"),)
+)
+
+
 COSTLY = {
     "calibrate": (calibrate, CALIBRATE),
     "choose_geometry": (
         choose_geometry,
         {"chain": trunk(), "q": Q, "x": X, "groups": GROUPS},
+    ),
+    "separating_motions": (
+        separating_motions,
+        {"choice": TWO_SETS, "q": Q, "x": X, "q_min": 0.1, "q_max": np.full(3, 0.4)},
     ),
     "HybridForwardModel.was_fitted": (LOADED.was_fitted, {"X": Q, "y": X}),
     "RobotDescription.to_log": (DESCRIPTION.to_log, {"q": Q}),

@@ -369,6 +369,12 @@ class ForwardModel(PortableModule):
         return torch.ones_like(q[..., 0], dtype=torch.bool)
 
     @property
+    def is_stepwise(self) -> bool:
+        """Whether a part of the model is constant almost everywhere, as trees are."""
+        parts = [part for part in self.modules() if isinstance(part, ForwardModel)]
+        return any(part.is_stepwise for part in parts if part is not self)
+
+    @property
     def plane(self) -> PlaneOfQ:
         """The plane of q to keep to: the whole space if nothing is known of one."""
         return PlaneOfQ.whole()

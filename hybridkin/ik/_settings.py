@@ -249,6 +249,19 @@ class StepSettings(Portable):
                 messages += robot.unit_messages(rows, name, factor)
         return messages
 
+    def derivative_messages(self) -> list[str]:
+        """Return a warning if a part of a model has no derivative to follow."""
+        if not any(model.is_stepwise for model in self.task.models):
+            return []
+        return [
+            "`model` has a regressor that is constant between steps, as trees and nearest "
+            "neighbours are: its derivative is zero almost everywhere. Steps follow the derivative "
+            "of the mechanical model alone (without one no step approaches the target), and "
+            "targets within a step of the regressor are not reached. Use such regressors for "
+            "predictions, and a smooth error model for inverse kinematics, for example "
+            "error_model='auto'."
+        ]
+
     def posture_messages(self, q: Tensor, name: str) -> list[str]:
         """Return warnings if configurations (..., n) seem to have another unit than the model."""
         rows = q.reshape(-1, q.shape[-1])

@@ -229,7 +229,8 @@ class InverseKinematics:
             clearance=_length(clearance, "clearance"),
             body_points=body_points_of(body_points),
         )
-        for message in self.settings.unit_messages():
+        settings = self.settings
+        for message in [*settings.unit_messages(), *settings.derivative_messages()]:
             warnings.warn(message, stacklevel=2)
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
@@ -27,6 +28,7 @@ from hybridkin.learning.network import write_units
 _LINEAR = (LinearRegression, Ridge, RidgeCV, ElasticNet)
 _LARGEST = float(np.finfo(np.float32).max)
 _KERNEL_BLOCK = 2**20  # numbers in the kernel matrix of a block of rows
+_SOME = 20  # training rows at which derivatives are looked at
 
 
 class Regressor(Protocol):
@@ -368,8 +370,17 @@ class RegressorModule(ForwardModel):
         width = (q.amax(0) - q.amin(0)).numpy()
         width[width == 0.0] = 1.0
         self._step = np.finfo(np.float64).eps ** (1 / 3) * width
+        self._some_rows = q[:: max(1, len(q) // _SOME)].clone()
         self.n_actuators = q.shape[1]
         self.n_outputs = self.evaluate(q[:1]).shape[1]
+
+    @cached_property
+    def is_stepwise(self) -> bool:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Whether predictions change from row to row, but have no derivative at most of them."""
+        rows = self._some_rows
+        changes = bool((self(rows) != self(rows[:1])).any())
+        flat = (self.differences(rows) == 0.0).flatten(1).all(dim=1)
+        return changes and bool(2 * flat.sum() > len(rows))
 
     def forward(self, q: Tensor) -> Tensor:
         """Return the regressor's prediction, shape (..., m)."""

@@ -280,3 +280,25 @@ def test_a_regressor_of_one_output_is_refused_with_the_way_out(regressor):
     with pytest.raises(ValueError, match=r"`error_model` must learn all columns.*MultiOutput"):
         model(regressor).fit(q, x)
     model(MultiOutputRegressor(regressor)).fit(q, x)
+
+
+@pytest.mark.parametrize("name", [*STEPS, "MLP", "SVR", "Ridge", "constant"])
+def test_inverse_kinematics_warns_of_regressors_without_derivatives(name):
+    """Only of those that change from row to row; without mechanics they leave q where it is."""
+    q, x = log()
+    regressor = REGRESSORS.get(name, DummyRegressor())
+    fitted = model(regressor).fit(q, x)
+    with warnings.catch_warnings(record=True) as seen:
+        warnings.simplefilter("always")
+        InverseKinematics(fitted, q_min=0.1, q_max=0.4)
+    messages = [str(warning.message) for warning in seen]
+    assert any("is zero almost everywhere" in message for message in messages) == (name in STEPS)
+    if name not in STEPS:
+        return
+    alone = HybridForwardModel(None, regressor).fit(q, x)
+    with pytest.warns(UserWarning, match="derivative is zero almost everywhere"):
+        ik = InverseKinematics(alone, q_min=0.1, q_max=0.4, beta=0.0)
+    tracker = ik.tracker(q[0])
+    for target in x[1:4]:
+        tracker.step(target)
+    np.testing.assert_allclose(tracker.q, q[0], atol=1e-9)

@@ -210,7 +210,9 @@ def _next(command: argparse.ArgumentParser) -> None:
 
     Chooses the configurations after which a hybrid model has the least expected error, everywhere
     within the limits or along a path. Writes them to next.csv in the units, names and sign of the
-    robot's logs, in the order of choice, each with the expected error that remains after it.
+    robot's logs, in the order of choice, each with the expected error that remains after it. With
+    --measured, it also names motions that show which parameters of the robot are wrong, where the
+    log leaves that open, and writes them to separating.csv.
 
     Some examples:
       hybridkin next robot.toml -n 50 --out plan

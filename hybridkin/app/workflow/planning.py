@@ -6,7 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
-from hybridkin import HybridForwardModel, choose_rows, trajectories
+from hybridkin import (
+    HybridForwardModel,
+    SeparatingMotion,
+    choose_geometry,
+    choose_rows,
+    separating_motions,
+    trajectories,
+)
 from hybridkin.app.workflow.domain import Domain, PathLimits, path_limits
 from hybridkin.app.workflow.log import MeasuredLog
 from hybridkin.app.workflow.model import commands_for, tips_at
@@ -44,6 +51,10 @@ def next_rows(
     the limits, and tendons of a segment do not pull against each other. With backlash, send the
     commands in this order.
 
+    If rows are measured, and the description of the robot leaves open what is calibrated, the
+    report names the motions that separate sets of parameters with nearly equal errors, see
+    `separating_motions`; their commands are in ``separating.csv``.
+
     Parameters
     ----------
     model : HybridForwardModel
@@ -67,8 +78,9 @@ def next_rows(
     Returns
     -------
     Report of dict
-        "expected_errors" (n,) [m] after each configuration, the "limits", "n_measured" rows, and
-        "where" the error must be small, in words.
+        "expected_errors" (n,) [m] after each configuration, the "limits", "n_measured" rows,
+        "where" the error must be small, in words, and the "separating" motions, one
+        `SeparatingMotion` for each set of parameters whose errors are near the best.
 
     Raises
     ------
@@ -76,7 +88,7 @@ def next_rows(
         If the range of the actuators is not known, or fewer than `n` balanced configurations lie
         within it.
     """
-    check_out(out, "next", ["next.csv"], force=force)
+    check_out(out, "next", ["next.csv", "separating.csv"], force=force)
     n = whole(n, "n")
     if limits is None:
         limits = path_limits(model, within_fit=False)
@@ -94,7 +106,12 @@ def next_rows(
         measured_q = model.effective(measured.commands)
     progress("choosing configurations", 0, 1)
     rows, errors = choose_rows(model, candidates, n, measured=measured_q, target=target)
-    n_measured = 0 if measured is None else len(measured.q)
+    n_measured = 0
+    separating: tuple[SeparatingMotion, ...] = ()
+    if measured is not None:
+        n_measured = len(measured.q)
+        progress("comparing sets of parameters", 0, 1)
+        separating = _separating(model, measured, limits)
     record = {
         "command": "next",
         "model": model.description_.path,
@@ -102,6 +119,7 @@ def next_rows(
         "where": where,
         "limits": limits,
         "expected_errors": errors,
+        "separating": separating,
     }
     report = Report(f"{model.description_.name}: {n} configurations to measure next", record)
     shown = sorted({k for k in _SHOWN if k < n} | {n})
@@ -116,5 +134,33 @@ def next_rows(
     sent = log.to_log(commands_for(model, candidates[rows]))
     numbers = np.column_stack([sent, errors / METRES[log.x_unit]])
     report.table_file("next.csv", [*log.q, "expected_error"], np.char.mod("%.9g", numbers))
+    if separating:
+        report.text(
+            "## What the measured rows leave open\n\nThese sets of parameters have nearly equal "
+            "errors on the measured rows. The motions show which one is right."
+        )
+        report.items([str(motion) for motion in separating])
+        lines = []
+        for k, motion in enumerate(separating):
+            for command in log.to_log(commands_for(model, motion.q)):
+                lines.append([str(k + 1), *np.char.mod("%.9g", command)])
+        report.table_file("separating.csv", ["motion", *log.q], lines)
     report.write(out)
     return report
+
+
+def _separating(
+    model: HybridForwardModel, measured: MeasuredLog, limits: PathLimits
+) -> tuple[SeparatingMotion, ...]:
+    """Return the motions that separate what the description of the robot leaves open.
+
+    There are none if it has no chain, or a list of what to calibrate.
+    """
+    robot = model.description_.robot
+    if robot.chain is None or robot.calibrate != "auto":
+        return ()
+    rows = measured.counted
+    q = model.effective(measured.commands)[rows]
+    x = measured.x[rows]
+    choice = choose_geometry(robot.chain, q, x, groups=measured.motions[rows])
+    return separating_motions(choice, q, x, q_min=limits.q_min, q_max=limits.q_max)

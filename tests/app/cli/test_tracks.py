@@ -1,5 +1,6 @@
 """`next`, `track`, `animate` and `export`: from a model to commands."""
 
+import json
 import re
 
 import numpy as np
@@ -61,6 +62,45 @@ def test_next_counts_what_is_measured_and_where_the_error_matters(robot, log, tm
     assert record["where"].startswith("along the path")
     # A base that is not known to the end moves a path as it moves all tips.
     assert record["expected_errors"][-1] < fresh["expected_errors"][-1]
+
+
+def small_log():
+    """Rows bent by up to 6 deg, of a robot with a base of its own and a tool of 30 mm."""
+    base = torch.eye(4, dtype=torch.float64)
+    base[:3, 3] = torch.tensor([0.05, -0.1, 0.2])
+    offsets = torch.tensor([0.0, 0.03], dtype=torch.float64)
+    truth = hybridkin.ConstantCurvatureChain([0.0055, 0.0055], lengths=[0.1, 0.1])
+    truth = truth.with_geometry(offsets=offsets, base=base)
+    rng = np.random.default_rng(0)
+    ring = 2.0 * np.pi / 3.0 * np.arange(3)
+    bends = rng.uniform(-0.1, 0.1, (60, 2, 2))
+    q = -0.0055 * (bends @ [np.cos(ring), np.sin(ring)]).reshape(60, 6)
+    x = truth(torch.from_numpy(q)).numpy() + 3e-4 * rng.standard_normal((60, 3))
+    return np.column_stack([np.arange(60), -1e3 * q, 1e3 * x, np.arange(60) // 6])
+
+
+@pytest.mark.slow
+def test_next_names_the_motion_that_shows_whether_the_tool_is_wrong(robot, tmp_path, capsys):
+    """Only where the description leaves open what is calibrated, and rows are measured."""
+    log = write(tmp_path / "log.csv", small_log())
+    plan = ["next", robot, "-n", 3, "--out", tmp_path / "plan"]
+    assert document(capsys, *plan, "--measured", log)[1]["separating"] == []
+    robot.write_text(ROBOT.replace('calibrate = ["radii", "base"]', ""))
+    assert document(capsys, *plan)[1]["separating"] == []
+    assert not (tmp_path / "plan" / "separating.csv").exists()
+    code, out, _ = run(capsys, *plan, "--measured", log)
+    assert code == 0
+    record = json.loads((tmp_path / "plan" / "report.json").read_text())
+    table = np.genfromtxt(tmp_path / "plan" / "separating.csv", delimiter=",", names=True)
+    assert table.dtype.names == ("motion", *COLUMNS)
+    table = np.array([*map(tuple, table)])
+    for k, motion in enumerate(record["separating"]):
+        assert motion["motion"].split(",")[0] in " ".join(out.split())
+        sent = table[table[:, 0] == k + 1, 1:]
+        np.testing.assert_allclose(sent, -1e3 * np.array(motion["q"]), atol=1e-5)
+        assert np.abs(sent).max() <= 6.0 + 1e-9
+    (tool,) = [entry for entry in record["separating"] if "tool" in entry["rival"]]
+    assert tool["remaining"] > 5.0 * tool["noise"]
 
 
 class Enough(ValueError):
