@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hybridkin._core.rotations import cross_matrix, rotation
+from hybridkin._core.stumpff import stumpff
 from hybridkin.calibration.natural_scales import GEOMETRY
 from hybridkin.chains.chain import Chain
 
@@ -127,6 +128,38 @@ class Factors(Shifts):
         return super().std_errors(std, value) * np.abs(value)
 
 
+@dataclass(frozen=True, eq=False)
+class Directions(Parameter):
+    """Unit vectors (n, 3) that turn, each by two angles, along great circles from the start.
+
+    Column k of `directions` holds unit vectors perpendicular to those of the start.
+    """
+
+    directions: Tensor  # (3 n, size)
+
+    def entry_at(self, theta: Tensor) -> Tensor:
+        way = self._way(theta)
+        circular = stumpff(way.square().sum(-1, keepdim=True))
+        return circular.c * self.start + circular.f * way
+
+    def tangents(self, theta: Tensor) -> Tensor:
+        way = self._way(theta)
+        circular = stumpff(way.square().sum(-1, keepdim=True))
+        steps = self.directions.to(theta).T.reshape(-1, *self.start.shape)
+        along = (steps * way).sum(-1, keepdim=True)  # change of half the squared angle
+        turned = (circular.c3 - circular.g) * way - circular.f * self.start
+        return along * turned + circular.f * steps
+
+    def _way(self, theta: Tensor) -> Tensor:
+        return (self.directions.to(theta) @ theta).reshape(self.start.shape)
+
+    def bounds(self) -> tuple[NDArray, NDArray]:
+        return np.full(self.size, -np.inf), np.full(self.size, np.inf)
+
+    def value(self, entry: Tensor) -> Tensor:
+        return entry
+
+
 class Pose(Parameter):
     """A pose that changes by a rotation vector and a translation, both in the measuring frame."""
 
@@ -165,6 +198,12 @@ def parameter(chain: Chain, name: str) -> Parameter:
         return Pose(name, entry, start, labels, units, kinds, (6,))
     scale = chain.scale_of(entry)
     units = np.broadcast_to(scale.unit, len(part.shown))
+    kinds = tuple(np.broadcast_to(scale.kind, len(part.shown)).tolist())
+    directions = torch.from_numpy(part.directions * units)
+    if scale.turns:
+        start = start / start.norm(dim=1, keepdim=True)
+        labels = tuple(f"{name}[{k // 3}, {'xyz'[k % 3]}]" for k in part.shown.tolist())
+        return Directions(name, entry, start, labels, units, kinds, part.shape, directions)
     form = Factors if scale.keeps_sign else Shifts
     return form(
         name,
@@ -172,9 +211,9 @@ def parameter(chain: Chain, name: str) -> Parameter:
         start,
         _labels(name, part.shape),
         units,
-        tuple(np.broadcast_to(scale.kind, len(part.shown)).tolist()),
+        kinds,
         part.shape,
-        torch.from_numpy(part.directions * units),
+        directions,
         part.shown,
         scale.low,
         scale.high,

@@ -12,6 +12,7 @@ from hybridkin._core.model import ZeroModel
 from hybridkin.calibration._initial_guesses import Guess, initial_guesses
 from hybridkin.calibration._least_squares import ROUGH, Accuracy, Fit, TipRows, solve
 from hybridkin.calibration._parameters import Problem
+from hybridkin.calibration._signs import with_likely_signs
 from hybridkin.calibration.natural_scales import GEOMETRY
 from hybridkin.chains.chain import Chain
 
@@ -57,17 +58,22 @@ def search(
     prior: float = GEOMETRY,
 ) -> Start:
     """Return the best start of a fit of the parameters with these names."""
+    messages = ()
+    free_base = "base" in names
+    if chain.reversible and (free_base or "gains" in names):
+        chain, messages = with_likely_signs(chain, rows, free_base)
     with torch.no_grad():
         guesses = initial_guesses(chain, rows.measured, names)
     starts = []
     for guess in guesses:
         problem = Problem.of(guess.chain, names, prior)
-        starts.append(Start(problem, problem.start(guess.scale)))
+        starts.append(Start(problem, problem.start(guess.scale), messages))
     if len(starts) == 1:
         return starts[0]
     fits = [solve(start.problem, rows, start.theta, loss, ROUGH) for start in starts]
     free_angles = "angles" in names or "turns" in names
-    return _best(fits, guesses, free_angles)
+    best = _best(fits, guesses, free_angles)
+    return best._replace(messages=messages + best.messages)
 
 
 def widened(

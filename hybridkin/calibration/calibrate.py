@@ -37,6 +37,7 @@ __all__ = ["CalibrationResult", "calibrate"]
 # Identified if the standard error is below this fraction of the prior. (The prior alone narrows k
 # parameters that share one unidentified direction to 1 / sqrt(k).)
 _IDENTIFIED = 0.1
+_REDUNDANT = 1e-9  # of the largest motion of the tips: smaller ones are rounding
 # fewest rows; ratio of residual to spread, a quarter of the variance
 _FEW = 10
 _ENOUGH = 500  # rows to calibrate on when rows are held out
@@ -56,10 +57,12 @@ class CalibrationResult(Portable):
     values : dict of str to array
         The calibrated geometry by parameter name, in the shapes and units of ``chain.geometry()``;
         "tool" () [m] is the last offset, "turns" (S,) [rad] the angle of the first actuator of
-        each segment, "gain" () the first gain.
+        each segment, "gain" () the first gain. Of rigid arms "gains" (n,) [-] holds the motion of
+        the first joint of each actuator per motion of it.
     std_errors : dict of str to array
         One standard error for each entry of `values`; for "base" shape (6,), three of rotation
-        [rad] and three of translation [m], in the measuring frame.
+        [rad] and three of translation [m], in the measuring frame; for "axes" shape (n_joints, 2)
+        [rad], towards the two coordinate axes of the joint's frame that `names` tell.
     correlations : ndarray of shape (P, P)
         Correlation of the P free parameters, in the order of `names`.
     names : tuple of P str
@@ -153,8 +156,9 @@ def calibrate(
     identified by the data near their start. Its weight follows the noise level, which is estimated
     from the residuals, so exact data override it. With a free base or free angles several initial
     guesses are tried, including other turns and mirror images of the actuator rings: a robot with
-    actuators in the opposite order is recognised. Tendons on a backbone of given length identify
-    only the ratio of gains and radii, which `unidentified` then contains.
+    actuators in the opposite order is recognised. So are motors of a rigid arm that count in the
+    opposite direction, if its base or its gains are free. Tendons on a backbone of given length
+    identify only the ratio of gains and radii, which `unidentified` then contains.
 
     No camera is needed where the tip touches the same points again and again, e.g. sockets, in
     different postures. The points are unknowns of the fit, each with its rows of `touched`. Touches
@@ -175,9 +179,10 @@ def calibrate(
         Entries of ``chain.geometry()``: "radii", "angles" (of every actuator), "lengths" (tendon
         chains), "offsets", "rest_bends", "actuator_zeros", "gains", "base" (pose); for elastic
         tendon chains also "bending_stiffness", "axial_stiffness" and "tendon_zeros"; for rigid
-        arms "joint_zeros", "links" and "tool". Smaller sets: "turns", one common turn of each
-        segment's actuators, instead of "angles"; "tool", the last offset, instead of "offsets";
-        "gain", a common factor, instead of "gains".
+        arms "base", "tool", "joint_zeros", "links", "axes" (two angles for each joint) and "gains",
+        a factor on the motion of the joints for each actuator (gear ratio). Smaller sets: "turns",
+        one common turn of each segment's actuators, instead of "angles"; "tool", the last offset,
+        instead of "offsets"; "gain", a common factor, instead of "gains".
     loss : {"linear", "soft_l1", "cauchy"}, default="linear"
         All but "linear" bound the influence of outliers: ``rho(|e|^2 / 3)`` of SciPy's
         ``least_squares``, with the distance ``|e|`` of a row over the noise, times its weight.
@@ -186,9 +191,9 @@ def calibrate(
         lengths, gains and stiffnesses; of the mean radius (over the mean gain if q is not a length)
         for actuator and tendon zeros; of the robot's length for "offsets", "links", "tool", zeros
         of sliding joints and the base position; radians for angles, rest bends, zeros of turning
-        joints and the base orientation. ``inf`` turns it off. Values also stay within a factor of 5
-        of the start for radii, lengths and gains and of 10 000 for stiffnesses, half a turn for
-        rest bends, and above minus a tenth of the robot's length for offsets.
+        joints, "axes" and the base orientation. ``inf`` turns it off. Values also stay within a
+        factor of 5 of the start for radii, lengths and gains and of 10 000 for stiffnesses, half a
+        turn for rest bends, and above minus a tenth of the robot's length for offsets.
     groups : array-like of shape (N,), optional
         Motion of every row; required for `cv_rmse` on held-out motions.
     sample_weight : array-like of shape (N,), optional
@@ -219,9 +224,10 @@ def calibrate(
     UserWarning
         If q or x look like millimetres. If there are fewer different rows than free parameters. If
         a quarter of the variance of the tips remains, e.g. with columns of q in a wrong order. If
-        a value is at a bound or not physical. If the mirror image of the given robot fits the data
-        far better; it is then returned. If tendons of a ConstantCurvatureChain contradict each
-        other, e.g. slack tendons. If the robot shrinks to touch all points at once.
+        a value is at a bound or not physical. If the mirror image of the given robot, or a rigid
+        arm with some actuators reversed, fits the data far better; it is then returned. If tendons
+        of a ConstantCurvatureChain contradict each other, e.g. slack tendons. If the robot shrinks
+        to touch all points at once.
 
     References
     ----------
@@ -321,7 +327,7 @@ def fit_geometry(
     messages = [
         *unit_messages,
         *start.messages,
-        *rows.few_messages(best.theta.size),
+        *rows.few_messages(_n_independent(best)),
         *doubts,
         *best.chain().contradictions(q),
     ]
@@ -346,6 +352,18 @@ def refitted(start: Start, q: Tensor, x: Tensor, weights: Tensor) -> Chain:
     rows = TipRows(q.to(like), x.to(like), weights.to(like))
     rows = rows.take(evenly_spaced(len(q), _ENOUGH))
     return start.fitted(rows, "linear", REFITTED)
+
+
+def _n_independent(fit: Fit) -> int:
+    """Return the number of free parameters; those that compensate each other count once.
+
+    They all count where the rows suffice for them, or are too few to see it.
+    """
+    n_free = fit.theta.size
+    if not len(fit.rows.q) < n_free < len(fit.jacobian):
+        return n_free
+    columns = fit.jacobian * fit.problem.prior_std
+    return int(np.linalg.matrix_rank(columns, _REDUNDANT * np.linalg.norm(columns, 2)))
 
 
 def _unexplained(fit: Fit) -> list[str]:

@@ -36,9 +36,7 @@ Starts = tuple[Start, ...]
 _MOST = 400
 _FOLDS = 3
 _FEW = 40  # with fewer rows `io` is not used
-# rows per parameter; with fewer rows a set must be clearly better
-_ROWS = 7
-_CLEARLY = 0.7
+_CLEARLY = 0.7  # of the score of sets with enough rows: a set with too few must be better
 _WORSE = 1.1  # times the smallest held-out error: sets above are not taken, whatever `io`
 # Also from few rows.
 _USUAL = (
@@ -182,9 +180,10 @@ def choose_geometry(
     The score of a set is ``(cv * io**2)**(1/3)``: `cv` is the mean tip distance on held-out
     motions, `io` that on the outer 35 % of the rows after a fit to the inner 40 %. Among sets with
     a `cv` at most a tenth above the smallest, the smallest one with nearly the best score is taken.
-    A set with more than one parameter per 7 rows must be clearly better, except base and radii.
-    For a set with more than one parameter per 7 inner rows `io` is at most that of the last smaller
-    set, times the ratio of their `cv`. Below 40 rows the score is `cv`.
+    A set with more than one parameter per 7 rows (per row for a `RigidChain`) must be clearly
+    better, except base and radii. For a set with more of them than the inner rows suffice for, `io`
+    is at most that of the last smaller set, times the ratio of their `cv`. Below 40 rows the score
+    is `cv`.
 
     Parameters
     ----------
@@ -314,16 +313,18 @@ def _best(
     n_inner: int,
 ) -> int:
     """Return the index of the chosen one of K sets, with `SetErrors` (K, 2), smaller sets first."""
-    n_free = np.array([start.n_free for start in starts])
+    needed = np.zeros(len(starts))
+    for k, (candidate, start) in enumerate(zip(candidates, starts, strict=True)):
+        needed[k] = candidate.chain.rows_per_parameter * start.n_free
     usual = np.array([candidate.name in _USUAL for candidate in candidates])
     cv, io = errors.T
     # Where the inner rows do not suffice, `io` is at most that of the last set for which they do.
-    enough = n_free <= n_inner / _ROWS
+    enough = needed <= n_inner
     last = np.maximum.accumulate(np.where(enough, np.arange(len(cv)), 0))
     io = np.minimum(io, io[last] * cv / cv[last])
     scores = _scores(np.column_stack([cv, io]))
     # Sets for which all rows do not suffice must be clearly better.
-    sure = usual | (n_free <= n_rows / _ROWS)
+    sure = usual | (needed <= n_rows)
     sure = sure | (scores < _CLEARLY * scores[sure].min(initial=np.inf))
     good = sure & (cv <= _WORSE * cv[sure].min())
     return simplest_within(np.where(good, scores, np.inf), _EQUAL)

@@ -70,15 +70,18 @@ class Urdf:
         self.path.reverse()
         self.joints = [joint for _, joints in self.path for joint in joints]
 
-    def placed(self, names: Sequence[str], origins: NDArray) -> str:
-        """Return the XML with new origins (n, 4, 4) of the moving joints, as an arm has them."""
+    def placed(self, names: Sequence[str], origins: NDArray, axes: NDArray) -> str:
+        """Return the XML with new origins (n, 4, 4) and unit axes (n, 3) of the moving joints.
+
+        They are those of an arm, whose origins include fixed joints and offsets of mimic joints.
+        """
         moving = [joint.name for joint in self.joints if joint.kind != "fixed"]
         if [*dict.fromkeys(moving)] != [*names] or len(moving) != len(origins):
             raise ValueError(
                 f"`text_or_path` must be the URDF of this arm, whose actuators are {[*names]}, "
                 f"got {moving}."
             )
-        wanted = iter(origins)
+        wanted = zip(origins, axes, strict=True)
         before = np.eye(4)
         for element, (joint, *free) in self.path:
             if free:
@@ -87,12 +90,16 @@ class Urdf:
                 before = before @ joint.origin
                 continue
             # Exclude the fixed joints before it and the offset of a mimic joint.
-            origin = _origin(element)
-            ahead = np.linalg.solve(before, next(wanted))
-            placed = ahead @ np.linalg.solve(joint.origin, origin)
+            origin, axis = next(wanted)
+            ahead = np.linalg.solve(before, origin)
+            _, _, offset = self._mimicked(element)
+            at_offset = offset_origin(np.eye(4), joint.kind, axis, offset)
+            placed = ahead @ np.linalg.inv(at_offset)
             before = np.eye(4)
-            if np.abs(placed - origin).max() > _SAME:
+            if np.abs(placed - _origin(element)).max() > _SAME:
                 _write_origin(element, placed)
+            if np.abs(axis - joint.axis / np.linalg.norm(joint.axis)).max() > _SAME:
+                _write_axis(element, axis)
         return etree.tostring(self.robot.getroottree(), encoding="unicode")
 
     def _joints(self, element: etree._Element) -> list[Joint]:
@@ -281,6 +288,13 @@ def _write_origin(joint: etree._Element, placed: NDArray) -> None:
     element.attrib.pop("quat_xyzw", None)
     element.set("xyz", _text(placed[:3, 3]))
     element.set("rpy", _text([roll, pitch, yaw]))
+
+
+def _write_axis(joint: etree._Element, axis: NDArray) -> None:
+    """Write the <axis> of a joint."""
+    if not _has(joint, "axis"):
+        etree.SubElement(joint, "axis")
+    joint.find("axis").set("xyz", _text(axis))
 
 
 def _text(numbers: Iterable[float]) -> str:

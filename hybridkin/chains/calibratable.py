@@ -36,6 +36,26 @@ class Part(NamedTuple):
         size = math.prod(shape)
         return cls(entry, np.eye(size), np.arange(size), shape)
 
+    @classmethod
+    def unit_vectors(cls, entry: str, vectors: NDArray) -> Self:
+        """Return the parameter that turns the unit vectors (n, 3) of an entry.
+
+        Each has two directions, perpendicular to it and to each other: towards the two coordinate
+        axes that are farthest from it. A user sees these coordinates.
+        """
+        n = len(vectors)
+        directions = np.zeros((n, 3, n, 2))
+        shown = np.zeros((n, 2), dtype=int)
+        for k, vector in enumerate(vectors):
+            first, second = np.sort(np.argsort(np.abs(vector), kind="stable")[:2])
+            towards_first = np.eye(3)[first] - vector[first] * vector
+            towards_first /= np.linalg.norm(towards_first)
+            aside = np.cross(vector, towards_first)
+            directions[k, :, k, 0] = towards_first
+            directions[k, :, k, 1] = aside * np.copysign(1.0, aside[second])
+            shown[k] = 3 * k + first, 3 * k + second
+        return cls(entry, directions.reshape(3 * n, 2 * n), shown.ravel(), (n, 2))
+
 
 class Scale(NamedTuple):
     """How far the numbers of an entry of a geometry may change in a calibration.
@@ -50,6 +70,8 @@ class Scale(NamedTuple):
         Physical limits of the numbers; of the factor, if they keep their sign.
     keeps_sign : bool
         Whether the numbers change by a factor.
+    turns : bool
+        Whether the rows of the entry are unit vectors, which turn.
     """
 
     unit: ArrayLike
@@ -57,6 +79,12 @@ class Scale(NamedTuple):
     low: float = -math.inf
     high: float = math.inf
     keeps_sign: bool = False
+    turns: bool = False
+
+    @classmethod
+    def of_unit_vectors(cls) -> Self:
+        """Return the scale of unit vectors, which may turn as far as they must."""
+        return cls(1.0, "rad", turns=True)
 
     @classmethod
     def factor(cls, most: float) -> Self:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, ClassVar, TypeVar
 
 import torch
@@ -54,6 +54,9 @@ class Chain(PoseModel):
 
     # Names of parts of entries that `calibrate` knows too, and those entries.
     aliases: ClassVar[dict[str, str]] = {}
+    # Rows that a choice of parameters needs for each of them. Those of soft robots also compensate
+    # for what the model does not describe, and then fail outside the log.
+    rows_per_parameter: ClassVar[float] = 7.0
     # Entry of the geometry with the zeros of the actuators [unit of q]; empty: none.
     _zeros: ClassVar[str] = ""
 
@@ -122,6 +125,15 @@ class Chain(PoseModel):
     def scale_of(self, entry: str) -> Scale:
         """Return the natural scale of the numbers of an entry; of most it is the robot's length."""
         return Scale(float(self.reach), "m")
+
+    @property
+    def reversible(self) -> tuple[int, ...]:
+        """Actuators whose motors may count in the opposite direction; by default none."""
+        return ()
+
+    def with_reversed(self, actuators: Sequence[int]) -> Chain:
+        """Return the robot with some of the `reversible` actuators in the opposite direction."""
+        return self
 
     def free_rings(self, names: tuple[str, ...]) -> set[str]:
         """Return what these parameters free of the actuator rings that must be searched."""

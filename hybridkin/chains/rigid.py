@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from os import PathLike
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -39,7 +39,7 @@ from hybridkin.chains._joint_motions import (
     moving_frames,
 )
 from hybridkin.chains._mjcf import mjcf_path
-from hybridkin.chains.calibratable import Scale
+from hybridkin.chains.calibratable import Part, Scale
 from hybridkin.chains.chain import Chain
 
 if TYPE_CHECKING:
@@ -51,6 +51,9 @@ __all__ = ["RigidChain"]
 _FAR = 10.0  # [m]; a joint that slides further is more likely in millimetres
 _LINK = 0.3  # [m]; a usual link
 _KINDS = ("revolute", "prismatic")
+# What is calibrated, what is mostly wrong first: each set of a choice has one more.
+_CALIBRATED = ("base", "tool", "joint_zeros", "links", "axes")
+_GEAR = 5.0  # largest factor on the gain of an actuator
 
 
 def _write_plan(plan: Plan, stored: Stored) -> int:
@@ -173,6 +176,10 @@ class RigidChain(Chain):
 
     _entries = ("base", "joint_zeros", "tool")
     _zeros = "joint_zeros"
+    _units: ClassVar[dict[str, str]] = {**Chain._units, "axes": "-", "couplings": "-"}
+    aliases: ClassVar[dict[str, str]] = {"gains": "couplings"}
+    # A rigid arm is what its model says; a third of the parameters are redundant.
+    rows_per_parameter: ClassVar[float] = 1.0
     _structure = ("n_actuators", "kinds", "names", "tip_at")
     _limits = ("q_min", "q_max", "dq_max", "ddq_max")
     _arrays = ("origins", "axes", "tip", "tool", *_limits, "base")
@@ -298,7 +305,7 @@ class RigidChain(Chain):
         *,
         root_link: str | None = None,
     ) -> str:
-        """Return a URDF with the calibrated geometry of this arm: links and joint zeros.
+        """Return a URDF with the calibrated geometry of this arm: links, joint zeros and axes.
 
         Parameters
         ----------
@@ -310,8 +317,9 @@ class RigidChain(Chain):
         Returns
         -------
         str
-            The same XML with new <origin> tags for moving joints whose origin has changed. Reading
-            it gives this arm with zero `joint_zeros`. A URDF does not contain `base` and `tool`.
+            The same XML with new <origin> and <axis> tags for moving joints whose origin or axis
+            has changed. Reading it gives this arm with zero `joint_zeros`. A URDF does not contain
+            `base`, `tool` and calibrated gains.
 
         Raises
         ------
@@ -337,7 +345,8 @@ class RigidChain(Chain):
         from hybridkin.chains._urdf import Urdf  # loads lxml
 
         origins = self.origins_at_zero.double().numpy(force=True)
-        return Urdf(text_or_path, end_link, root_link).placed(self.names, origins)
+        axes = self.unit_axes.double().numpy(force=True)
+        return Urdf(text_or_path, end_link, root_link).placed(self.names, origins, axes)
 
     @classmethod
     def from_mjcf(
@@ -462,7 +471,9 @@ class RigidChain(Chain):
         Besides arguments of the constructor this has "links", shape (n_joints, 3) [m]: the origin
         of every joint in the moving frame of the previous joint. The last link is the `tool`.
         """
-        return {**super().geometry(), "links": self.origins[:, :3, 3]}
+        links = self.origins[:, :3, 3]
+        geometry = {**super().geometry(), "links": links}
+        return {**geometry, "axes": self.axes, "couplings": self.couplings}
 
     def _set_geometry(self, geometry: Mapping[str, Tensor | None]) -> None:
         entries = dict(geometry)
@@ -603,8 +614,34 @@ class RigidChain(Chain):
 
     @property
     def default_parameters(self) -> tuple[str, ...]:
-        """Names of the parameters that a calibration fits by default."""
-        return ("base",)
+        """Names of the parameters that a calibration fits by default: all but gains."""
+        return self.parameter_sets[-1]
+
+    @property
+    def parameter_sets(self) -> list[tuple[str, ...]]:
+        """Sets of parameters that ``calibrate="auto"`` compares, the smaller ones first."""
+        n_sets = len(_CALIBRATED) if self.kinds else 1  # of a constant, the base is all
+        return [_CALIBRATED[:k] for k in range(n_sets + 1)]
+
+    @property
+    def parameter_names(self) -> list[str]:
+        """Names that `calibrate` accepts: of the couplings only the "gains"."""
+        return [name for name in super().parameter_names if name != "couplings"]
+
+    @property
+    def reversible(self) -> tuple[int, ...]:
+        """Actuators whose motors may count in the opposite direction: all."""
+        return tuple(range(self.n_actuators))
+
+    def with_reversed(self, actuators: Sequence[int]) -> RigidChain:
+        """Return the arm with some actuators, and their limits, in the opposite direction."""
+        signs = torch.ones_like(self.q_min)
+        signs[[*actuators]] = -1.0
+        low = torch.where(signs < 0, -self.q_max, self.q_min)
+        high = torch.where(signs < 0, -self.q_min, self.q_max)
+        arm = self.with_geometry(couplings=self.couplings * signs)
+        arm._set_geometry({"q_min": low, "q_max": high})
+        return arm
 
     @property
     def limits(self) -> dict[str, Tensor]:
@@ -643,11 +680,27 @@ class RigidChain(Chain):
 
     def scale_of(self, entry: str) -> Scale:
         """Return the natural scale of the numbers of an entry of the geometry."""
+        if entry == "axes":
+            return Scale.of_unit_vectors()
+        if entry == "couplings":
+            return Scale.factor(_GEAR)
         if entry != "joint_zeros":
             return super().scale_of(entry)
         kinds = self.unit_of_q
         units = np.where(np.array(kinds) == "m", float(self.reach), 1.0)
         return Scale(units, kinds)
+
+    def part_of(self, name: str) -> Part:
+        """Return what a parameter of `calibrate` changes of the geometry."""
+        if name == "axes":
+            return Part.unit_vectors(name, self.unit_axes.numpy(force=True).astype(float))
+        if name != "gains":
+            return super().part_of(name)
+        n_joints, n = self.couplings.shape
+        columns = np.tile(np.eye(n), (n_joints, 1))
+        driven = (self.couplings != 0.0).numpy(force=True)
+        first = driven.argmax(axis=0)
+        return Part("couplings", columns, first * n + np.arange(n), (n,))
 
     def coordinates(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return positions of the m joints before the tip at rows q (N, n), and dz/dq (m, n).

@@ -79,9 +79,11 @@ def test_each_set_is_scored_on_whole_motions_with_the_weights_of_rows():
     q, x, groups, weights = log_of_motions()
     own = {"groups": groups, "weights": weights, "outside": False}
     errors = choose_geometry(PLANAR, q, x, **own).errors
-    assert [*errors] == ["nothing", "base"]
+    sets = [" + ".join(names) or "nothing" for names in PLANAR.parameter_sets]
+    assert [*errors] == sets
+    assert sets[-1] == "base + tool + joint_zeros + links + axes"
     rows = torch.from_numpy(q)
-    for name, found in errors.items():
+    for name in sets[:2]:
         total = 0.0
         for motion in range(3):
             chain = PLANAR
@@ -92,7 +94,7 @@ def test_each_set_is_scored_on_whole_motions_with_the_weights_of_rows():
             distance = np.linalg.norm(chain(rows).numpy() - x, axis=1)
             total += weights[~kept] @ distance[~kept]
         # The fits that are compared end at steps of 1e-4.
-        assert found.cv == pytest.approx(total / weights.sum(), rel=1e-3)
+        assert errors[name].cv == pytest.approx(total / weights.sum(), rel=1e-3)
 
 
 @pytest.mark.parametrize("loss", ["linear", "soft_l1"])
@@ -131,7 +133,8 @@ def test_groups_choose_another_set_than_rows():
     exact = PLANAR(torch.from_numpy(q)).numpy()
     x = exact + 0.05 * rng.standard_normal((3, 3))[groups]
     choices = [choose_geometry(PLANAR, q, x, groups=g, outside=False) for g in (None, groups)]
-    assert [choice.name for choice in choices] == ["base", "nothing"]
+    assert "base" in choices[0].parameters
+    assert choices[1].name == "nothing"
 
 
 @pytest.mark.parametrize("unit", [1e-3, 1e3])

@@ -517,10 +517,14 @@ def test_joints_of_equal_names_are_actuators_of_their_own():
 
 def moved(arm, rng):
     """An arm with other links and zeros."""
+    return changed(arm, ("links", "joint_zeros"), rng)
+
+
+def changed(arm, names, rng):
     old = arm.geometry()
     new = {
         name: old[name] + 0.1 * torch.randn(old[name].shape, generator=rng, dtype=torch.float64)
-        for name in ("links", "joint_zeros")
+        for name in names
     }
     return arm.with_geometry(**new)
 
@@ -544,18 +548,21 @@ def test_a_calibrated_urdf_is_read_as_the_calibrated_arm(text, end, tmp_path, rn
     path = tmp_path / "arm.urdf"
     path.write_bytes(b"\xef\xbb\xbf" + text.encode())
     tool = [0.1, 0.2, 0.3]
-    chain = moved(RigidChain.from_urdf(path, end, tool=tool), rng)
+    chain = RigidChain.from_urdf(path, end, tool=tool)
+    chain = changed(chain, ("links", "joint_zeros", "axes"), rng)
     written = chain.to_urdf(path, end)
     again, q = RigidChain.from_urdf(written, end, tool=tool), random_q(rng, 9, chain.n_actuators)
     assert_close(again.poses(q)[:, 1:], chain.poses(q)[:, 1:], rtol=0, atol=1e-12)
     assert_close(again.jacobian(q), chain.jacobian(q), rtol=0, atol=1e-12)
     assert again.to_urdf(written, end) == written
     # Nothing else has changed: comments, tags of vendors, the order, fixed joints.
-    origin = re.compile("<origin[^>]*>(</origin>)?")
+    tags = re.compile("<(origin|axis)[^>]*>(</origin>)?")
     before = etree.tostring(etree.fromstring(text.encode()).getroottree(), encoding="unicode")
-    assert origin.sub("", written) == origin.sub("", before)
+    assert tags.sub("", written) == tags.sub("", before)
     fixed = re.search('<joint name="(plate|mount)".*?</joint>', before, re.S)
     assert fixed[0] in written
+    unturned = moved(RigidChain.from_urdf(path, end), rng).to_urdf(path, end)
+    assert re.findall("<axis[^>]*>", unturned) == re.findall("<axis[^>]*>", before)
     assert RigidChain.from_urdf(text, end).to_urdf(text, end) == before
 
 
