@@ -200,8 +200,8 @@ def calibrate(
         How often each row counts: 2 is the same as the row twice, 0 drops it, whatever x holds
         there. Equal rows are held out together.
     touched : array-like of shape (N,), optional
-        Label of the point that the tip touched in each row, a text or a number; "", None or NaN:
-        none. Rows with the same label touched the same point, whose position is not known. Its
+        Label of the point that the tip touched in each row, a str or an int; "", None or NaN: none.
+        Rows with the same label touched the same point, whose position is not known. Its
         position errors have the same noise as measured tips.
     distances : dict of (label, label) to float, optional
         Known distances between touched points [m].

@@ -300,9 +300,9 @@ def _scores(errors: NDArray) -> NDArray:
 
 def _near(scores: NDArray, best: int) -> list[int]:
     """Return the sets whose scores (K,) are near that of the chosen one, which is among them."""
-    order = np.argsort(scores, kind="stable")
-    near = order[scores[order] <= _NEAR * scores[best]][:_MOST_NEAR]
-    return sorted({best, *near.tolist()})
+    near = [k for k in np.argsort(scores, kind="stable").tolist() if k != best]
+    near = [k for k in near if scores[k] <= _NEAR * scores[best]]
+    return sorted([best, *near[: _MOST_NEAR - 1]])
 
 
 def _best(
