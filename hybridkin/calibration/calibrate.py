@@ -299,7 +299,7 @@ def fit_geometry(
             "`chain` must be a ConstantCurvatureChain, an ElasticTendonChain, a RigidChain or "
             f"another Chain, got {type(chain).__name__}."
         )
-    names = _check_parameters(chain, parameters)
+    names = check_parameters(chain, parameters)
     prior = number(prior, "prior")
     if not prior > 1.0 / LARGEST:
         need = f"must be a positive standard deviation, over {1.0 / LARGEST:g}"
@@ -479,7 +479,8 @@ def _cross_validate(best: Fit, rows: TipRows, motions: Groups, loss: str) -> flo
     return float(np.sqrt(squares / float(rows.weights.sum())))
 
 
-def _check_parameters(chain: Chain, parameters: Sequence[str]) -> tuple[str, ...]:
+def check_parameters(chain: Chain, parameters: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of parameters that a chain has, checked."""
     names = (parameters,) if isinstance(parameters, str) else tuple(parameters)
     available = chain.parameter_names
     unknown = [str(name) for name in names if name not in available]

@@ -22,6 +22,7 @@ from hybridkin.calibration._search import NO_START, Start, search, widened
 from hybridkin.calibration.calibrate import (
     CalibrationResult,
     check_data,
+    check_parameters,
     fit_geometry,
 )
 from hybridkin.calibration.measured import evenly_spaced, inner_and_outer
@@ -119,6 +120,13 @@ class GeometryChoice:
     def __iter__(self) -> Iterator[str]:
         """Return an iterator over the parameters to calibrate."""
         return iter(self.parameters)
+
+    def started(self, rows: TipRows) -> GeometryChoice:
+        """Return the choice with a start of its fit, which is searched if there is none."""
+        if self.start.n_free or not self.parameters:
+            return self
+        chain = self.chain.frozen().cpu()
+        return replace(self, start=search(chain, rows, self.parameters, "linear"))
 
     def calibrate(self, q: Numbers, x: Numbers, *, loss: str = "linear") -> CalibrationResult:
         """Return the calibration of the chosen parameters, which must not be empty.
@@ -239,6 +247,8 @@ def choose_geometry(
         weights = np.ones(len(q))
     weights = as_tensor(weights, "weights").to(q)
     names = tuple(parameters or ())
+    if names:
+        names = check_parameters(chain, names)
     first, counts, _ = distinct_rows(q, x, weights, motions.apart)
     motions = motions.take(first)
     order = np.argsort(motions.labels, kind="stable")

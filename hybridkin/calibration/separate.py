@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 from hybridkin._core.arrays import Numbers, real_array
 from hybridkin.calibration._least_squares import TipRows
 from hybridkin.calibration._motions import Motion, motions_within
-from hybridkin.calibration._search import search
 from hybridkin.calibration.calibrate import check_data, refitted
 from hybridkin.calibration.choice import GeometryChoice
 from hybridkin.calibration.measured import evenly_spaced, points
@@ -151,22 +150,14 @@ def separating_motions(
     if not choice.rivals:
         return ()
     log = TipRows(q, x, q.new_ones(len(q))).take(evenly_spaced(len(q), _MOST))
-    chosen = _Calibrated.of(_started(choice, log), log)
+    chosen = _Calibrated.of(choice.started(log), log)
     with torch.no_grad():
         motions = motions_within(chosen.chain, rows, low, high)
     found = []
     for rival in choice.rivals:
-        other = _Calibrated.of(_started(rival, log), log)
+        other = _Calibrated.of(rival.started(log), log)
         found.append(_separating(chosen, other, log, motions))
     return tuple(found)
-
-
-def _started(choice: GeometryChoice, log: TipRows) -> GeometryChoice:
-    """Return a choice with a start of its fit, which is searched if there is none."""
-    if choice.start.n_free or not choice.parameters:
-        return choice
-    chain = choice.chain.frozen().cpu()
-    return replace(choice, start=search(chain, log, choice.parameters, "linear"))
 
 
 def _limit(value: ArrayLike | None, name: str, usual: NDArray) -> NDArray:

@@ -635,8 +635,13 @@ class RigidChain(Chain):
 
     def with_reversed(self, actuators: Sequence[int]) -> RigidChain:
         """Return the arm with some actuators, and their limits, in the opposite direction."""
-        signs = torch.ones_like(self.q_min)
-        signs[[*actuators]] = -1.0
+        if not np.iterable(actuators) or not set(actuators) <= set(self.reversible):
+            raise ValueError(
+                f"`actuators` must hold places from 0 to {self.n_actuators - 1}, got "
+                f"{actuators!r:.80}; this arm has {self.n_actuators} actuators."
+            )
+        flipped = set(actuators)
+        signs = self.q_min.new_tensor([-1.0 if k in flipped else 1.0 for k in self.reversible])
         low = torch.where(signs < 0, -self.q_max, self.q_min)
         high = torch.where(signs < 0, -self.q_min, self.q_max)
         arm = self.with_geometry(couplings=self.couplings * signs)

@@ -63,9 +63,10 @@ def _best(tables: Sequence[CrossFit]) -> int:
     """Return the place of the best of several tables, those of simpler mechanics first."""
     cv = np.array([table.expected_error for table in tables])
     io = np.array([table.outer_error for table in tables])
-    scores = cv
+    cv[np.isnan(cv)] = np.inf  # some rows have no prediction
+    scores = cv.copy()
     if len(tables[0].y) >= _FEW:
-        scores = np.cbrt(cv * io**2)
+        scores = np.cbrt(cv * np.where(np.isnan(io), np.inf, io) ** 2)
     least = tables[int(np.argmin(cv))]
     for k, table in enumerate(tables):
         excess = table.excess_over(least)
@@ -88,7 +89,7 @@ def _options(spec: Spec, geometry: GeometryChoice) -> Iterator[Mechanics]:
     if spec.output == "pose":
         yield Mechanics(geometry)
         return
-    for near in geometry.near:
+    for near in geometry.near or (geometry,):  # a choice of the caller has no others
         yield Mechanics(near)
     bases = {base.name: base for base in (*geometry.usual[-1:], geometry)}
     for base in bases.values():

@@ -310,7 +310,8 @@ def _table_anew(spec: Spec, fit: FitOnce) -> CrossFit:
     """Return the predictions of five folds of a log, which make the choices of a fit anew."""
     if not fit.hysteresis:
         spec = replace(spec, hysteresis=HysteresisChoice())
-        fit = replace(fit, log=fit.log.distinct())
+        rows = replace(fit.rows, place=np.arange(len(fit.rows)))
+        fit = replace(fit, log=rows, rows=rows)
     log = fit.log
     if fit.fitted.error.candidates:
         spec = spec.starting_at(fit.fitted.error.settled, fit.starts)

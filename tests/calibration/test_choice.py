@@ -224,3 +224,9 @@ def test_rows_held_out_of_a_long_log_are_predicted_from_evenly_spaced_others():
     noisy = torch.from_numpy(measured(truth, q))
     chain = refitted(choice.start, torch.from_numpy(q), noisy, weights)
     assert (chain(torch.from_numpy(q)) - exact).norm(dim=1).mean() < 0.3 * NOISE
+
+
+def test_unknown_parameters_are_named():
+    q = np.random.default_rng(0).uniform(0.2, 0.3, (10, 3))
+    with pytest.raises(ValueError, match="`parameters` must name different entries"):
+        choose_geometry(PLANAR, q, np.zeros((10, 3)), parameters=["tool_"])

@@ -10,11 +10,13 @@ from scipy.spatial.transform import Rotation
 from torch.testing import assert_close
 
 from hybridkin import HybridForwardModel, RigidChain, calibrate, load_model, save_model
+from hybridkin.app.workflow.calibrated import calibrated_parameters
 from hybridkin.calibration._least_squares import TipRows
 from hybridkin.calibration._parameters import Problem, parameter
 from hybridkin.calibration._search import search
 from hybridkin.calibration.calibrate import fit_geometry
 from hybridkin.calibration.choice import choose_geometry
+from hybridkin.formats import LogUnit
 
 NOISE = 5e-5
 ALL = ("base", "tool", "joint_zeros", "links", "axes")
@@ -124,6 +126,27 @@ def test_signs_are_kept_where_others_explain_no_more():
         start = searched(q, 0.2 * rng.standard_normal((n, 3)))
         assert_close(start.problem.chain.couplings, nominal().couplings, rtol=0, atol=0)
         assert not start.messages
+
+
+@pytest.mark.parametrize("actuators", [[5], [-1], [0.5], ["a"], 0])
+def test_reversed_actuators_are_among_those_of_the_arm(actuators):
+    with pytest.raises(ValueError, match="`actuators` must hold places from 0 to 4"):
+        nominal().with_reversed(actuators)
+
+
+def test_reports_show_what_calibrate_shows_of_axes():
+    """Two coordinates of each axis, beside standard errors of two angles."""
+    arm = real(0, 0.5)
+    q, x = log_of(arm, 60)
+    result = calibrate(nominal(), q, x, ALL)
+    shown = calibrated_parameters(nominal(), result, LogUnit.of("rad"))
+    assert [parameter.name for parameter in shown] == [*result.names]
+    axes = [parameter for parameter in shown if parameter.name.startswith("axes")]
+    values = {parameter.name: parameter.value for parameter in axes}
+    assert len(values) == 10
+    for name, value in values.items():
+        joint, coordinate = int(name[5]), "xyz".index(name[-2])
+        assert value == result.values["axes"][joint, coordinate]
 
 
 def test_reversed_actuators_keep_the_limits_of_their_joints():

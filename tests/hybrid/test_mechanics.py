@@ -5,8 +5,15 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import torch
+from torch.testing import assert_close
 
-from hybridkin import ConstantCurvatureChain, HybridForwardModel, RigidChain, choose_geometry
+from hybridkin import (
+    ConstantCurvatureChain,
+    GeometryChoice,
+    HybridForwardModel,
+    RigidChain,
+    choose_geometry,
+)
 from hybridkin.hybrid._mechanics import _best, best_mechanics
 from hybridkin.hybrid._rows import Rows
 from hybridkin.hybrid._selection import Auto
@@ -143,3 +150,29 @@ def test_the_first_of_nearly_equal_mechanics_is_taken():
 def test_errors_outside_do_not_count_for_few_rows():
     assert _best([Table(1.0, 3.0, n=39), Table(1.05, 2.0, n=39)]) == 0
     assert _best([Table(1.0, 3.0, n=40), Table(1.05, 2.0, n=40)]) == 1
+
+
+def test_mechanics_without_predictions_of_some_rows_are_not_taken():
+    assert _best([Table(np.nan, np.nan), Table(1.0, 3.0)]) == 1
+    assert _best([Table(1.0, np.nan), Table(1.05, 3.0)]) == 1
+    assert _best([Table(np.nan, np.nan), Table(np.nan, np.nan)]) == 0
+
+
+@pytest.mark.parametrize("error_model", ["auto", "drop"])
+def test_a_choice_of_the_caller_is_calibrated_in_every_fold(error_model):
+    """It has no start and no sets near it: the start is searched, the set is not replaced."""
+    arm, rows = arm_with_a_moved_base()
+    choice = GeometryChoice(arm, ("base",), name="base")
+    model = HybridForwardModel(arm, error_model, calibrate=choice, coverage=0.9, random_state=0)
+    model.fit(rows.X, rows.y)
+    assert model.radius_.inside < 1e-6
+    assert_close(model.mechanical_model_.base[:3, 3], torch.tensor([0.3, -0.2, 0.1]).double())
+
+
+def test_a_choice_of_the_caller_can_do_without_errors_of_the_structure():
+    q = lengths(40, 0.03, 0)
+    rows = Rows.of(q, NOMINAL(torch.from_numpy(q)).numpy())
+    choice = GeometryChoice(NOMINAL, ("base",), name="base")
+    mechanics = best_mechanics(Spec(NOMINAL, Auto(0), calibrate="auto"), choice, rows)
+    assert mechanics.name == "base"
+    assert [*mechanics.geometry.corrected] == ["base", "base, structure"]

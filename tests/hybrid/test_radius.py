@@ -116,3 +116,14 @@ def test_a_radius_of_two_motions_holds_out_one_and_then_rows(n, error_model):
     assert (fitted.radius.inside < 0.2) == (not told)
     with pytest.raises(ValueError, match="`groups` must hold at least two motions"):
         model.fit(q[:12], x[:12], groups=motion[:12])
+
+
+def test_equal_rows_of_several_motions_have_a_radius():
+    """Rows are merged before folds; the outer ones are then places among the merged rows."""
+    q, x, _ = motions(0, 3, 1)
+    rows = np.repeat(np.arange(2), 5)[:9]
+    motion = np.array([0, 1, 2, 0, 1, 2, 0, 1, 2])
+    model = HybridForwardModel(robots.bionic_handling_assistant(), "auto", coverage=0.5)
+    model.set_params(calibrate=["base"], random_state=0).fit(q[rows], x[rows], groups=motion)
+    assert model.radius_.coverage == 0.5
+    assert np.isfinite(model.predict(q)).all()

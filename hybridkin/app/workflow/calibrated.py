@@ -92,9 +92,9 @@ def calibrated_parameters(
     """
     labels = zip(result.names, result.narrowing.tolist(), strict=True)
     parameters = []
-    for name, calibrated in result.values.items():
+    for name in result.values:
         physical = name not in result.unphysical
-        before, after = _before_and_after(start, name, np.asarray(calibrated))
+        before, after = _before_and_after(start, result.chain, name)
         errors = np.ravel(result.std_errors[name])
         for k, std_error in enumerate(errors):
             label, narrowing = next(labels)
@@ -114,19 +114,20 @@ def calibrated_parameters(
     return parameters
 
 
-def _before_and_after(start: Chain, name: str, calibrated: NDArray) -> tuple[NDArray, NDArray]:
+def _before_and_after(start: Chain, chain: Chain, name: str) -> tuple[NDArray, NDArray]:
     """Return the numbers (k,) of a parameter before and after its calibration."""
-    before = _start_value(start, name)
+    before = _shown_value(start, start, name)
+    calibrated = _shown_value(start, chain, name)
     if name != "base":
-        return before.ravel(), calibrated.ravel()
+        return before, calibrated
     turn = Rotation.from_matrix(calibrated[:3, :3] @ before[:3, :3].T).as_rotvec()
     return np.append(np.zeros(3), before[:3, 3]), np.append(turn, calibrated[:3, 3])
 
 
-def _start_value(start: Chain, name: str) -> NDArray:
-    """Return the start value of a parameter of `calibrate`."""
+def _shown_value(start: Chain, chain: Chain, name: str) -> NDArray:
+    """Return the numbers (k,) of a chain that `calibrate` shows of a parameter; of the base all."""
     part = start.part_of(name)
-    entry = start.geometry()[part.entry].numpy(force=True)
+    entry = chain.geometry()[part.entry].numpy(force=True)
     if name == "base":
         return entry
     return entry.ravel()[part.shown]

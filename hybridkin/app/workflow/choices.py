@@ -91,7 +91,8 @@ def auto_in_words(model: HybridForwardModel, unit: LogUnit) -> list[str]:
     if results["corrected"]:
         listed = []
         for name, both in results["corrected"].items():
-            listed.append(f"{name} {1e3 * both['cv']:.2f} and {1e3 * both['io']:.2f}")
+            millimetre_words = [f"{1e3 * error:.2f}" for error in both.values()]
+            listed.append(f"{name} {' and '.join(millimetre_words)}")
         sentences.append(
             "With quick corrections, mean errors on held-out motions and outside the fitted rows "
             f"in mm: {'; '.join(listed)}."

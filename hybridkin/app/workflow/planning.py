@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -53,7 +54,7 @@ def next_rows(
 
     If rows are measured, and the description of the robot leaves open what is calibrated, the
     report names the motions that separate sets of parameters with nearly equal errors, see
-    `separating_motions`; their commands are in ``separating.csv``.
+    `separating_motions`; their commands are in ``separating.csv``, each motion once.
 
     Parameters
     ----------
@@ -134,19 +135,37 @@ def next_rows(
     sent = log.to_log(commands_for(model, candidates[rows]))
     numbers = np.column_stack([sent, errors / METRES[log.x_unit]])
     report.table_file("next.csv", [*log.q, "expected_error"], np.char.mod("%.9g", numbers))
+    # One of an earlier run is not that of these rows.
+    (Path(out) / "separating.csv").unlink(missing_ok=True)
     if separating:
         report.text(
             "## What the measured rows leave open\n\nThese sets of parameters have nearly equal "
             "errors on the measured rows. The motions show which one is right."
         )
-        report.items([str(motion) for motion in separating])
+        items = []
         lines = []
-        for k, motion in enumerate(separating):
-            for command in log.to_log(commands_for(model, motion.q)):
+        for k, rivals in enumerate(_by_motion(separating)):
+            items.append(_in_words(rivals))
+            for command in log.to_log(commands_for(model, rivals[0].q)):
                 lines.append([str(k + 1), *np.char.mod("%.9g", command)])
+        report.items(items)
         report.table_file("separating.csv", ["motion", *log.q], lines)
     report.write(out)
     return report
+
+
+def _by_motion(separating: Sequence[SeparatingMotion]) -> list[list[SeparatingMotion]]:
+    """Return them by motion and by whether it separates, each time the smallest rival first."""
+    groups: dict[tuple[str, bool], list[SeparatingMotion]] = {}
+    for motion in separating:
+        groups.setdefault((motion.motion, motion.separates), []).append(motion)
+    return [*groups.values()]
+
+
+def _in_words(rivals: Sequence[SeparatingMotion]) -> str:
+    """Return what to do, and all sets that this motion is the best one for."""
+    others = ", ".join(repr(motion.rival) for motion in rivals[1:])
+    return f"{rivals[0]}; the same for {others}" if others else str(rivals[0])
 
 
 def _separating(

@@ -94,13 +94,20 @@ def test_next_names_the_motion_that_shows_whether_the_tool_is_wrong(robot, tmp_p
     table = np.genfromtxt(tmp_path / "plan" / "separating.csv", delimiter=",", names=True)
     assert table.dtype.names == ("motion", *COLUMNS)
     table = np.array([*map(tuple, table)])
-    for k, motion in enumerate(record["separating"]):
+    motions = {motion["motion"]: motion for motion in record["separating"]}
+    assert len(np.unique(table[:, 0])) == len(motions) < len(record["separating"])
+    for k, motion in enumerate(motions.values()):
         assert motion["motion"].split(",")[0] in " ".join(out.split())
         sent = table[table[:, 0] == k + 1, 1:]
         np.testing.assert_allclose(sent, -1e3 * np.array(motion["q"]), atol=1e-5)
         assert np.abs(sent).max() <= 6.0 + 1e-9
     (tool,) = [entry for entry in record["separating"] if "tool" in entry["rival"]]
     assert tool["remaining"] > 5.0 * tool["noise"]
+    for entry in record["separating"]:
+        assert entry["rival"] in " ".join(out.split())
+    robot.write_text(ROBOT)
+    assert document(capsys, *plan, "--measured", log)[1]["separating"] == []
+    assert not (tmp_path / "plan" / "separating.csv").exists()
 
 
 class Enough(ValueError):
