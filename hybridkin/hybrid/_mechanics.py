@@ -6,9 +6,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hybridkin._core.simplest import simplest_within
 from hybridkin.calibration.choice import GeometryChoice, SetErrors
+from hybridkin.calibration.measured import inner_and_outer
 from hybridkin.hybrid._candidates import Candidates, Settled
 from hybridkin.hybrid._error_models import (
     KernelModel,
@@ -28,7 +30,7 @@ _FEW = 40  # with fewer rows the outer ones do not count
 # and by more than this many standard errors of the difference.
 _WORSE = 0.1
 _SURE = 2.0
-_EQUAL = 0.01  # of the score: within it the simpler mechanics are taken
+_EQUAL = 0.03  # of the score: within it the simpler mechanics are taken
 
 
 def best_mechanics(spec: Spec, geometry: GeometryChoice, rows: Rows) -> Mechanics:
@@ -52,17 +54,25 @@ def best_mechanics(spec: Spec, geometry: GeometryChoice, rows: Rows) -> Mechanic
         settled = Settled(calibrated, rows, models)
         folds = rows.groups.folds(_FOLDS, shuffle=True)
         tables.append(settled.table(settled.outer(), folds))
-    chosen = options[_best(tables)]
+    inner, _ = inner_and_outer(rows.X)
+    enough = np.array([option.rows_needed <= len(inner) for option in options])
+    chosen = options[_best(tables, enough)]
     errors = {}
     for mechanics, table in zip(options, tables, strict=True):
         errors[mechanics.name] = SetErrors(table.expected_error, table.outer_error)
     return chosen._replace(geometry=replace(chosen.geometry, corrected=errors))
 
 
-def _best(tables: Sequence[CrossFit]) -> int:
-    """Return the place of the best of several tables, those of simpler mechanics first."""
+def _best(tables: Sequence[CrossFit], enough: NDArray[np.bool_]) -> int:
+    """Return the place of the best of K tables, those of simpler mechanics first.
+
+    Mechanics for which the inner rows are not `enough` (K,) would have too large errors of outer
+    rows: these count at most as large, relative to held-out errors, as those of the others.
+    """
     cv = np.array([table.expected_error for table in tables])
     io = np.array([table.outer_error for table in tables])
+    largest = (io / cv).min(where=enough, initial=np.inf) * cv
+    io = np.where(enough, io, np.minimum(io, largest))
     scores = cv
     if len(tables[0].y) >= _FEW:
         scores = np.cbrt(cv * io**2)

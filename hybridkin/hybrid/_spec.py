@@ -198,6 +198,12 @@ class Mechanics(NamedTuple):
         """What is calibrated, and what is learned below corrections."""
         return self.geometry.name + self.refinement.suffix
 
+    @property
+    def rows_needed(self) -> float:
+        """Number of rows that suffice for the free numbers of the geometry."""
+        geometry = self.geometry
+        return geometry.start.n_free * geometry.chain.rows_per_parameter
+
 
 @dataclass(frozen=True)
 class Spec:
