@@ -38,9 +38,9 @@ def best_mechanics(spec: Spec, geometry: GeometryChoice, rows: Rows) -> Mechanic
 
     Mechanics are a set of calibrated parameters, with or without the errors of the structure. For
     each, a blend of few, quick corrections predicts the rows of three folds, and the outer rows
-    after a fit to the inner ones. Among those with a held-out error `cv` at most a tenth,
-    or two standard errors of the difference, above the least, the simplest one with nearly the least ``(cv * io**2)**(1/3)`` is taken, with the
-    error `io` of the outer rows; of few rows that with the least `cv`.
+    after a fit to the inner ones. Taken are those with nearly the least ``(cv * io**2)**(1/3)``,
+    with the held-out error `cv` and the error `io` of the outer rows; of few rows those with the
+    least `cv`. Mechanics that are clearly worse on held-out rows are left out.
     """
     options = [*_options(spec, geometry)]
     if len(options) < 2:
