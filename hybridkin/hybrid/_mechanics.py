@@ -56,15 +56,18 @@ def best_mechanics(spec: Spec, geometry: GeometryChoice, rows: Rows) -> Mechanic
         tables.append(settled.table(settled.outer(), folds))
     inner, _ = inner_and_outer(rows.X)
     enough = np.array([option.rows_needed <= len(inner) for option in options])
-    chosen = options[_best(tables, enough)]
+    handicap = np.array([option.refinement.handicap for option in options])
+    chosen = options[_best(tables, enough, handicap)]
     errors = {}
     for mechanics, table in zip(options, tables, strict=True):
         errors[mechanics.name] = SetErrors(table.expected_error, table.outer_error)
     return chosen._replace(geometry=replace(chosen.geometry, corrected=errors))
 
 
-def _best(tables: Sequence[CrossFit], enough: NDArray[np.bool_]) -> int:
+def _best(tables: Sequence[CrossFit], enough: NDArray[np.bool_], handicap: NDArray) -> int:
     """Return the place of the best of K tables, those of simpler mechanics first.
+
+    The score of each is multiplied by its `handicap` (K,).
 
     Mechanics for which the inner rows are not `enough` (K,) would have too large errors of outer
     rows: these count at most as large, relative to held-out errors, as those of the others.
@@ -73,9 +76,9 @@ def _best(tables: Sequence[CrossFit], enough: NDArray[np.bool_]) -> int:
     io = np.array([table.outer_error for table in tables])
     largest = (io / cv).min(where=enough, initial=np.inf) * cv
     io = np.where(enough, io, np.minimum(io, largest))
-    scores = cv
+    scores = handicap * cv
     if len(tables[0].y) >= _FEW:
-        scores = np.cbrt(cv * io**2)
+        scores = handicap * np.cbrt(cv * io**2)
     least = tables[int(np.argmin(cv))]
     for k, table in enumerate(tables):
         excess = table.excess_over(least)

@@ -175,9 +175,12 @@ class Refinement:
     ----------
     suffix : str
         What it adds to the name of a set of calibrated parameters.
+    handicap : float
+        Factor on its errors where it is compared with other mechanics.
     """
 
     suffix = ""
+    handicap = 1.0
 
     def refine(self, mechanical: ForwardModel, rows: Rows) -> ForwardModel:
         """Return the mechanical model that fits the rows better."""

@@ -124,9 +124,9 @@ class Table:
         )
 
 
-def best(*tables, enough=None):
-    all_enough = np.ones(len(tables), dtype=bool)
-    return _best(tables, all_enough if enough is None else np.array(enough))
+def best(*tables, enough=True, handicap=1.0):
+    each = np.ones(len(tables))
+    return _best(tables, each * enough > 0, each * handicap)
 
 
 def test_errors_outside_decide_among_mechanics_that_are_equal_inside():
@@ -143,6 +143,11 @@ def test_mechanics_that_are_worse_inside_are_not_taken_for_their_errors_outside(
 def test_the_first_of_nearly_equal_mechanics_is_taken():
     assert best(Table(1.0, 2.08), Table(1.0, 2.0)) == 0
     assert best(Table(1.0, 2.1), Table(1.0, 2.0)) == 1
+
+
+def test_a_handicap_is_made_good_by_smaller_errors():
+    assert best(Table(1.0, 2.1), Table(1.0, 2.0), handicap=[1.0, 1.03]) == 0
+    assert best(Table(1.0, 2.2), Table(1.0, 2.0), handicap=[1.0, 1.03]) == 1
 
 
 def test_errors_outside_count_only_as_far_as_the_inner_rows_suffice():
