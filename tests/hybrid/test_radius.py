@@ -124,6 +124,7 @@ def test_equal_rows_of_several_motions_have_a_radius():
     rows = np.repeat(np.arange(2), 5)[:9]
     motion = np.array([0, 1, 2, 0, 1, 2, 0, 1, 2])
     model = HybridForwardModel(robots.bionic_handling_assistant(), "auto", coverage=0.5)
-    model.set_params(calibrate=["base"], random_state=0).fit(q[rows], x[rows], groups=motion)
-    assert model.radius_.coverage == 0.5
-    assert np.isfinite(model.predict(q)).all()
+    model.set_params(calibrate=["base"], random_state=0)
+    fitted = fit_to_log(*model.prepared(q[rows], x[rows], groups=motion))
+    assert fitted.radius.coverage == 0.5
+    assert fitted.radius.inside > 0.0
