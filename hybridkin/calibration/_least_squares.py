@@ -119,11 +119,13 @@ class TipRows:
 
     moved: ClassVar[str] = "the tips"
     """What a change moves that shows in the residual."""
-    may_be_wrong: ClassVar[str] = (
-        "or the description of the robot, may be wrong: app.check_log(Log(q, x), chain=chain) "
-        "looks for better ones."
-    )
-    """What else than the columns of q may be wrong if large residuals are left."""
+
+    def may_be_wrong(self, chain: Chain) -> str:
+        """Return what else than the columns of q may be wrong if large residuals are left."""
+        words = "or the description of the robot, may be wrong"
+        if not chain.n_arcs:  # the check knows no other robots
+            return f"{words}."
+        return f"{words}: app.check_log(Log(q, x), chain=chain) looks for better ones."
 
     def take(self, rows: NDArray | slice) -> Self:
         """Return some of the rows."""

@@ -129,7 +129,9 @@ class TouchedRows(TipRows):
     scale: float = 1.0
 
     moved: ClassVar[str] = "the tips from the points that they touched"
-    may_be_wrong: ClassVar[str] = "`touched`, or the description of the robot, may be wrong."
+
+    def may_be_wrong(self, chain: Chain) -> str:
+        return "`touched`, or the description of the robot, may be wrong."
 
     def take(self, rows: NDArray | slice) -> Self:
         taken = replace(super().take(rows), point=self.point[rows])

@@ -66,11 +66,18 @@ class Touches:
         """Which rows touched a point, (N,)."""
         return np.asarray(self.point != NO_POINT)
 
-    def tips(self, x: Any, n_outputs: int) -> Any:
-        """Return measured tips (N, n_outputs), NaN for None if there are touches."""
-        if x is None and self.names:
-            return np.full((len(self.point), n_outputs), np.nan)
-        return x
+    def tips(self, x: Any, n_outputs: int, weights: NDArray) -> Any:
+        """Return measured tips (N, n_outputs), NaN for None if all rows that count are touches."""
+        if x is not None or not self.names:
+            return x
+        unknown = np.flatnonzero(~self.touching & (weights > 0.0))
+        if unknown.size:
+            raise ValueError(
+                "`touched` must name a point in every row if `x` is None, but "
+                f"{unknown.size} of {len(weights)} rows have none (first: row {unknown[0]}); leave "
+                "these rows out, or give measured tips in `x`."
+            )
+        return np.full((len(self.point), n_outputs), np.nan)
 
     def rows(self, chain: Chain, names: tuple[str, ...], rows: TipRows, first: NDArray) -> TipRows:
         """Return different rows, the given ones at the places `first`, with their touches.

@@ -312,7 +312,7 @@ def fit_geometry(
     check_shape(q, "q", ("N", "n_actuators"))
     weights = _check_weights(sample_weight, q)
     touches = Touches.of(touched, distances, distance_std, weights.numpy())
-    x = targets_that_count(touches.tips(x, chain.n_outputs), sample_weight, "x")
+    x = targets_that_count(touches.tips(x, chain.n_outputs, weights.numpy()), sample_weight, "x")
     may_lack_tip = touches.touching | (weights.numpy() == 0.0)
     q, x, unit_messages = check_data(chain, q, x, may_lack_tip)
     motions = Groups.of(groups, len(q))
@@ -373,9 +373,10 @@ def _unexplained(fit: Fit) -> list[str]:
     spread = np.median(np.linalg.norm(rows.centred(fit.unknowns), axis=1))
     if len(rows.x) < _FEW or not 0 < _LEFT * spread < residual:
         return []
+    may_be_wrong = rows.may_be_wrong(fit.problem.chain)
     return [
         f"the calibrated model has a median residual of {1e3 * residual:.3g} mm, but the tip moves "
-        f"by only {1e3 * spread:.3g} mm. Order or sign of the columns of `q`, {rows.may_be_wrong}"
+        f"by only {1e3 * spread:.3g} mm. Order or sign of the columns of `q`, {may_be_wrong}"
     ]
 
 

@@ -185,7 +185,8 @@ class _Calibrated(NamedTuple):
             chain = refitted(choice.start, rows.q, rows.x, rows.weight)
         residual = rows.x.numpy() - _tips(chain, rows.q.numpy())
         weights = np.where(np.isnan(residual), 0.0, rows.weight.numpy()[:, None])
-        offset = np.average(np.nan_to_num(residual), axis=0, weights=weights)
+        counts = np.maximum(weights.sum(axis=0), np.finfo(np.float64).tiny)
+        offset = (weights * np.nan_to_num(residual)).sum(axis=0) / counts  # 0: never measured
         return cls(choice, chain, offset)
 
     def tips(self, q: NDArray) -> NDArray:

@@ -255,3 +255,12 @@ def test_a_calibrated_arm_is_saved_and_loaded(tmp_path):
     loaded = load_model(tmp_path / "arm.hk")
     np.testing.assert_array_equal(loaded.predict(q), model.predict(q))
     assert error_of(loaded.predict, arm) < 1e-4
+
+
+def test_a_warning_about_wrong_columns_recommends_no_check_of_soft_robots():
+    rng = np.random.default_rng(0)
+    q = rng.uniform(-1.0, 1.0, (40, 5))
+    x = 0.5 * rng.standard_normal((40, 3))
+    messages = fit_geometry(nominal(), q, x, ("base",)).messages
+    (wrong,) = [message for message in messages if "median residual" in message]
+    assert wrong.endswith("or the description of the robot, may be wrong.")

@@ -163,3 +163,15 @@ def test_limits_must_be_limits(limits):
     name = next(iter(limits))
     with pytest.raises(ValueError, match=name):
         separating_motions(GeometryChoice(nominal, ()), q, x, **limits)
+
+
+def test_a_marker_that_was_never_measured_has_no_offset():
+    chain = ConstantCurvatureChain([0.05]).with_markers([(0, 0.5), (0, 1.0)])
+    q = np.random.default_rng(0).uniform(0.2, 0.3, (30, 3))
+    x = chain.with_geometry(radii=torch.tensor([0.06]).double())(torch.from_numpy(q)).numpy()
+    x[:, :3] = np.nan
+    radii = GeometryChoice(chain, ("radii", "base"), name="radii + base")
+    choice = GeometryChoice(chain, ("base",), name="base", rivals=(radii,))
+    (motion,) = separating_motions(choice, q, x)
+    assert motion.separates
+    assert np.isfinite([motion.difference, motion.noise]).all()

@@ -481,3 +481,10 @@ def test_equal_rows_are_one_touch():
     q = np.repeat(np.random.default_rng(0).uniform(-0.3, 0.3, (2, 5)), 3, axis=0)
     with pytest.raises(ValueError, match="at least two different rows, but 2 of 2 labels"):
         calibrate(gantry(), q, None, ["tool"], touched=[0, 0, 0, 1, 1, 1])
+
+
+def test_rows_that_neither_touch_nor_have_a_tip_are_named(seeded):
+    q = seeded.uniform(-0.1, 0.1, (6, 3))
+    labels = ["a", "a", "", "b", "b", ""]
+    with pytest.raises(ValueError, match="2 of 6 rows have none \\(first: row 2\\)"):
+        calibrate(gantry(), q, None, ["tool"], touched=labels)
