@@ -121,11 +121,13 @@ class GeometryChoice:
         """Return an iterator over the parameters to calibrate."""
         return iter(self.parameters)
 
-    def started(self, rows: TipRows) -> GeometryChoice:
+    def started(self, q: Tensor, x: Tensor, weights: Tensor) -> GeometryChoice:
         """Return the choice with a start of its fit, which is searched if there is none."""
         if self.start.n_free or not self.parameters:
             return self
         chain = self.chain.frozen().cpu()
+        like = chain.geometry()["base"]
+        rows = TipRows(q.to(like), x.to(like), weights.to(like))
         return replace(self, start=search(chain, rows, self.parameters, "linear"))
 
     def calibrate(self, q: Numbers, x: Numbers, *, loss: str = "linear") -> CalibrationResult:

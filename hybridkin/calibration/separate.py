@@ -150,12 +150,12 @@ def separating_motions(
     if not choice.rivals:
         return ()
     log = TipRows(q, x, q.new_ones(len(q))).take(evenly_spaced(len(q), _MOST))
-    chosen = _Calibrated.of(choice.started(log), log)
+    chosen = _Calibrated.of(choice.started(log.q, log.x, log.weight), log)
     with torch.no_grad():
         motions = motions_within(chosen.chain, rows, low, high)
     found = []
     for rival in choice.rivals:
-        other = _Calibrated.of(rival.started(log), log)
+        other = _Calibrated.of(rival.started(log.q, log.x, log.weight), log)
         found.append(_separating(chosen, other, log, motions))
     return tuple(found)
 

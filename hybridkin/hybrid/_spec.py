@@ -19,7 +19,6 @@ from hybridkin._core.arrays import countable
 from hybridkin._core.groups import Groups
 from hybridkin._core.model import ForwardModel
 from hybridkin._core.progress import Progress
-from hybridkin.calibration._least_squares import TipRows
 from hybridkin.calibration.calibrate import CalibrationResult, fit_geometry, refitted
 from hybridkin.calibration.choice import (
     NOT_CHOSEN,
@@ -264,10 +263,8 @@ class Spec:
                 parameters=None if automatic else self.calibrate,
                 starts=self.starts,
             )
-        like = geometry.chain.geometry()["base"]
         counts = torch.from_numpy(rows.counts)
-        tip_rows = TipRows(rows.q.to(like), self.positions(rows).to(like), counts.to(like))
-        geometry = geometry.started(tip_rows)
+        geometry = geometry.started(rows.q, self.positions(rows), counts)
         return self.with_mechanics(self.error_model.mechanics(self, geometry, rows))
 
     def with_mechanics(self, mechanics: Mechanics) -> Spec:
