@@ -460,6 +460,21 @@ class ConstantCurvatureChain(LengthDrivenChain):
             kinds[0] = f"{self.stage} stage"
         return f"{' and '.join(dict.fromkeys(kinds))}, {super().extra_repr()}"
 
+    def tips_once(self, q: Tensor) -> NDArray:
+        """Return the tips (N, m) at rows q (N, n) of a chain that is evaluated there once.
+
+        No plan is made of it.
+        """
+        program = self._program_of_arcs()
+        if program is None:
+            return super().tips_once(q)
+        with torch.no_grad():
+            arcs = self._arcs_of_rows(q)
+            (points,) = program.evaluate(self._arcs_and_offsets(arcs))
+        turn, move = np.split(as_array(self.base[:3]), [3], axis=1)
+        x = points.reshape(-1, 3) @ turn.T + move[:, 0]
+        return x.reshape(points.shape)
+
     @derived(*_SHAPING)
     def _arc_map(self) -> tuple[Tensor, Tensor]:
         """Return the matrix (3 S, n) and the offset (3 S,) of the map from q to the arcs."""
