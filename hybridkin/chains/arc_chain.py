@@ -384,9 +384,15 @@ class ArcChain(MarkedChain):
 
     def slopes_once(self, q: Tensor, tangents: Mapping[str, Tensor]) -> Tensor:
         """Return `geometry_jacobian` (N, m, P), from the compiled core if available."""
-        slopes_of = self._compiled_points_and_slopes
-        (J,) = self.by_rows(partial(self._along_geometry, tangents=tangents, slopes_of=slopes_of), q)
+        chain = self._once()
+        slopes_of = chain._compiled_points_and_slopes
+        along = partial(chain._along_geometry, tangents=tangents, slopes_of=slopes_of)
+        (J,) = self.by_rows(along, q)
         return J
+
+    def _once(self) -> Self:
+        """Return the chain for a single evaluation, without tables that serve many."""
+        return self
 
     def _along_geometry(
         self, rows: Tensor, tangents: Mapping[str, Tensor], slopes_of: _SlopesOf
@@ -427,7 +433,7 @@ class ArcChain(MarkedChain):
         program = self._program_of_arcs()
         if program is None:
             return self._points_and_slopes(arcs)
-        results = program.evaluate(self._arcs_and_offsets(arcs), jacobian=True)
+        results = program.evaluate(self._arcs_and_offsets(arcs.mT), jacobian=True)
         points, J = map(torch.from_numpy, results)
         turned = self.base[:3, :3].to(J) @ J.unflatten(1, (-1, 3))
         by_arcs, by_offsets = turned.flatten(1, 2).split([len(arcs), self.n_segments], dim=2)
@@ -437,9 +443,9 @@ class ArcChain(MarkedChain):
         return program_of_arcs(self.n_segments, self.arcs_per_segment, self.markers)
 
     def _arcs_and_offsets(self, arcs: Tensor) -> NDArray:
-        """Return rows (N, 3 A + S) for `program_of_arcs`."""
-        offsets = self.offsets.to(arcs).expand(arcs.shape[1], -1)
-        return torch.cat([arcs.T, offsets], dim=1).numpy()
+        """Return rows (N, 3 A + S) of `program_of_arcs` from arcs (N, 3 A)."""
+        offsets = self.offsets.detach().to(arcs).expand(len(arcs), -1)
+        return torch.cat([arcs, offsets], dim=1).numpy()
 
     def _axes_at_markers(self, arcs: Tensor) -> Tensor:
         """Return x, y, z of the axes of the frames at markers in the base frame, (3, 3, K, N)."""

@@ -469,8 +469,8 @@ class ConstantCurvatureChain(LengthDrivenChain):
         if program is None:
             return super().tips_once(q)
         with torch.no_grad():
-            arcs = self._arcs_of_rows(q)
-            (points,) = program.evaluate(self._arcs_and_offsets(arcs))
+            (arcs,) = self.by_rows(lambda rows: (self._arcs_of_rows(rows).mT,), q)
+        (points,) = program.evaluate(self._arcs_and_offsets(arcs))
         turn, move = np.split(as_array(self.base[:3]), [3], axis=1)
         x = points.reshape(-1, 3) @ turn.T + move[:, 0]
         return x.reshape(points.shape)
