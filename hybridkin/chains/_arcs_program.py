@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from ctypes import CDLL
 from functools import lru_cache
 
 import numpy as np
@@ -15,7 +16,6 @@ from hybridkin.native.library import Program, library
 _MOST = 64  # programs that are kept
 
 
-@lru_cache(_MOST)
 def program_of_arcs(
     n_segments: int, arcs_per_segment: int, markers: tuple[Marker, ...]
 ) -> Program | None:
@@ -25,10 +25,18 @@ def program_of_arcs(
     S segments. Its results are points (N, 3 K). None of these numbers is part of the program, so
     that the chains of a calibration share it.
     """
-    if library() is None:
+    opened = library()
+    if opened is None:
         return None
+    return _program(opened, n_segments, arcs_per_segment, markers)
+
+
+@lru_cache(_MOST)
+def _program(
+    opened: CDLL, n_segments: int, arcs_per_segment: int, markers: tuple[Marker, ...]
+) -> Program | None:
     try:
-        return Program(Plan(_stored(n_segments, arcs_per_segment, markers)))
+        return Program(Plan(_stored(n_segments, arcs_per_segment, markers)), opened)
     except NoKernel:
         return None
 

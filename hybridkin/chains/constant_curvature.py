@@ -532,9 +532,8 @@ class ConstantCurvatureChain(LengthDrivenChain):
         matrix, offset = self._arc_map()
         arcs = torch.addmm(offset.to(rows)[:, None], matrix.to(rows), rows.T)
         by_matrix, by_rest = self._changes_of_map(matrix, tangents)
-        by_rows = torch.tensordot(rows, by_matrix, ([1], [2]))  # pyright: ignore[reportArgumentType]
-        slope = by_rows + by_rest  # (N, P, 3 S)
-        slope = slope.permute(2, 1, 0)
+        slope = torch.addmm(by_rest.flatten(), rows, by_matrix.flatten(0, 1).mT)
+        slope = slope.unflatten(1, by_rest.shape).permute(2, 1, 0)  # (3 S, P, N)
         if self.n_stages:
             arcs, slope = turned_by_first(arcs, slope)
         return arcs, lambda by_arcs: by_arcs @ slope.permute(2, 0, 1)
