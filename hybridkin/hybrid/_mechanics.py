@@ -6,9 +6,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hybridkin._core.simplest import simplest_within
 from hybridkin.calibration.choice import GeometryChoice, SetErrors
+from hybridkin.calibration.measured import inner_and_outer
 from hybridkin.hybrid._candidates import Candidates, Settled
 from hybridkin.hybrid._error_models import (
     KernelModel,
@@ -28,7 +30,7 @@ _FEW = 40  # with fewer rows the outer ones do not count
 # and by more than this many standard errors of the difference.
 _WORSE = 0.1
 _SURE = 2.0
-_EQUAL = 0.01  # of the score: within it the simpler mechanics are taken
+_EQUAL = 0.03  # of the score: within it the simpler mechanics are taken
 
 
 def best_mechanics(spec: Spec, geometry: GeometryChoice, rows: Rows) -> Mechanics:
@@ -36,9 +38,9 @@ def best_mechanics(spec: Spec, geometry: GeometryChoice, rows: Rows) -> Mechanic
 
     Mechanics are a set of calibrated parameters, with or without the errors of the structure. For
     each, a blend of few, quick corrections predicts the rows of three folds, and the outer rows
-    after a fit to the inner ones. Among those with a held-out error `cv` at most 15 % above
-    the least, the simplest one with nearly the least ``(cv * io**2)**(1/3)`` is taken, with the
-    error `io` of the outer rows; of few rows that with the least `cv`.
+    after a fit to the inner ones. Taken are those with nearly the least ``(cv * io**2)**(1/3)``,
+    with the held-out error `cv` and the error `io` of the outer rows; of few rows those with the
+    least `cv`. Mechanics that are clearly worse on held-out rows are left out.
     """
     options = [*_options(spec, geometry)]
     if len(options) < 2:
@@ -52,20 +54,31 @@ def best_mechanics(spec: Spec, geometry: GeometryChoice, rows: Rows) -> Mechanic
         settled = Settled(calibrated, rows, models)
         folds = rows.groups.folds(_FOLDS, shuffle=True)
         tables.append(settled.table(settled.outer(), folds))
-    chosen = options[_best(tables)]
+    inner, _ = inner_and_outer(rows.X)
+    enough = np.array([option.rows_needed <= len(inner) for option in options])
+    handicap = np.array([option.refinement.handicap for option in options])
+    chosen = options[_best(tables, enough, handicap)]
     errors = {}
     for mechanics, table in zip(options, tables, strict=True):
         errors[mechanics.name] = SetErrors(table.expected_error, table.outer_error)
     return chosen._replace(geometry=replace(chosen.geometry, corrected=errors))
 
 
-def _best(tables: Sequence[CrossFit]) -> int:
-    """Return the place of the best of several tables, those of simpler mechanics first."""
+def _best(tables: Sequence[CrossFit], enough: NDArray[np.bool_], handicap: NDArray) -> int:
+    """Return the place of the best of K tables, those of simpler mechanics first.
+
+    The score of each is multiplied by its `handicap` (K,).
+
+    Mechanics for which the inner rows are not `enough` (K,) would have too large errors of outer
+    rows: these count at most as large, relative to held-out errors, as those of the others.
+    """
     cv = np.array([table.expected_error for table in tables])
     io = np.array([table.outer_error for table in tables])
-    scores = cv
+    largest = (io / cv).min(where=enough, initial=np.inf) * cv
+    io = np.where(enough, io, np.minimum(io, largest))
+    scores = handicap * cv
     if len(tables[0].y) >= _FEW:
-        scores = np.cbrt(cv * io**2)
+        scores = handicap * np.cbrt(cv * io**2)
     least = tables[int(np.argmin(cv))]
     for k, table in enumerate(tables):
         excess = table.excess_over(least)

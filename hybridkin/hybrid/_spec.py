@@ -175,9 +175,12 @@ class Refinement:
     ----------
     suffix : str
         What it adds to the name of a set of calibrated parameters.
+    handicap : float
+        Factor on its errors where it is compared with other mechanics.
     """
 
     suffix = ""
+    handicap = 1.0
 
     def refine(self, mechanical: ForwardModel, rows: Rows) -> ForwardModel:
         """Return the mechanical model that fits the rows better."""
@@ -197,6 +200,12 @@ class Mechanics(NamedTuple):
     def name(self) -> str:
         """What is calibrated, and what is learned below corrections."""
         return self.geometry.name + self.refinement.suffix
+
+    @property
+    def rows_needed(self) -> float:
+        """Number of rows that suffice for the free numbers of the geometry."""
+        geometry = self.geometry
+        return geometry.start.n_free * geometry.chain.rows_per_parameter
 
 
 @dataclass(frozen=True)
