@@ -384,8 +384,11 @@ class ArcChain(MarkedChain):
 
     def slopes_once(self, q: Tensor, tangents: Mapping[str, Tensor]) -> Tensor:
         """Return `geometry_jacobian` (N, m, P), from the compiled core if available."""
+        program = self._program_of_arcs()
+        if program is None:
+            return self.geometry_jacobian(q, tangents)
         chain = self._once()
-        slopes_of = chain._compiled_points_and_slopes
+        slopes_of = partial(chain._compiled_points_and_slopes, program)
         along = partial(chain._along_geometry, tangents=tangents, slopes_of=slopes_of)
         (J,) = self.by_rows(along, q)
         return J
@@ -428,11 +431,10 @@ class ArcChain(MarkedChain):
         by_arcs = self._turned(self.by_arcs(by_arcs)).contiguous()
         return points.permute(2, 1, 0), by_arcs, self._turned(by_offsets).contiguous()
 
-    def _compiled_points_and_slopes(self, arcs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return `_points_and_slopes`, from the compiled core if available."""
-        program = self._program_of_arcs()
-        if program is None:
-            return self._points_and_slopes(arcs)
+    def _compiled_points_and_slopes(
+        self, program: Program, arcs: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return `_points_and_slopes` from the program of arcs."""
         results = program.evaluate(self._arcs_and_offsets(arcs.mT), jacobian=True)
         points, J = map(torch.from_numpy, results)
         turned = self.base[:3, :3].to(J) @ J.unflatten(1, (-1, 3))
@@ -440,6 +442,9 @@ class ArcChain(MarkedChain):
         return points.unflatten(1, (-1, 3)), by_arcs, by_offsets
 
     def _program_of_arcs(self) -> Program | None:
+        """Return the program of arcs; a class that inherits its layout may compute others."""
+        if "layout" not in vars(type(self)):
+            return None
         return program_of_arcs(self.n_segments, self.arcs_per_segment, self.markers)
 
     def _arcs_and_offsets(self, arcs: Tensor) -> NDArray:

@@ -30,7 +30,6 @@ from hybridkin.chains.arc_chain import (
 )
 from hybridkin.chains.calibratable import Scale
 from hybridkin.chains.length_driven import LengthDrivenChain
-from hybridkin.native.library import program_of
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -402,8 +401,6 @@ class ElasticTendonChain(ElasticBody, LengthDrivenChain):
         return self.n_actuators <= _TABLE and not self._is_single
 
     def _once(self) -> Self:
-        if program_of(self) is None:
-            return self  # its tips need the table, too
         chain = self.with_geometry()
         chain._is_single = True
         return chain

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from hybridkin import ConstantCurvatureChain, ElasticTendonChain, RigidChain
+from hybridkin import ConstantCurvatureChain, ElasticTendonChain, ForceTendonChain, RigidChain
 from hybridkin.chains.chain import Chain
 from hybridkin.native import library
 
@@ -104,6 +104,28 @@ def test_the_straight_robot(name):
     assert_close(torch.from_numpy(chain.tips_once(q)), tip, rtol=0, atol=1e-15)
     expected = Chain.geometry_jacobian(chain, q, tangents)
     assert_close(chain.slopes_once(q, tangents), expected, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("at", [0.5, 1.0, 2.0])
+def test_several_arcs_in_a_segment(at):
+    chain = ForceTendonChain([0.01, 0.009], [0.1, 0.11], 1e-3, 50.0, arcs=3, offsets=[0.01, 0.02])
+    chain = chain.with_tip(at)
+    q = 0.3 * torch.rand(4, 6, generator=torch.manual_seed(0), dtype=torch.float64)
+    tangents = {k: torch.ones(2, *a.shape).to(a) for k, a in chain.geometry().items()}
+    expected = chain.geometry_jacobian(q, tangents)
+    size = float(expected.abs().max())
+    assert_close(chain.slopes_once(q, tangents), expected, rtol=0, atol=1e-10 * size)
+    assert_close(torch.from_numpy(chain.tips_once(q)), chain(q), rtol=0, atol=1e-9)
+
+
+def test_a_class_that_computes_something_else():
+    class Shifted(ConstantCurvatureChain):
+        def forward(self, q):
+            return super().forward(q) + 1.0
+
+    chain = Shifted(RADII, lengths=LENGTHS)
+    q = torch.zeros(2, 9, dtype=torch.float64)
+    assert_close(torch.from_numpy(chain.tips_once(q)), chain(q), rtol=0, atol=0)
 
 
 @pytest.mark.needs_core
