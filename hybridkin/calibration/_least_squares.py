@@ -16,7 +16,6 @@ from torch import Tensor
 from hybridkin.calibration._parameters import Problem
 from hybridkin.calibration.measured import points
 from hybridkin.chains.chain import Chain
-from hybridkin.native.library import evaluate
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -161,7 +160,7 @@ class TipRows:
 
     def tips(self, chain: Chain) -> NDArray:
         """Return the tips (N, m) of a chain."""
-        return evaluate(chain, self.q.numpy())[0]
+        return chain.tips_once(self.q)
 
     @property
     def determined(self) -> NDArray[np.bool_]:
@@ -196,7 +195,7 @@ class TipRows:
         """Return the derivatives (N, K, 3, P) of all markers by the free directions."""
         with torch.no_grad():
             tangents = problem.tangents(torch.from_numpy(theta).to(self.q))
-            return chain.geometry_jacobian(self.q, tangents).unflatten(1, (-1, 3)).numpy()
+            return chain.slopes_once(self.q, tangents).unflatten(1, (-1, 3)).numpy()
 
     def weighted(self, J: NDArray) -> NDArray:
         """Return derivatives (M, 3, P) of errors, times the roots of the weights, (3 M, P)."""

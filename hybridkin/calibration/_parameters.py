@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -160,17 +161,23 @@ class Directions(Parameter):
         return entry
 
 
+@lru_cache(1)  # the derivatives are asked for where the pose was
+def _rotation(x: float, y: float, z: float) -> tuple[Tensor, Tensor]:
+    """Return the `rotation` of a vector, and its left Jacobian."""
+    return rotation(torch.from_numpy(np.array([x, y, z])))
+
+
 class Pose(Parameter):
     """A pose that changes by a rotation vector and a translation, both in the measuring frame."""
 
     def entry_at(self, theta: Tensor) -> Tensor:
-        turned = rotation(theta[:3])[0] @ self.start[:3, :3]
+        turned = _rotation(*theta[:3].tolist())[0].to(theta) @ self.start[:3, :3]
         position = self.start[:3, 3] + theta[3:] * torch.from_numpy(self.units[3:]).to(theta)
         pose = torch.cat([turned, position[:, None]], dim=1)
         return torch.cat([pose, self.start[3:]], dim=0)
 
     def tangents(self, theta: Tensor) -> Tensor:
-        turned, left = rotation(theta[:3])
+        turned, left = [part.to(theta) for part in _rotation(*theta[:3].tolist())]
         tangents = self.start.new_zeros(6, 4, 4)
         # Spins about the columns of the left Jacobian.
         tangents[:3, :3, :3] = cross_matrix(left.T) @ (turned @ self.start[:3, :3])

@@ -133,8 +133,9 @@ def find_by_solving(rows: Tensor, *elasticity: Tensor) -> Tensor:
     n = rows.shape[1]
 
     def maps_of(codes: Tensor) -> Tensor:
-        taut = as_mask(codes, n)
-        return responses_of(taut, Elasticity(*elasticity)).stretch
+        sets, places = codes.unique(return_inverse=True)  # far fewer than rows
+        responses = responses_of(as_mask(sets, n), Elasticity(*elasticity))
+        return responses.stretch.index_select(0, places)
 
     def stretches(codes: Tensor, x: Tensor) -> Tensor:
         return applied(maps_of(codes), x)

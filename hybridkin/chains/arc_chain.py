@@ -28,6 +28,7 @@ from hybridkin.chains._arcs import (
     tip_and_columns,
     transforms,
 )
+from hybridkin.chains._arcs_program import program_of_arcs
 from hybridkin.chains._checks import arc_geometry
 from hybridkin.chains._paths import bend_matrix, path_starts, reading_matrix
 from hybridkin.chains.body import Body, actuator_path, disk
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 Change = Callable[[Tensor], Tensor]
+_SlopesOf = Callable[[Tensor], tuple[Tensor, Tensor, Tensor]]
 _RANK = 1e-9  # of the largest singular value: smaller ones are zero
 _FACTOR = 5.0  # by which sizes can grow or shrink in a calibration
 _SHORTEST = -0.1  # of the robot's length: a marker may sit a little before the end
@@ -376,31 +378,79 @@ class ArcChain(MarkedChain):
         self._check_tangents(tangents)
         self._check_shape(q)
         changes = {name: value.to(q) for name, value in tangents.items()}
-        (J,) = self.by_rows(partial(self._along_geometry, tangents=changes), q)
+        along = partial(self._along_geometry, tangents=changes, slopes_of=self._points_and_slopes)
+        (J,) = self.by_rows(along, q)
         return J
 
-    def _along_geometry(self, rows: Tensor, tangents: Mapping[str, Tensor]) -> tuple[Tensor]:
+    def slopes_once(self, q: Tensor, tangents: Mapping[str, Tensor]) -> Tensor:
+        """Return `geometry_jacobian` (N, m, P), from the compiled core if available."""
+        program = self._program_of_arcs()
+        if program is None:
+            return self.geometry_jacobian(q, tangents)
+        chain = self._once()
+        slopes_of = partial(chain._compiled_points_and_slopes, program)
+        along = partial(chain._along_geometry, tangents=tangents, slopes_of=slopes_of)
+        (J,) = self.by_rows(along, q)
+        return J
+
+    def _once(self) -> Self:
+        """Return the chain for a single evaluation, without tables that serve many."""
+        return self
+
+    def _along_geometry(
+        self, rows: Tensor, tangents: Mapping[str, Tensor], slopes_of: _SlopesOf
+    ) -> tuple[Tensor]:
         """Return the derivative (N, 3 K, P) of x along P changes of the geometry."""
         arcs, change = self._arcs_and_change(rows, tangents)
-        arcs = self.up_to_markers(arcs)
-        x, columns = self._x_and_columns(arcs, rigid=True)
-        by_arcs, by_offsets = columns.split([len(arcs), len(arcs) // 3], dim=1)
-        # Products of row-major derivatives are much faster than those of transposed ones.
-        J = change(self._turned(self.by_arcs(by_arcs)).contiguous())
+        points, by_arcs, by_offsets = slopes_of(arcs)
+        J = change(by_arcs)
         if "offsets" in tangents:
-            k = self.arcs_per_segment  # an offset follows the last arc of a segment
-            by_offsets = self.by_offsets(by_offsets)[:, k - 1 :: k]
-            by_offsets = self._turned(by_offsets).contiguous()
             J = J + by_offsets @ tangents["offsets"].T
         if "base" in tangents:
             turn, move = tangents["base"][:, :3].split([3, 1], dim=2)
-            turned = torch.einsum("pij,jkn->nkip", turn, x)
+            turned = torch.einsum("pij,nkj->nkip", turn, points)
             J = J + (turned + move[..., 0].T).flatten(1, 2)
         if "marker_offsets" in tangents:
-            turns = self._turned(self._axes_at_markers(arcs)).unflatten(1, (-1, 3))
+            axes = self._axes_at_markers(self.up_to_markers(arcs))
+            turns = self._turned(axes).unflatten(1, (-1, 3))
             moved = torch.einsum("nkij,pkj->nkip", turns, tangents["marker_offsets"])
             J = J + moved.flatten(1, 2)
         return (J,)
+
+    def _points_and_slopes(self, arcs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the markers (N, K, 3) in the base frame at arcs (3 A, N), and derivatives of x.
+
+        These are the derivatives (N, 3 K, 3 A) by the arcs and (N, 3 K, S) by the offsets.
+        """
+        arcs = self.up_to_markers(arcs)
+        points, columns = self._x_and_columns(arcs, rigid=True)
+        by_arcs, by_offsets = columns.split([len(arcs), len(arcs) // 3], dim=1)
+        k = self.arcs_per_segment  # an offset follows the last arc of a segment
+        by_offsets = self.by_offsets(by_offsets)[:, k - 1 :: k]
+        # Products of row-major derivatives are much faster than those of transposed ones.
+        by_arcs = self._turned(self.by_arcs(by_arcs)).contiguous()
+        return points.permute(2, 1, 0), by_arcs, self._turned(by_offsets).contiguous()
+
+    def _compiled_points_and_slopes(
+        self, program: Program, arcs: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return `_points_and_slopes` from the program of arcs."""
+        results = program.evaluate(self._arcs_and_offsets(arcs.mT), jacobian=True)
+        points, J = map(torch.from_numpy, results)
+        turned = self.base[:3, :3].to(J) @ J.unflatten(1, (-1, 3))
+        by_arcs, by_offsets = turned.flatten(1, 2).split([len(arcs), self.n_segments], dim=2)
+        return points.unflatten(1, (-1, 3)), by_arcs, by_offsets
+
+    def _program_of_arcs(self) -> Program | None:
+        """Return the program of arcs; a class that inherits its layout may compute others."""
+        if "layout" not in vars(type(self)):
+            return None
+        return program_of_arcs(self.n_segments, self.arcs_per_segment, self.markers)
+
+    def _arcs_and_offsets(self, arcs: Tensor) -> NDArray:
+        """Return rows (N, 3 A + S) of `program_of_arcs` from arcs (N, 3 A)."""
+        offsets = self.offsets.detach().to(arcs).expand(len(arcs), -1)
+        return torch.cat([arcs, offsets], dim=1).numpy()
 
     def _axes_at_markers(self, arcs: Tensor) -> Tensor:
         """Return x, y, z of the axes of the frames at markers in the base frame, (3, 3, K, N)."""

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, ClassVar, TypeVar
 
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hybridkin._core.arrays import as_array, check_shape, countable
@@ -17,6 +18,7 @@ from hybridkin._core.plausible import PlausibleRows, UnknownRows
 from hybridkin._core.units import motion_message, span_message
 from hybridkin.chains.body import Body
 from hybridkin.chains.calibratable import Part, Scale
+from hybridkin.native.library import evaluate
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -215,6 +217,14 @@ class Chain(PoseModel):
         self._check_tangents(tangents)
         self._check_shape(q)
         return self._slope_of(lambda chain: chain(q), tangents)
+
+    def tips_once(self, q: Tensor) -> NDArray:
+        """Return the tips (N, m) at rows q (N, n) of a chain that is evaluated there once."""
+        return evaluate(self, q.numpy())[0]
+
+    def slopes_once(self, q: Tensor, tangents: Mapping[str, Tensor]) -> Tensor:
+        """Return `geometry_jacobian` (N, m, P) of a chain that is evaluated at these rows once."""
+        return self.geometry_jacobian(q, tangents)
 
     def _slope_of(
         self, function: Callable[[Self], _Values], tangents: Mapping[str, Tensor]

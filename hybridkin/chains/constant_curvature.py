@@ -460,6 +460,21 @@ class ConstantCurvatureChain(LengthDrivenChain):
             kinds[0] = f"{self.stage} stage"
         return f"{' and '.join(dict.fromkeys(kinds))}, {super().extra_repr()}"
 
+    def tips_once(self, q: Tensor) -> NDArray:
+        """Return the tips (N, m) at rows q (N, n) of a chain that is evaluated there once.
+
+        No plan is made of it.
+        """
+        program = self._program_of_arcs()
+        if program is None:
+            return super().tips_once(q)
+        with torch.no_grad():
+            (arcs,) = self.by_rows(lambda rows: (self._arcs_of_rows(rows).mT,), q)
+        (points,) = program.evaluate(self._arcs_and_offsets(arcs))
+        turn, move = np.split(as_array(self.base[:3]), [3], axis=1)
+        x = points.reshape(-1, 3) @ turn.T + move[:, 0]
+        return x.reshape(points.shape)
+
     @derived(*_SHAPING)
     def _arc_map(self) -> tuple[Tensor, Tensor]:
         """Return the matrix (3 S, n) and the offset (3 S,) of the map from q to the arcs."""
@@ -517,9 +532,8 @@ class ConstantCurvatureChain(LengthDrivenChain):
         matrix, offset = self._arc_map()
         arcs = torch.addmm(offset.to(rows)[:, None], matrix.to(rows), rows.T)
         by_matrix, by_rest = self._changes_of_map(matrix, tangents)
-        by_rows = torch.tensordot(rows, by_matrix, ([1], [2]))  # pyright: ignore[reportArgumentType]
-        slope = by_rows + by_rest  # (N, P, 3 S)
-        slope = slope.permute(2, 1, 0)
+        slope = torch.addmm(by_rest.flatten(), rows, by_matrix.flatten(0, 1).mT)
+        slope = slope.unflatten(1, by_rest.shape).permute(2, 1, 0)  # (3 S, P, N)
         if self.n_stages:
             arcs, slope = turned_by_first(arcs, slope)
         return arcs, lambda by_arcs: by_arcs @ slope.permute(2, 0, 1)

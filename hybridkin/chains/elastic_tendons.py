@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -30,6 +30,9 @@ from hybridkin.chains.arc_chain import (
 )
 from hybridkin.chains.calibratable import Scale
 from hybridkin.chains.length_driven import LengthDrivenChain
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 __all__ = ["ElasticTendonChain"]
 
@@ -182,6 +185,8 @@ class ElasticTendonChain(ElasticBody, LengthDrivenChain):
         STRUCTURE,
         write_plan=_write_plan,
     )
+
+    _is_single = False  # whether the chain is used for a single evaluation
 
     def __init__(
         self,
@@ -372,7 +377,7 @@ class ElasticTendonChain(ElasticBody, LengthDrivenChain):
 
     def _find(self, rows: Tensor) -> tuple[Tensor, Tensor, _slack.Responses]:
         """Return the sets of taut tendons (N,) as bits, their places in responses, and those."""
-        if self.n_actuators <= _TABLE:
+        if self._has_table:
             table = self._all_responses(rows)
             stretch = table.stretch.detach()
             codes = _slack.WithoutDerivative.apply(_slack.find_in_table, rows.detach(), stretch)
@@ -380,9 +385,25 @@ class ElasticTendonChain(ElasticBody, LengthDrivenChain):
         elasticity = self._elasticity().to(rows)
         fixed = (part.detach() for part in elasticity)
         codes = _slack.WithoutDerivative.apply(_slack.find_by_solving, rows.detach(), *fixed)
-        taut = _slack.as_mask(codes, self.n_actuators)
-        places = torch.arange(len(rows), device=rows.device)
+        sets, places = self._distinct(codes)
+        taut = _slack.as_mask(sets, self.n_actuators)
         return codes, places, _slack.responses_of(taut, elasticity)
+
+    def _distinct(self, codes: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the distinct codes, and the place of each code (N,) among them."""
+        if self._is_single:
+            return codes.unique(return_inverse=True)
+        return codes, torch.arange(len(codes), device=codes.device)  # also in transforms
+
+    @property
+    def _has_table(self) -> bool:
+        """Whether the responses of all sets of taut tendons are stored."""
+        return self.n_actuators <= _TABLE and not self._is_single
+
+    def _once(self) -> Self:
+        chain = self.with_geometry()
+        chain._is_single = True
+        return chain
 
     def _balance(self, rows: Tensor) -> _slack.Balance:
         codes, places, responses = self._find(rows)
@@ -463,17 +484,24 @@ class ElasticTendonChain(ElasticBody, LengthDrivenChain):
             by_pull = (by_force @ fixed.readings.mT) * taut[:, None]
             by_stiffness = by_force * (shape - fixed.rest)[:, None]
             by_rest = -by_force * fixed.stiffness
-            S = self.n_segments  # before it are the lengths, whose readings do not change
-            by_readings = pull[:, None, :, None] * by_force[:, :, None, S:]
-            by_readings = by_readings + by_pull[..., None] * shape[:, None, None, S:]
+            S = self.n_segments
+            # A tendon reads the sums of the bendings of its segments, times its place beside the
+            # backbone. Its readings of the lengths do not change.
+            spans = fixed.readings[:, :S]
+            x_force, y_force = by_force[..., S:].split(S, dim=-1)
+            x_shape, y_shape = (shape[:, S:].unflatten(1, (2, S)) @ spans.mT).unbind(1)
+            by_x = pull[:, None] * (x_force @ spans.mT) + by_pull * x_shape[:, None]
+            by_y = pull[:, None] * (y_force @ spans.mT) + by_pull * y_shape[:, None]
 
             changes = self._all_changes(tangents)
             bending = changes["bending_stiffness"]
+            x_changes, y_changes = self._changes_of_places(changes)
             effects_and_causes = [
                 (by_stiffness[..., :S], changes["axial_stiffness"]),
                 (by_stiffness[..., S:], torch.cat([bending, bending], dim=-1)),
                 (by_rest[..., S:], changes["rest_bends"].mT.flatten(1)),
-                (by_readings.flatten(2), self._changes_of_bends(changes).flatten(1)),
+                (by_x, x_changes),
+                (by_y, y_changes),
                 (by_pull, changes["tendon_zeros"]),
                 (-by_pull * rows[:, None], changes["gains"]),
                 (by_arcs[..., :S], changes["lengths"]),
@@ -482,3 +510,11 @@ class ElasticTendonChain(ElasticBody, LengthDrivenChain):
             return torch.cat(effects, dim=-1) @ torch.cat(causes, dim=-1).mT
 
         return self._arcs_of(shape, rows), change
+
+    def _changes_of_places(self, changes: Mapping[str, Tensor]) -> tuple[Tensor, ...]:
+        """Return the changes (P, n) of what the tendons read of a bend of 1 rad, x and y [m]."""
+        of_bends = self._changes_of_bends(changes).unflatten(2, (2, self.n_segments))
+        # Each tendon bends its own segment.
+        own = np.repeat(np.eye(self.n_segments), self.actuators_per_segment, axis=0)
+        own = torch.from_numpy(own).to(of_bends)
+        return (of_bends * own[:, None]).sum(-1).unbind(2)
