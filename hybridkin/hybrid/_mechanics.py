@@ -71,7 +71,8 @@ def _best(tables: Sequence[CrossFit], enough: NDArray[np.bool_], handicap: NDArr
     The score of each is multiplied by its `handicap` (K,).
 
     Mechanics for which the inner rows are not `enough` (K,) would have too large errors of outer
-    rows: these count at most as large, relative to held-out errors, as those of the others.
+    rows: these count at most as large, relative to held-out errors, as those of the others. If they
+    suffice for none, only held-out errors count.
     """
     cv = _comparable([table.expected_error for table in tables])
     io = _comparable([table.outer_error for table in tables])
@@ -79,7 +80,7 @@ def _best(tables: Sequence[CrossFit], enough: NDArray[np.bool_], handicap: NDArr
     largest = (io[known] / cv[known]).min(initial=np.inf) * cv
     io = np.where(enough, io, np.minimum(io, largest))
     scores = handicap * cv
-    if len(tables[0].y) >= _FEW:
+    if len(tables[0].y) >= _FEW and enough.any():
         scores = handicap * np.cbrt(cv * io**2)
     least = tables[int(np.argmin(cv))]
     for k, table in enumerate(tables):
