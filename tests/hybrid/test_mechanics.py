@@ -162,7 +162,7 @@ def test_errors_outside_count_only_as_far_as_the_inner_rows_suffice():
     assert best(*tables) == 0
     # 3.0 counts as 1.9, twice the error inside, as for the mechanics with enough rows.
     assert best(*tables, enough=[True, False]) == 1
-    assert best(*tables, enough=[False, False]) == 0
+    assert best(Table(1.0, 1.0), *tables, enough=[False, False, False]) == 2
 
 
 def test_errors_outside_do_not_count_for_few_rows():

@@ -172,7 +172,7 @@ def reference(J, v, upper_rows, limits, k):
             bounds=bounds,
             constraints=rows,
             method="SLSQP",
-            options={"ftol": 1e-14, "maxiter": 500},
+            options={"ftol": 1e-12, "maxiter": 500},
         )
 
     return error, solve

@@ -95,7 +95,7 @@ def test_next_names_the_motion_that_shows_whether_the_tool_is_wrong(robot, tmp_p
     assert table.dtype.names == ("motion", *COLUMNS)
     table = np.array([*map(tuple, table)])
     motions = {motion["motion"]: motion for motion in record["separating"]}
-    assert len(np.unique(table[:, 0])) == len(motions) < len(record["separating"])
+    assert len(np.unique(table[:, 0])) == len(motions) <= len(record["separating"])
     for k, motion in enumerate(motions.values()):
         assert motion["motion"].split(",")[0] in " ".join(out.split())
         sent = table[table[:, 0] == k + 1, 1:]
