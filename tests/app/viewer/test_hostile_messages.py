@@ -218,19 +218,28 @@ def centers(view):
     return np.array([obstacle.center.tolist() for obstacle in view.robot.obstacles])
 
 
+def drag_until(condition, view, *messages):
+    """Send messages again, as a page does while it drags, until a condition holds."""
+    end = time.monotonic() + 30.0
+    while not condition():
+        assert time.monotonic() < end
+        connected(view, sending(*messages))
+        time.sleep(0.3)
+
+
 def test_the_page_drags_obstacles_and_turns_none(among):
     drag = {**POSE, "name": "/obstacle 1", "position": [0.4, 0.1, 0.6]}
     start = {"type": "TransformControlsDragStartMessage", "name": "/obstacle 1"}
     end = {"type": "TransformControlsDragEndMessage", "name": "/obstacle 1"}
-    connected(among, sending(start, {**drag, "wxyz": [0.0, 1.0, 0.0, 0.0]}, end))
-    until(lambda: np.allclose(centers(among), [[0.4, 0.1, 0.6], [0.0, 0.0, -0.3]]))
+    messages = start, {**drag, "wxyz": [0.0, 1.0, 0.0, 0.0]}, end
+    moved = [[0.4, 0.1, 0.6], [0.0, 0.0, -0.3]]
+    drag_until(lambda: np.allclose(centers(among), moved), among, *messages)
     assert among._obstacles[0]._arrows.wxyz == pytest.approx([1.0, 0.0, 0.0, 0.0])
     # The arrows of a plane stand in the middle of what is drawn of it.
     floor = among._obstacles[1]
     lifted = np.add(floor._arrows.position, [0.0, 0.0, 0.1])
     drag = {**POSE, "name": "/obstacle 2", "position": lifted.tolist()}
-    connected(among, sending(drag))
-    until(lambda: np.allclose(centers(among)[1], [0.0, 0.0, -0.2]))
+    drag_until(lambda: np.allclose(centers(among)[1], [0.0, 0.0, -0.2]), among, drag)
 
 
 @pytest.mark.filterwarnings("ignore:The page sent")
