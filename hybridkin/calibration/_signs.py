@@ -24,7 +24,7 @@ _MOST_OF_MANY = 3
 _FITTED = 12  # the most likely signs, by the alignment of the tips alone
 _EQUAL = 0.1  # of errors: the fewest reversed actuators are taken
 # What is fitted for each set of signs, as far as a chain has it.
-_COMPAREDLY = ("base", "tool", "joint_zeros")
+_FREE = ("base", "tool", "joint_zeros")
 
 
 def with_likely_signs(
@@ -35,7 +35,7 @@ def with_likely_signs(
     They are reversed only if the tips then fit clearly better. A warning says so; there is
     none if nothing is reversed.
     """
-    names = tuple(name for name in _COMPAREDLY if free_base or name != "base")
+    names = tuple(name for name in _FREE if free_base or name != "base")
     measured = rows.measured
     few = measured.take(evenly_spaced(len(measured.q), _ROWS))
     tips = points(few.x.numpy())[few.seen]
@@ -52,16 +52,16 @@ def with_likely_signs(
         problem = Problem.of(placed(reversed_ones), names)
         return solve(problem, few, np.zeros(len(problem.low)), "linear", COMPARED).rmse
 
-    declared = error(())
-    if declared <= _EXPLAINED * motion:
+    as_given = error(())
+    if as_given <= _EXPLAINED * motion:
         return chain, ()
     ways = sorted(_ways(chain.reversible), key=lambda way: few.rmse(placed(way)))
     likely = sorted(ways[:_FITTED], key=len)
     errors = [error(way) for way in likely]
     best = simplest_within(errors, _EQUAL)
-    if errors[best] > min(_FAR_BETTER * declared, _LEFT * motion):
+    if errors[best] > min(_FAR_BETTER * as_given, _LEFT * motion):
         return chain, ()
-    message = _message(likely[best], errors[best], declared)
+    message = _message(likely[best], errors[best], as_given)
     return chain.with_reversed(likely[best]), (message,)
 
 
@@ -72,11 +72,11 @@ def _ways(actuators: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
         yield from combinations(actuators, n_reversed)
 
 
-def _message(actuators: tuple[int, ...], error: float, declared: float) -> str:
+def _message(actuators: tuple[int, ...], error: float, as_given: float) -> str:
     columns = ", ".join(f"q[{k}]" for k in actuators)
     return (
         f"actuators run in the opposite direction to `chain`: with the sign of {columns} flipped, "
         f"base, tool and zeros leave an error of {1e3 * error:.3g} mm rms, with the given signs "
-        f"{1e3 * declared:.3g} mm. The chain with these actuators reversed is returned; negate "
+        f"{1e3 * as_given:.3g} mm. The chain with these actuators reversed is returned; negate "
         "these columns of `q` and of the `couplings` of the chain."
     )
