@@ -161,6 +161,7 @@ class FeatureModel(TipModel):
         self.noise_ratio = noise_ratio
         self.near = False  # whether penalties are chosen near these
         self.start: Readout | None = None  # of a fit to other rows
+        self.exact = True  # whether the search goes on below the noise
 
     @classmethod
     def of(cls, coupling: str, random_state: Seed) -> Self:
@@ -174,6 +175,15 @@ class FeatureModel(TipModel):
         near = copy.copy(settled)
         near.near = True
         return near
+
+    def down_to_noise(self) -> Self:
+        """Return the model whose search ends where steps gain less than the noise of the rows.
+
+        Its held-out errors are as small, in a fraction of the time.
+        """
+        model = copy.copy(self)
+        model.exact = False
+        return model
 
     @abstractmethod
     def features(self, q: Tensor, mechanical: ForwardModel) -> Features:
@@ -216,6 +226,7 @@ class FeatureModel(TipModel):
                 self.tells_errors,
                 self.near,
                 self.start,
+                self.exact,
             )
         except torch.linalg.LinAlgError as error:  # pyright: ignore
             raise too_far() from error

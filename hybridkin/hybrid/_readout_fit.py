@@ -62,11 +62,12 @@ def fit_readout(
     left_out: bool = True,
     near: bool = False,
     start: Readout | None = None,
+    exact: bool = True,
 ) -> ReadoutFit:
     """Return the readout that minimises the tip error plus a penalty on its weights.
 
     The objective sum_n w_n |x_n - F(z_n + D W phi_n)|^2 + alpha_1 |W_lin|^2 + alpha_2 |W_bent|^2 is
-    minimised exactly, by damped Gauss-Newton and then by quasi-Newton steps. D scales the
+    minimised by damped Gauss-Newton and then by quasi-Newton steps. D scales the
     coordinates so that one unit of each moves the tip by 1 m (rms over the rows). A penalty is
     therefore the variance of the noise over that of a weight.
 
@@ -97,6 +98,9 @@ def fit_readout(
         With `alphas`: whether the penalties are chosen anew, in a search that starts there.
     start : Readout, optional
         With `alphas`: the readout of a fit to other rows, from which the fit starts.
+    exact : bool, default=True
+        Whether the search goes on to the minimum. Else it ends where a step promises to lower the
+        objective by less than the noise of one coordinate of one row.
 
     Returns
     -------
@@ -107,7 +111,7 @@ def fit_readout(
     weight = torch.from_numpy(rows.counts.astype(np.float64))
     with torch.no_grad():
         problem = _ReadoutProblem(
-            mechanical, features, rows.q, x, weight, rows.groups, coupling == "serial"
+            mechanical, features, rows.q, x, weight, rows.groups, coupling == "serial", exact
         )
         if alphas is None:
             fit = _chosen_with_noise(problem)
@@ -186,6 +190,7 @@ class _ReadoutProblem:
         weight: Tensor,
         groups: Groups,
         serial: bool,
+        exact: bool = True,
     ) -> None:
         self.mechanical = mechanical
         self.features = features
@@ -199,6 +204,8 @@ class _ReadoutProblem:
         self._tips = mechanical.tips_by_coordinates() if serial else _at_tip
         self.z = mechanical.coordinates(q)[0] if serial else mechanical(q)
         self.seen = ~x.isnan()
+        # Part of the objective that a step must promise to gain.
+        self.least_gain = 0.0 if exact else 1.0 / int(self.seen.sum())
         self.rest, J = self._rest(self.z)
         J = self.root[:, None] * J
         moved = (J.square().sum((0, 1)) / weight.sum()).sqrt()
@@ -312,6 +319,8 @@ class _ReadoutProblem:
             step = -_linearised.quasi_newton(slope, pairs, factor)
             step_size = 1.0
             descent = float((slope * step).sum())
+            if -descent <= self.least_gain * value:
+                break
             while step_size > 1e-6:  # a full step may overshoot, as the tip is nonlinear
                 tried = readout + step_size * step
                 new, new_slope = self._value_and_slope(tried, weight, taking_part)

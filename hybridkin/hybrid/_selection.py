@@ -103,11 +103,11 @@ class Auto(ErrorModel):
             if spec.mechanical.without_errors is not spec.mechanical:
                 first = "structural"
             candidates[first] = NoCorrection()
-            candidates["serial linear"] = LinearModel("serial")
-            candidates["serial quadratic"] = QuadraticModel("serial")
+            candidates["serial linear"] = LinearModel("serial").down_to_noise()
+            candidates["serial quadratic"] = QuadraticModel("serial").down_to_noise()
             at_tip = "parallel "
             if spec.mechanical.robot.n_arcs:
-                candidates["serial pose"] = ShapeModel("serial")
+                candidates["serial pose"] = ShapeModel("serial").down_to_noise()
                 candidates["parallel pose"] = ShapeModel("parallel")
             else:
                 candidates["parallel quadratic"] = QuadraticModel("parallel")
