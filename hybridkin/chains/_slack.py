@@ -98,6 +98,11 @@ def as_mask(codes: Tensor, n: int) -> Tensor:
     return (codes[:, None] >> places) & 1 > 0
 
 
+def as_codes(mask: Tensor) -> Tensor:
+    """Return sets, given as a mask (N, n), as the bits of integers (N,)."""
+    return _as_codes(mask, _bits(mask.shape[1], mask))
+
+
 def _bits(n: int, like: Tensor) -> Tensor:
     """Return the bits of n tendons (n,); as floating-point numbers if sums of them are exact."""
     bits = 2 ** torch.arange(n, device=like.device)
@@ -105,7 +110,6 @@ def _bits(n: int, like: Tensor) -> Tensor:
 
 
 def _as_codes(mask: Tensor, bits: Tensor) -> Tensor:
-    """Return sets, given as a mask (N, n), as the bits of integers (N,)."""
     if bits.is_floating_point():  # a product is faster than a sum
         return (mask.to(bits) @ bits).long()
     return (mask * bits).sum(-1)
@@ -125,32 +129,65 @@ def find_in_table(rows: Tensor, table: Tensor) -> Tensor:
     def sizes(codes: Tensor, x: Tensor) -> Tensor:
         return stretches(codes, x.abs(), columns.abs())
 
-    return _pivoted(stretches, sizes, table[-1], extended(rows))
+    x = extended(rows)
+    return _pivoted(stretches, sizes, _guess(table[-1], x), x)
 
 
 def find_by_solving(rows: Tensor, *elasticity: Tensor) -> Tensor:
     """Return codes (N,) of the taut tendons, from the elasticity."""
-    n = rows.shape[1]
+    occurring = Occurring(Elasticity(*elasticity))
+    return occurring.find(rows, occurring.guess(rows))
 
-    def maps_of(codes: Tensor) -> Tensor:
-        sets, places = codes.unique(return_inverse=True)  # far fewer than rows
-        responses = responses_of(as_mask(sets, n), Elasticity(*elasticity))
+
+class Occurring:
+    """Responses of those sets of taut tendons that occur: far fewer than rows, or than all sets.
+
+    The responses of the last sets are kept.
+    """
+
+    def __init__(self, elasticity: Elasticity) -> None:
+        self._elasticity = elasticity
+        self._n = len(elasticity.gains)
+        self._sets = torch.empty(0)
+        self._responses: Responses
+
+    def of(self, codes: Tensor) -> tuple[Tensor, Responses]:
+        """Return the places of codes (N,) among the sets that occur, and the responses of these."""
+        sets, places = codes.unique(return_inverse=True)
+        if not torch.equal(sets, self._sets):
+            self._responses = responses_of(as_mask(sets, self._n), self._elasticity)
+            self._sets = sets
+        return places, self._responses
+
+    def guess(self, rows: Tensor) -> Tensor:
+        """Return codes (N,) for the signs of the stretches with all tendons taut."""
+        all_taut = torch.tensor([2**self._n - 1], device=rows.device)
+        return _guess(self._maps_of(all_taut)[0], extended(rows))
+
+    def find(self, rows: Tensor, guess: Tensor) -> Tensor:
+        """Return codes (N,) of the taut tendons, in a search that starts at a guess (N,)."""
+        return _pivoted(self._stretches, self._sizes, guess, extended(rows))
+
+    def _maps_of(self, codes: Tensor) -> Tensor:
+        places, responses = self.of(codes)
         return responses.stretch.index_select(0, places)
 
-    def stretches(codes: Tensor, x: Tensor) -> Tensor:
-        return applied(maps_of(codes), x)
+    def _stretches(self, codes: Tensor, x: Tensor) -> Tensor:
+        return applied(self._maps_of(codes), x)
 
-    def sizes(codes: Tensor, x: Tensor) -> Tensor:
-        return applied(maps_of(codes).abs(), x.abs())
-
-    all_taut = torch.tensor([2**n - 1], device=rows.device)
-    return _pivoted(stretches, sizes, maps_of(all_taut)[0], extended(rows))
+    def _sizes(self, codes: Tensor, x: Tensor) -> Tensor:
+        return applied(self._maps_of(codes).abs(), x.abs())
 
 
 _Stretches = Callable[[Tensor, Tensor], Tensor]
 
 
-def _pivoted(stretches: _Stretches, sizes: _Stretches, full: Tensor, x: Tensor) -> Tensor:
+def _guess(full: Tensor, x: Tensor) -> Tensor:
+    """Return codes (N,) for the signs of the stretches (n, n + 1) with all tendons taut."""
+    return as_codes(x @ full.T >= 0)
+
+
+def _pivoted(stretches: _Stretches, sizes: _Stretches, guess: Tensor, x: Tensor) -> Tensor:
     """Return the codes (N,) of the taut tendons by block principal pivoting.
 
     Parameters
@@ -159,15 +196,14 @@ def _pivoted(stretches: _Stretches, sizes: _Stretches, full: Tensor, x: Tensor) 
         Returns the stretches (N, n) for sets of taut tendons, as codes (N,), at x (N, n + 1).
     sizes : callable
         The same, of the absolute values of all numbers.
-    full : Tensor of shape (n, n + 1)
-        The stretches for all tendons taut, as a map of x; they give the first guess.
+    guess : Tensor of shape (N,)
+        The codes to start from.
     x : Tensor of shape (N, n + 1)
         (q, 1).
     """
     n = x.shape[1] - 1
     places = torch.arange(len(x), device=x.device)  # of the rows that still change
     bits = _bits(n, x)
-    guess = _as_codes(x @ full.T >= 0, bits)
     codes = guess.clone()
     for step in range(HK_WHOLE_STEPS + 2 ** min(n, HK_MOST_TURNS)):
         stretch = stretches(guess, x)

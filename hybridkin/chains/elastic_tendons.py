@@ -30,6 +30,7 @@ from hybridkin.chains.arc_chain import (
 )
 from hybridkin.chains.calibratable import Scale
 from hybridkin.chains.length_driven import LengthDrivenChain
+from hybridkin.native.library import evaluate
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -47,6 +48,7 @@ _SHAPING = (
 )
 _NO_TENSION = 1e-300  # [m]
 _SOFT = 0.1  # stiffness of tendons in the guess, relative to their own
+_Found = tuple[Tensor, Tensor, _slack.Responses]
 _TABLE = 12  # largest number of tendons for which all responses are stored
 
 
@@ -186,7 +188,8 @@ class ElasticTendonChain(ElasticBody, LengthDrivenChain):
         write_plan=_write_plan,
     )
 
-    _is_single = False  # whether the chain is used for a single evaluation
+    # Of a copy that is evaluated once: the chain itself, which has a compiled program.
+    _compiled: tuple[ElasticTendonChain, ...] = ()
 
     def __init__(
         self,
@@ -375,9 +378,11 @@ class ElasticTendonChain(ElasticBody, LengthDrivenChain):
         responses = _slack.responses_of(taut, self._elasticity().to(torch.float64))
         return _slack.Responses(*(part.to(device, dtype) for part in responses))
 
-    def _find(self, rows: Tensor) -> tuple[Tensor, Tensor, _slack.Responses]:
+    def _find(self, rows: Tensor) -> _Found:
         """Return the sets of taut tendons (N,) as bits, their places in responses, and those."""
-        if self._has_table:
+        if self._compiled:
+            return self._found_once(*self._compiled, rows)
+        if self.n_actuators <= _TABLE:
             table = self._all_responses(rows)
             stretch = table.stretch.detach()
             codes = _slack.WithoutDerivative.apply(_slack.find_in_table, rows.detach(), stretch)
@@ -385,24 +390,21 @@ class ElasticTendonChain(ElasticBody, LengthDrivenChain):
         elasticity = self._elasticity().to(rows)
         fixed = (part.detach() for part in elasticity)
         codes = _slack.WithoutDerivative.apply(_slack.find_by_solving, rows.detach(), *fixed)
-        sets, places = self._distinct(codes)
-        taut = _slack.as_mask(sets, self.n_actuators)
+        taut = _slack.as_mask(codes, self.n_actuators)
+        places = torch.arange(len(codes), device=codes.device)
         return codes, places, _slack.responses_of(taut, elasticity)
 
-    def _distinct(self, codes: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the distinct codes, and the place of each code (N,) among them."""
-        if self._is_single:
-            return codes.unique(return_inverse=True)
-        return codes, torch.arange(len(codes), device=codes.device)  # also in transforms
-
-    @property
-    def _has_table(self) -> bool:
-        """Whether the responses of all sets of taut tendons are stored."""
-        return self.n_actuators <= _TABLE and not self._is_single
+    def _found_once(self, compiled: ElasticTendonChain, rows: Tensor) -> _Found:
+        """Return `_find`, in a search that starts at the tendons that move the compiled chain."""
+        _, J = evaluate(compiled, rows.numpy(), jacobian=True)
+        guess = _slack.as_codes(torch.from_numpy(J).ne(0.0).any(1))
+        occurring = _slack.Occurring(self._elasticity().to(rows))
+        codes = occurring.find(rows, guess)
+        return codes, *occurring.of(codes)
 
     def _once(self) -> Self:
         chain = self.with_geometry()
-        chain._is_single = True
+        chain._compiled = (self,)
         return chain
 
     def _balance(self, rows: Tensor) -> _slack.Balance:
