@@ -72,7 +72,7 @@ class Accuracy(NamedTuple):
 
 EXACT = Accuracy(1e-12, 12, 0.0)
 HELD_OUT = Accuracy(1e-6, 12, 0.0)  # for errors of held-out rows
-ROUGH = Accuracy(1e-5, 2, 1.0)  # to compare initial guesses
+ROUGH = Accuracy(1e-5, 2, 0.0)  # to compare initial guesses
 REFITTED = Accuracy(1e-4, 2, 1.0)  # for errors of held-out rows, with corrections
 COMPARED = Accuracy(1e-4, 1, 1.0)  # for errors of held-out rows, to compare sets
 
