@@ -342,7 +342,7 @@ def fit_geometry(
     return replace(result, messages=tuple(messages))
 
 
-def refitted(start: Start, q: Tensor, x: Tensor, weights: Tensor) -> Chain:
+def refitted(start: Start, q: Tensor, x: Tensor, weights: Tensor, loss: str = "linear") -> Chain:
     """Return only the chain of a calibration to different rows from a start.
 
     It is for errors of held-out rows: of many rows, which follow one another in a log, evenly
@@ -351,7 +351,7 @@ def refitted(start: Start, q: Tensor, x: Tensor, weights: Tensor) -> Chain:
     like = start.problem.chain.geometry()["base"]
     rows = TipRows(q.to(like), x.to(like), weights.to(like))
     rows = rows.take(evenly_spaced(len(q), _ENOUGH))
-    return start.fitted(rows, "linear", REFITTED)
+    return start.fitted(rows, loss, REFITTED)
 
 
 def _n_independent(fit: Fit) -> int:

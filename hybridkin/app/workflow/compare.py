@@ -190,12 +190,7 @@ class CalibratedChain(Mechanical):
         return Calibration.of(start, self.result, rows.q_unit, messages, others)
 
 
-def mechanical_of(
-    robot: robots.RobotDescription,
-    rows: MeasuredLog,
-    loss: str,
-    starts: Starts = (),
-) -> Mechanical:
+def mechanical_of(robot: robots.RobotDescription, rows: MeasuredLog, loss: str) -> Mechanical:
     """Return the mechanical model of a robot for rows.
 
     Parameters
@@ -206,8 +201,6 @@ def mechanical_of(
         The rows.
     loss : str
         Loss of the calibration.
-    starts : tuple, optional
-        Those of the model for more rows.
     """
     chain = robot.chain
     if chain is None:
@@ -222,14 +215,7 @@ def mechanical_of(
     if robot.base_is_free:
         base = GeometryChoice(chain, ("base",))
         nominal = base.calibrate(rows.q, rows.x, loss=loss).chain
-    calibrate = robot.calibrate
-    if calibrate == "auto":
-        calibrate = choose_geometry(
-            chain, rows.q, rows.x, groups=rows.motions, loss=loss, starts=starts
-        )
-        geometry = calibrate
-    else:
-        geometry = GeometryChoice(chain, tuple(calibrate))
+    geometry = _geometry_of(chain, robot, rows, loss)
     result = None
     messages = geometry.messages
     calibrated = geometry.chain
@@ -240,7 +226,7 @@ def mechanical_of(
     return CalibratedChain(
         calibrated,
         messages,
-        calibrate,
+        _calibrated_by_auto(robot, geometry),
         geometry.name,
         {name: errors.known() for name, errors in geometry.errors.items()},
         geometry.starts,
@@ -248,6 +234,46 @@ def mechanical_of(
         geometry=geometry,
         result=result,
     )
+
+
+def _mechanical_of_part(
+    robot: robots.RobotDescription, rows: MeasuredLog, loss: str, starts: Starts
+) -> Mechanical:
+    """Return the mechanical model for a part of the rows, of which only the predictions count."""
+    chain = robot.chain
+    if chain is None:
+        return mechanical_of(robot, rows, loss)
+    nominal = chain
+    if robot.base_is_free:
+        nominal = GeometryChoice(chain, ("base",)).fitted(rows.q, rows.x, loss=loss)
+    geometry = _geometry_of(chain, robot, rows, loss, starts)
+    return CalibratedChain(
+        geometry.fitted(rows.q, rows.x, loss=loss),
+        calibrate=_calibrated_by_auto(robot, geometry),
+        nominal=nominal,
+        geometry=geometry,
+        result=None,
+    )
+
+
+def _geometry_of(
+    chain: Chain,
+    robot: robots.RobotDescription,
+    rows: MeasuredLog,
+    loss: str,
+    starts: Starts = (),
+) -> GeometryChoice:
+    """Return what is calibrated: the parameters that the robot names, or those of a choice."""
+    if robot.calibrate != "auto":
+        return GeometryChoice(chain, tuple(robot.calibrate))
+    return choose_geometry(chain, rows.q, rows.x, groups=rows.motions, loss=loss, starts=starts)
+
+
+def _calibrated_by_auto(
+    robot: robots.RobotDescription, geometry: GeometryChoice
+) -> GeometryChoice | tuple[str, ...]:
+    """Return what "auto" gets as `calibrate`."""
+    return geometry if robot.calibrate == "auto" else geometry.parameters
 
 
 def models_of(
@@ -386,7 +412,7 @@ def _models_for(
     rows: MeasuredLog,
 ) -> dict[str, HybridForwardModel]:
     """Return the models of the comparison for training rows."""
-    mechanical = mechanical_of(robot, rows, settings.loss, of_all.starts)
+    mechanical = _mechanical_of_part(robot, rows, settings.loss, of_all.starts)
     return models_of(robot, mechanical, settings)
 
 
