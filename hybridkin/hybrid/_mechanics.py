@@ -100,7 +100,7 @@ def _quick_corrections(spec: Spec, rows: Rows) -> dict[str, ErrorModel]:
     corrections = Candidates(
         {
             "none": NoCorrection(),
-            "quadratic": QuadraticModel("serial").down_to_noise(),
+            "quadratic": QuadraticModel("serial"),
             "kernel": KernelModel(),
         }
     )

@@ -21,6 +21,7 @@ from hybridkin.hybrid._features import Features, Readout
 from hybridkin.hybrid._linearised import Linearised, Pair
 from hybridkin.hybrid._rows import Rows
 
+_ENOUGH = 1000  # rows to choose penalties
 _LARGEST = 1000  # most weights; of more features only the strongest directions are kept
 # Steps; the first ones, far from the optimum, and every tenth factorise.
 _ROUNDS, _FACTORS, _REFRESH = (
@@ -100,13 +101,20 @@ def fit_readout(
         With `alphas`: the readout of a fit to other rows, from which the fit starts.
     exact : bool, default=True
         Whether the search goes on to the minimum. Else it ends where a step promises to lower the
-        objective by less than the noise of one coordinate of one row.
+        objective by less than the noise of one coordinate of one row, and of many rows a thousand
+        choose the penalties.
 
     Returns
     -------
     ReadoutFit
         The readout with its penalties and held-out residuals.
     """
+    if alphas is None and not exact and len(rows) > _ENOUGH:
+        few = rows.thinned(_ENOUGH)
+        chosen = fit_readout(mechanical, features, few, coupling, exact=False)
+        alphas = chosen.alphas
+        noise_ratio = chosen.noise_ratio
+        start = chosen.readout
     x = torch.from_numpy(rows.tips.astype(np.float64))
     weight = torch.from_numpy(rows.counts.astype(np.float64))
     with torch.no_grad():

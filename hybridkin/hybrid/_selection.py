@@ -108,9 +108,9 @@ class Auto(ErrorModel):
             at_tip = "parallel "
             if spec.mechanical.robot.n_arcs:
                 candidates["serial pose"] = ShapeModel("serial").down_to_noise()
-                candidates["parallel pose"] = ShapeModel("parallel")
+                candidates["parallel pose"] = ShapeModel("parallel").down_to_noise()
             else:
-                candidates["parallel quadratic"] = QuadraticModel("parallel")
+                candidates["parallel quadratic"] = QuadraticModel("parallel").down_to_noise()
         candidates[f"{at_tip}ELM"] = NetworkModelCV(network)
         if n_rows <= _MOST:
             candidates[f"{at_tip}kernel"] = KernelModel()
