@@ -44,11 +44,10 @@ NETWORK = {
     "input_scaling": LIMITS,
     "fit_intercept": True,
     "direct_link": True,
-    "random_state": 0,
 }
 SIZES = (10**6, 10**7, 10**8)
 HIDDEN = (100, 300)
-HEADER = ["neurons", "rows", "CPU [s]", "rows per second", "memory beside imports [MB]"]
+HEADER = ["neurons", "rows", "seed", "CPU [s]", "rows per second", "memory beside imports [MB]"]
 HEADER += ["error of the chain [mm]", "error of the hybrid [mm]"]
 
 
@@ -60,21 +59,21 @@ def tips(q: NDArray) -> NDArray:
     return x + reach * np.hstack([0.06 * x[:, :2], -0.1 * reach])
 
 
-def drawn(seed: tuple[int, int], n_rows: int) -> NDArray:
+def drawn(seed: tuple[int, int, int], n_rows: int) -> NDArray:
     """Return commands (N, 9) at random [m]."""
     low, high = LIMITS.astype(np.float32)
     unit = np.random.default_rng(seed).random((n_rows, 9), dtype=np.float32)
     return low + (high - low) * unit
 
 
-def write_log(path: Path, n_rows: int) -> None:
+def write_log(path: Path, n_rows: int, seed: int) -> None:
     """Write a log, row group after row group."""
     schema = pa.schema([(name, pa.float32()) for name in Q + X])
     options = {"use_dictionary": False, "compression": "none"}
     with pq.ParquetWriter(path, schema, **options) as writer:
         for number in range(n_rows // ROWS):
-            q = drawn((0, number), ROWS)
-            rng = np.random.default_rng((1, number))
+            q = drawn((0, number, seed), ROWS)
+            rng = np.random.default_rng((1, number, seed))
             x = tips(q) + NOISE * rng.standard_normal((ROWS, 3), dtype=np.float32)
             columns = [*q.T.copy(), *x.T.astype(np.float32)]
             writer.write_table(pa.Table.from_arrays(columns, schema=schema))
@@ -88,7 +87,7 @@ def chunks(log: pq.ParquetFile, row_groups: range, n_rows: int) -> Iterator[tupl
         yield q, x
 
 
-def streamed(path: Path, n_hidden: int) -> HybridForwardModel:
+def streamed(path: Path, n_hidden: int, seed: int) -> HybridForwardModel:
     """Return the hybrid of a log; the rows of its last row group only give the guard."""
     log = pq.ParquetFile(path, pre_buffer=False)  # else pyarrow reads all of the file at once
     last = log.num_row_groups - 1
@@ -97,7 +96,7 @@ def streamed(path: Path, n_hidden: int) -> HybridForwardModel:
     q, x = map(np.concatenate, zip(*some, strict=True))
     chain = HybridForwardModel(robots.bionic_handling_assistant(), "drop", calibrate="default")
     chain.fit(q, x)
-    network = ELMRegressor(n_hidden, **NETWORK)
+    network = ELMRegressor(n_hidden, random_state=seed, **NETWORK)
     for q, x in chunks(log, range(last), ROWS):
         network.partial_fit(q, x - chain.predict(q))
     hybrid = HybridForwardModel(chain.mechanical_model_, FrozenEstimator(network))
@@ -105,33 +104,34 @@ def streamed(path: Path, n_hidden: int) -> HybridForwardModel:
     return hybrid.fit(q, x)
 
 
-def error(model: HybridForwardModel, mechanical: bool) -> float:
+def error(model: HybridForwardModel, seed: int, mechanical: bool) -> float:
     """Return the root mean square error on new rows without noise [m]."""
-    q = drawn((2, 0), 20_000)
+    q = drawn((2, 0, seed), 20_000)
     predicted = model.predict_mechanical(q) if mechanical else model.predict(q)
     return float(np.sqrt(np.mean(np.sum((predicted - tips(q)) ** 2, axis=1))))
 
 
-def measure(path: Path, n_hidden: int) -> None:
+def measure(path: Path, n_hidden: int, seed: int) -> None:
     """Write time, memory and errors of the fit to a log as JSON, in a process with one fit."""
     imports = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     before = time.process_time()
-    model = streamed(path, n_hidden)
+    model = streamed(path, n_hidden, seed)
     seconds = time.process_time() - before
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     measured = {"seconds": seconds, "memory": (peak - imports) / 1e3}
-    errors = {"chain": error(model, True), "hybrid": error(model, False)}
+    errors = {"chain": error(model, seed, True), "hybrid": error(model, seed, False)}
     json.dump(measured | errors, sys.stdout)
 
 
-def row_of_table(path: Path, n_rows: int, n_hidden: int) -> list[str]:
+def row_of_table(path: Path, n_rows: int, n_hidden: int, seed: int) -> list[str]:
     """Return a row of the table for a log, from a process of its own."""
-    command = [sys.executable, __file__, "--measure", str(path), str(n_hidden)]
+    command = [sys.executable, __file__, "--measure", str(path), str(n_hidden), str(seed)]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     found = json.loads(done.stdout)
     return [
         str(n_hidden),
         str(n_rows),
+        str(seed),
         f"{found['seconds']:.1f}",
         f"{n_rows / found['seconds']:.0f}",
         f"{found['memory']:.0f}",
@@ -145,12 +145,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("results/streams"))
     parser.add_argument("--sizes", type=int, nargs="*", default=SIZES)
-    parser.add_argument("--measure", nargs=2, metavar=("LOG", "NEURONS"))
+    parser.add_argument("--seed", type=int, default=0, help="of the log and of the network")
+    parser.add_argument("--measure", nargs=3, metavar=("LOG", "NEURONS", "SEED"))
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     if arguments.measure:
-        path, n_hidden = arguments.measure
-        measure(Path(path), int(n_hidden))
+        path, n_hidden, seed = arguments.measure
+        measure(Path(path), int(n_hidden), int(seed))
         return
     arguments.out.mkdir(parents=True, exist_ok=True)
     with (arguments.out / "streams.csv").open("w", newline="") as file:
@@ -159,9 +160,10 @@ def main() -> None:
         for n_rows in arguments.sizes:
             path = arguments.out / f"{n_rows}.parquet"
             try:
-                write_log(path, n_rows)
+                write_log(path, n_rows, arguments.seed)
                 for n_hidden in HIDDEN:
-                    table.writerow(row_of_table(path, n_rows, n_hidden))
+                    row = row_of_table(path, n_rows, n_hidden, arguments.seed)
+                    table.writerow(row)
                     file.flush()
             finally:
                 path.unlink(missing_ok=True)

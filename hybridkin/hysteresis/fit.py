@@ -212,13 +212,15 @@ class HysteresisProblem:
         with torch.no_grad():
             corrected = moved.z + torch.from_numpy(of_correction)
             tips, slope = self.log.model.from_coordinates_and_jacobian(corrected)
-            by_y = slope @ (moved.slope + torch.from_numpy(correction[:, 1:] / self.scale))
         residual = np.where(self.roots > 0.0, self.measured - tips.numpy(), 0.0)
 
         # What the unknowns have to explain: the residual, and what they explain already.
         by_z = slope.numpy()
-        by_free = by_y.numpy()[:, :, None] * moved.by_weights[:, None, prior.free]
-        by_free = by_free.reshape(*residual.shape, -1)
+        by_free = np.empty((*residual.shape, 0))
+        if prior.free.any():
+            by_y = by_z @ (moved.slope.numpy() + correction[:, 1:] / self.scale)
+            by_free = by_y[:, :, None] * moved.by_weights[:, None, prior.free]
+            by_free = by_free.reshape(*residual.shape, -1)
         target = residual + (by_z @ of_correction[..., None])[..., 0]
         target += by_free @ weights[prior.free].ravel()
 
@@ -343,9 +345,12 @@ class _LeastSquares:
         products = np.empty((n_both + n_others,) * 2)
 
         squares = (by_z.mT @ by_z).reshape(n_rows, -1)
-        of_inputs = (inputs[:, :, None] * inputs[:, None]).reshape(n_rows, -1)
-        both = (squares.T @ of_inputs).reshape(n_z, n_z, n_inputs, n_inputs)
-        products[:n_both, :n_both] = both.transpose(0, 2, 1, 3).reshape(n_both, n_both)
+        first, second = np.triu_indices(n_inputs)  # the products of inputs are symmetric
+        half = squares.T @ (inputs[:, first] * inputs[:, second])
+        both = np.empty((n_inputs, n_inputs, n_z * n_z))
+        both[first, second] = both[second, first] = half.T
+        both = both.reshape(n_inputs, n_inputs, n_z, n_z)
+        products[:n_both, :n_both] = both.transpose(2, 0, 3, 1).reshape(n_both, n_both)
 
         mixed = (by_z.mT @ others).reshape(n_rows, -1)
         mixed = (inputs.T @ mixed).reshape(n_inputs, n_z, n_others)
