@@ -214,8 +214,9 @@ if __name__ == "__main__":  # each worker imports this file
         for n_workers, (first, second, used) in enumerate(seconds, 1):
             rate = n_rows / (first + second) / n_workers / 1e3
             print(
-                f"workers: {n_workers}; bounds {first:.1f} s, fit and merge {second:.1f} s, "
-                f"processors {used:.1f} s; {rate:.0f} thousand rows/s per worker"
+                f"workers: {n_workers}; bounds {first:.1f} s, fit and merge {second:.1f} s; "
+                f"{rate:.0f} thousand rows/s per worker, {n_rows / used / 1e3:.0f} thousand in a "
+                "second of its processor"
             )
         print(f"one merge: {1e3 * merge_time:.0f} ms, most of it to solve for the readout")
         figure = draw(tree, curve, seconds)
