@@ -184,9 +184,9 @@ def draw(tree, curve, seconds):
         axes[1].bar(workers, time_taken, 0.6, bottom, color=color, label=label)
         bottom = bottom + time_taken
     for place, total in enumerate(bottom):
-        rate = f"{rows[-1] / total / (place + 1) / 1e3:.0f} thousand\nrows/s per worker"
+        rate = f"{rows[-1] / total / (place + 1) / 1e3:.0f} thousand\nrows/s\nper worker"
         axes[1].text(place, total, rate, ha="center", va="bottom", fontsize="small")
-    axes[1].set(ylabel="time [s]", ylim=(0, 1.45 * bottom.max()))
+    axes[1].set(ylabel="time [s]", ylim=(0, 1.6 * bottom.max()))
     axes[1].legend(fontsize="small", loc="upper right")
     return figure
 
