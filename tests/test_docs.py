@@ -10,11 +10,13 @@ from enum import Enum
 from pathlib import Path
 
 import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
 import pytest
 import torch
 
 import hybridkin
-from hybridkin import ForwardModel, app
+from hybridkin import ForwardModel, app, load_model, robots
 from hybridkin.app.cli.main import main
 
 DOCS = Path(__file__).parent.parent / "docs"
@@ -135,6 +137,33 @@ def test_code_of_the_learners_page_runs_as_printed(capsys):
     new_rows, left_out = map(float, capsys.readouterr().out.split()[:2])
     assert new_rows < 0.6  # against the truth without noise
     assert 0.9 < left_out < 1.2  # the noise is 1
+
+
+@pytest.mark.slow
+def test_the_stream_of_the_learners_page_learns_a_folder_of_parquet(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("night").mkdir()
+    rng = np.random.default_rng(0)
+    chain = robots.bionic_handling_assistant()
+
+    def log(n_rows):
+        q = rng.uniform(0.2, 0.25, (n_rows, 9))
+        x = chain(torch.from_numpy(q)).numpy()
+        return q, x + np.array([0.01, 0.0, 0.0]) + 0.05 * x * x[:, 2:]
+
+    for number in range(4):
+        q, x = log(4000)
+        table = pd.DataFrame(np.hstack([q, x]), columns=[*(f"q{i}" for i in range(9)), *"xyz"])
+        table.astype(np.float32).to_parquet(f"night/{number}.parquet")
+    space = {}
+    exec(compile(blocks("elm.md", "python")[1], "elm.md", "exec"), space)
+    assert space["network"].n_samples_seen_ == 12000  # the first file is held out
+    q, x = log(500)
+    loaded = load_model("night.safetensors")
+    error = np.linalg.norm(loaded.predict(q) - x, axis=1).mean()
+    mechanical = np.linalg.norm(loaded.predict_mechanical(q) - x, axis=1).mean()
+    assert error < 0.3 * mechanical
+    assert loaded.in_domain(q).mean() > 0.8
 
 
 @pytest.mark.slow

@@ -13,6 +13,7 @@ from typing_extensions import Self
 
 from hybridkin._core.arrays import LARGEST
 
+_BLOCK = 2048  # rows, whose temporary arrays stay in the cache
 _FLOAT64 = np.dtype(np.float64)
 
 
@@ -40,9 +41,13 @@ class PlausibleRows:
 
     def hold(self, q: NDArray) -> bool:
         """Return whether all rows of q (N, n) lie within the bounds."""
-        with np.errstate(all="ignore"):  # numbers too large for float64 are outside
-            largest = np.abs((q - self.rest) @ self.weights.T).max(initial=0.0)
-        return bool(largest <= 1.0)
+        for first in range(0, len(q), _BLOCK):
+            block = q[first : first + _BLOCK]
+            with np.errstate(all="ignore"):  # numbers too large for float64 are outside
+                largest = np.abs((block - self.rest) @ self.weights.T).max(initial=0.0)
+            if not largest <= 1.0:
+                return False
+        return True
 
     def hold_row(self, q: object) -> TypeGuard[NDArray]:
         """Return whether q is an array of one row (1, n) of small numbers, within the bounds."""

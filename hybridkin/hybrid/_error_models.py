@@ -16,8 +16,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from sklearn.base import clone
+from sklearn.frozen import FrozenEstimator
 from sklearn.kernel_ridge import KernelRidge
-from sklearn.utils.validation import has_fit_parameter
+from sklearn.utils.validation import check_is_fitted, has_fit_parameter
 from torch import Tensor
 from typing_extensions import Self
 
@@ -405,6 +406,38 @@ class ForeignModel(RegressorModel[Any]):
             regressor = ResidualRegressor(regressor, scaling)
         with TURNS.filters:  # it may change them while it fits
             return _fit_to_residuals(regressor, rows)
+
+
+class FrozenModel(RegressorModel[FrozenEstimator]):
+    """A regressor that was fitted to residuals before, for example to a stream of rows.
+
+    The rows of a fit give its guard, its domain and its errors.
+    """
+
+    def fit_tip(self, rows: Rows, spec: Spec) -> FittedError:
+        """Return a copy of the regressor."""
+        regressor: Any = copy.deepcopy(self.regressor.estimator)
+        check_is_fitted(regressor)
+        residual = _residual(rows)
+        n_inputs = rows.X.shape[1]
+        n_known = getattr(regressor, "n_features_in_", n_inputs)
+        if n_known != n_inputs:
+            raise ValueError(
+                f"`error_model` must take {n_inputs} actuators, but the frozen regressor was "
+                f"fitted to {n_known} inputs; fit it to the residuals of this robot."
+            )
+        module = error_module(regressor, rows.q)
+        with torch.no_grad():
+            learned = module(rows.q).numpy().reshape(len(rows), -1)
+        n_outputs = residual.shape[1]
+        if learned.shape[1] != n_outputs:
+            raise ValueError(
+                f"`error_model` must predict {n_outputs} columns, the residual of one tip or pose, "
+                f"but the frozen regressor predicts {learned.shape[1]}; fit it to y minus the "
+                "prediction of the mechanical model."
+            )
+        noise = _spread(residual - learned, rows.counts)
+        return FittedError(regressor, [[(1.0, TipCorrection(module))]], self, noise)
 
 
 class NetworkModel(RegressorModel[ELMRegressor]):

@@ -4,11 +4,17 @@ from __future__ import annotations
 
 from numbers import Real
 
+from sklearn.frozen import FrozenEstimator
 from sklearn.utils._param_validation import HasMethods, Interval, StrOptions
 from torch import nn
 
 from hybridkin.calibration.choice import GeometryChoice
-from hybridkin.hybrid._error_models import NAMED, ForeignModel, network_model
+from hybridkin.hybrid._error_models import (
+    NAMED,
+    ForeignModel,
+    FrozenModel,
+    network_model,
+)
 from hybridkin.hybrid._selection import Auto
 from hybridkin.hybrid._spec import ErrorModel, Seed
 from hybridkin.hysteresis.value import Hysteresis
@@ -47,6 +53,8 @@ def error_model_of(setting: object, coupling: str, random_state: Seed) -> ErrorM
         error_model = ERROR_MODELS[setting].of(coupling, random_state)
     elif isinstance(setting, (ELMRegressor, ELMRegressorCV)):
         error_model = network_model(setting, coupling, random_state)
+    elif isinstance(setting, FrozenEstimator):
+        error_model = FrozenModel(setting)
     else:
         error_model = ForeignModel(setting)
     if coupling not in error_model.couplings and coupling == "parallel":

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator
+from sklearn.frozen import FrozenEstimator
 from sklearn.kernel_ridge import KernelRidge
 from sklearn.linear_model import LinearRegression
 
@@ -321,7 +322,12 @@ def training_of(model: HybridForwardModel) -> dict[str, object]:
 
 
 def _setting(error_model: object) -> str | dict[str, object] | None:
-    """Return the setting `error_model` as JSON; entries that JSON lacks, such as a splitter, go."""
+    """Return the setting `error_model` as JSON; entries that JSON lacks, such as a splitter, go.
+
+    Of a frozen regressor the settings remain, as its module is that of the model.
+    """
+    if isinstance(error_model, FrozenEstimator):
+        error_model = error_model.estimator
     if error_model is None or isinstance(error_model, str):
         return error_model
     name = type(error_model).__name__

@@ -88,7 +88,9 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         its own pipeline scales it, and residuals with mean zero and unit spread: its penalties and
         tolerances are relative to that spread, and lengths can be in any unit.
         (``LinearRegression``, ``Ridge``, ``RidgeCV`` and ``KernelRidge`` give the same at any
-        scale, and see metres.) Names:
+        scale, and see metres.) A fitted regressor in a ``sklearn.frozen.FrozenEstimator`` is used
+        as it is, for example an `ELMRegressor` that has learned the residuals of a stream [m] by
+        `partial_fit`; X and y then only give its guard and its errors. Names:
 
         - "elm", the same as None: ``ELMRegressor(random_state=random_state)``;
         - "structural": the errors of a chain's structure, which are a moved base, zeros and rings

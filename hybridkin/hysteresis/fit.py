@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.optimize import nnls
+from torch import Tensor
 
 from hybridkin._core.arrays import LARGEST
 from hybridkin.hysteresis.follow import followed
@@ -85,6 +86,7 @@ class HysteresisProblem:
         self.roots = np.where(np.isnan(self.measured), 0.0, roots)
         self.center = np.average(log.q[log.rows], axis=0, weights=counts)
         self.scale = log.ranges
+        self.least_noise = _LEAST_NOISE**2 * np.nanvar(self.measured)
 
     def _changes(self) -> tuple[NDArray, NDArray]:
         """Return changes c (C, K + 1, n), and S(c) - c (C, J, K + 1, n) with the slow states S.
@@ -158,30 +160,25 @@ class HysteresisProblem:
         weights = np.concatenate([self.start, np.zeros((n_shares, n))])
         spreads = np.repeat([slope_spread, share_spread], [n_slopes, n_shares])
         prior = _Prior.of(weights, spreads)
-        correction = self._no_correction()
+        moved = self._moved(weights)
+        correction = np.zeros((moved.z.shape[1], 1 + len(self.center)))
         system = None
         for _ in range(_ROUNDS):
-            system = self._linearised(weights, correction, prior)
-            if not np.isfinite(system.columns).all():
+            system = self._linearised(moved, weights, correction, prior)
+            if not system.is_finite:
                 # The model is not regular so far away.
                 unknown = np.full(len(self.log.rows), LARGEST)
                 return HysteresisFit(weights[:n_slopes], weights[n_slopes:], unknown)
             solution = system.solution(system.products)
             correction = solution[: correction.size].reshape(correction.shape)
-            weights[prior.free] = solution[correction.size :].reshape(-1, n)
-            shares = weights[n_slopes:]
-            shares *= _MOST_LATE / np.maximum(shares.sum(axis=0), _MOST_LATE)
+            if prior.free.any():
+                weights[prior.free] = solution[correction.size :].reshape(-1, n)
+                shares = weights[n_slopes:]
+                shares *= _MOST_LATE / np.maximum(shares.sum(axis=0), _MOST_LATE)
+                moved = self._moved(weights)
         assert system is not None
-        distances = np.empty(len(self.log.rows))
-        for _, test in self.log.folds:
-            distances[test] = system.held_out(test) / self.roots[test].max(axis=1)
+        distances = system.held_out() / self.roots.max(axis=1)
         return HysteresisFit(weights[:n_slopes], weights[n_slopes:], distances)
-
-    def _no_correction(self) -> NDArray:
-        """Return a correction W of zeros (Z, n + 1)."""
-        with torch.no_grad():
-            z, _ = self.log.model.coordinates(torch.from_numpy(self.log.q[:1]))
-        return np.zeros((z.shape[1], 1 + len(self.center)))
 
     def _effective(self, weights: NDArray) -> tuple[NDArray, NDArray]:
         """Return the effective changes y (C, n), and dy / d weights (C, K + J, n).
@@ -192,45 +189,73 @@ class HysteresisProblem:
         shares = weights[n_slopes:]
         of_changes = np.ones((n_slopes + 1, weights.shape[1]))  # the last are 1
         of_changes[:-1] = weights[:n_slopes]
-        by_shares = (self.late * of_changes).sum(axis=2)
-        y = (self.changes * of_changes).sum(axis=1) + (by_shares * shares).sum(axis=1)
-        delayed = (self.late[:, :, :n_slopes] * shares[:, None]).sum(axis=1)
+        by_shares = np.einsum("cjkn,kn->cjn", self.late, of_changes)
+        y = np.einsum("ckn,kn->cn", self.changes, of_changes)
+        y += np.einsum("cjn,jn->cn", by_shares, shares)
+        delayed = np.einsum("cjkn,jn->ckn", self.late[:, :, :n_slopes], shares)
         by_slopes = self.changes[:, :n_slopes] + delayed
         return y, np.concatenate([by_slopes, by_shares], axis=1)
 
-    def _linearised(self, weights: NDArray, correction: NDArray, prior: _Prior) -> _LeastSquares:
-        """Return the least squares of the next step, from weights and a correction W."""
+    def _moved(self, weights: NDArray) -> _Moved:
+        """Return what the actuators do with some weights (K + J, n)."""
         y, by_weights = self._effective(weights)
         inputs = np.column_stack([np.ones(len(y)), (y - self.center) / self.scale])
-        model = self.log.model
         with torch.no_grad():
-            z, dz = model.coordinates(torch.from_numpy(y))
-            moved = z + torch.from_numpy(inputs @ correction.T)
-            tips, by_z = model.from_coordinates_and_jacobian(moved)
-            by_y = by_z @ (dz + torch.from_numpy(correction[:, 1:] / self.scale))
+            z, slope = self.log.model.coordinates(torch.from_numpy(y))
+        return _Moved(by_weights, inputs, z, slope)
+
+    def _linearised(
+        self, moved: _Moved, weights: NDArray, correction: NDArray, prior: _Prior
+    ) -> _LeastSquares:
+        """Return the least squares of the next step, from weights and a correction W."""
+        of_correction = moved.inputs @ correction.T
+        with torch.no_grad():
+            corrected = moved.z + torch.from_numpy(of_correction)
+            tips, slope = self.log.model.from_coordinates_and_jacobian(corrected)
         residual = np.where(self.roots > 0.0, self.measured - tips.numpy(), 0.0)
 
-        # Columns of all unknowns, then the target: what they have to explain.
-        n_correction = correction.size
-        unknowns = np.append(correction, weights[prior.free])
-        columns = np.empty((*residual.shape, len(unknowns) + 1))
-        in_columns = columns[..., :n_correction].reshape(*by_z.shape, -1)
-        np.multiply(by_z.numpy()[..., None], inputs[:, None, None], out=in_columns)
-        in_columns = columns[..., n_correction:-1].reshape(*residual.shape, -1, y.shape[1])
-        by_free = by_weights[:, None, prior.free]
-        np.multiply(by_y.numpy()[:, :, None], by_free, out=in_columns)
-        columns[..., -1] = residual + columns[..., :-1] @ unknowns
-        columns *= self.roots[..., None]
+        # What the unknowns have to explain: the residual, and what they explain already.
+        by_z = slope.numpy()
+        by_free = np.empty((*residual.shape, 0))
+        if prior.free.any():
+            by_y = by_z @ (moved.slope.numpy() + correction[:, 1:] / self.scale)
+            by_free = by_y[:, :, None] * moved.by_weights[:, None, prior.free]
+            by_free = by_free.reshape(*residual.shape, -1)
+        target = residual + (by_z @ of_correction[..., None])[..., 0]
+        target += by_free @ weights[prior.free].ravel()
 
         counts = self.roots**2
-        noise = np.average(residual**2, weights=counts)
-        noise += _LEAST_NOISE**2 * np.nanvar(self.measured)
+        noise = np.average(residual**2, weights=counts) + self.least_noise
+        roots = self.roots[..., None]
         return _LeastSquares(
-            columns,
+            roots * by_z,
+            moved.inputs,
+            roots * by_free,
+            self.roots * target,
+            [test for _, test in self.log.folds],
             noise * prior.precision,
             prior.mean,
             n_rows=counts.max(axis=1).sum(),
         )
+
+
+class _Moved(NamedTuple):
+    """What the actuators do at the rows that count.
+
+    Attributes
+    ----------
+    by_weights : ndarray of shape (C, K + J, n)
+        Derivatives of the effective changes y by the weights of each actuator.
+    inputs : ndarray of shape (C, 1 + n)
+        One, and y from -1 to 1 or so: the inputs of the correction.
+    z, slope : Tensor of shape (C, Z) and (C, Z, n)
+        Inner coordinates of the model at y, and their derivative.
+    """
+
+    by_weights: NDArray
+    inputs: NDArray
+    z: Tensor
+    slope: Tensor
 
 
 def _held_back(steps: NDArray, spans: NDArray) -> NDArray:
@@ -273,31 +298,82 @@ class _Prior(NamedTuple):
 class _LeastSquares:
     """Linear least squares of all rows, whose products are kept to leave some of them out.
 
-    The columns are those of a correction, of weights of zero and more, and of the target. Beside
-    the penalty of the weights, each entry of the correction has one that counts as one row.
+    The columns are those of a correction, of weights of zero and more, and of the target. Those of
+    the correction are products ``by_z[z] inputs[i]``, so they are never written out. Beside the
+    penalty of the weights, each entry of the correction has one that counts as one row.
     """
 
-    columns: NDArray  # (C, m, P + F + 1)
+    by_z: NDArray  # (C, m, Z)
+    inputs: NDArray  # (C, I)
+    by_weights: NDArray  # (C, m, F)
+    target: NDArray  # (C, m)
+    folds: list[NDArray]  # the rows of each part
     penalty: NDArray  # (F, F)
     mean: NDArray  # (F,), at which the penalty is zero
     n_rows: float
 
+    @property
+    def is_finite(self) -> bool:
+        """Whether all columns are."""
+        return bool(np.isfinite(self.products).all())
+
+    @cached_property
+    def of_folds(self) -> list[NDArray]:
+        """Products of the columns, summed over the rows of each part."""
+        return [self._products(rows) for rows in self.folds]
+
     @cached_property
     def products(self) -> NDArray:
-        """Products of the columns, summed over rows."""
-        return _products(self.columns)
+        """Products of the columns, summed over all rows."""
+        return np.sum(self.of_folds, axis=0)
 
     @cached_property
     def ridge(self) -> NDArray:
-        """Penalties of the correction (P,)."""
+        """Penalties of the correction (Z I,)."""
         ridge = np.diag(self.products)[: -1 - len(self.mean)] / self.n_rows
         return np.where(ridge > 0.0, ridge, 1.0)
 
-    def held_out(self, test: NDArray) -> NDArray:
-        """Return the lengths of the errors of rows, from the solution of all others."""
-        columns = self.columns[test]
-        solution = self.solution(self.products - _products(columns))
-        return np.linalg.norm(columns @ np.append(solution, -1.0), axis=1)
+    def _products(self, rows: NDArray) -> NDArray:
+        """Return the products of the columns with each other, summed over some rows."""
+        by_z = self.by_z[rows]
+        inputs = self.inputs[rows]
+        others = np.concatenate([self.by_weights[rows], self.target[rows, :, None]], axis=2)
+        n_rows, _, n_z = by_z.shape
+        n_inputs = inputs.shape[1]
+        n_others = others.shape[2]
+        n_both = n_z * n_inputs
+        products = np.empty((n_both + n_others,) * 2)
+
+        squares = (by_z.mT @ by_z).reshape(n_rows, -1)
+        first, second = np.triu_indices(n_inputs)  # the products of inputs are symmetric
+        half = squares.T @ (inputs[:, first] * inputs[:, second])
+        both = np.empty((n_inputs, n_inputs, n_z * n_z))
+        both[first, second] = both[second, first] = half.T
+        both = both.reshape(n_inputs, n_inputs, n_z, n_z)
+        products[:n_both, :n_both] = both.transpose(2, 0, 3, 1).reshape(n_both, n_both)
+
+        mixed = (by_z.mT @ others).reshape(n_rows, -1)
+        mixed = (inputs.T @ mixed).reshape(n_inputs, n_z, n_others)
+        mixed = mixed.transpose(1, 0, 2).reshape(n_both, n_others)
+        products[:n_both, n_both:] = mixed
+        products[n_both:, :n_both] = mixed.T
+
+        flat = others.reshape(-1, n_others)
+        products[n_both:, n_both:] = flat.T @ flat
+        return products
+
+    def held_out(self) -> NDArray:
+        """Return the lengths (C,) of the errors of rows, from the solution without their part."""
+        lengths = np.empty(len(self.target))
+        for rows, of_rows in zip(self.folds, self.of_folds, strict=True):
+            solution = self.solution(self.products - of_rows)
+            inputs = self.inputs[rows]
+            n_both = self.by_z.shape[2] * inputs.shape[1]
+            correction = solution[:n_both].reshape(-1, inputs.shape[1])
+            explained = (self.by_z[rows] @ (inputs @ correction.T)[..., None])[..., 0]
+            explained += self.by_weights[rows] @ solution[n_both:]
+            lengths[rows] = np.linalg.norm(explained - self.target[rows], axis=1)
+        return lengths
 
     def solution(self, products: NDArray) -> NDArray:
         """Return the correction and the weights of products; the correction is eliminated."""
@@ -313,9 +389,3 @@ class _LeastSquares:
         weights, _ = nnls(factor.T, np.linalg.solve(factor, moment))
         correction = explained @ np.append(-weights, 1.0)
         return np.concatenate([correction, weights])
-
-
-def _products(columns: NDArray) -> NDArray:
-    """Return the products of columns (C, m, L) with each other, summed over rows."""
-    flat = columns.reshape(-1, columns.shape[2])
-    return flat.T @ flat

@@ -52,11 +52,11 @@ def gather(stats, elm, X, y, sample_weight, block_size):
         block = z[:-1]
         elm.write_features(q, block[:, :n_features])
         block[:, n_features:] = copied(y[rows], device)
-        w = copied(sample_weight[rows], device)[:, None]
+        w = copied(sample_weight[rows], device)
         n_block = w.sum().item()
-        mean_block = (w * block).sum(0) / n_block
+        mean_block = (w @ block) / n_block
         block -= mean_block
-        block *= w.sqrt()
+        block *= w.sqrt()[:, None]
         step = mean_block - mean
         torch.mul(step, (n / (n + n_block) * n_block) ** 0.5, out=z[-1])
         n += n_block

@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from hybridkin import Hysteresis, as_forward_model, robots
-from hybridkin.hysteresis.fit import HysteresisProblem
+from hybridkin.hysteresis.fit import HysteresisProblem, _LeastSquares
 from hybridkin.hysteresis.log import HysteresisLog
 from hybridkin.hysteresis.search import Candidate, find_hysteresis, gain
 
@@ -225,3 +225,28 @@ def test_missing_markers_and_counts_weigh_the_rows():
     np.testing.assert_allclose(one.slopes, two.slopes, atol=1e-9)
     np.testing.assert_allclose(one.distances[::2], two.distances, rtol=1e-9)
     assert problem.fitted(0.2, 0.2).shares.max() < 0.02
+
+
+@pytest.mark.parametrize("n_weights", [0, 4])
+def test_least_squares_are_those_of_columns_written_out(n_weights):
+    """The products of a correction's columns, and the errors of each part without its rows."""
+    rng = np.random.default_rng(0)
+    by_z = rng.standard_normal((40, 3, 5))
+    inputs = rng.standard_normal((40, 4))
+    by_weights = rng.standard_normal((40, 3, n_weights))
+    target = rng.standard_normal((40, 3))
+    folds = np.array_split(rng.permutation(40), 3)
+    penalty = 0.3 * np.eye(n_weights)
+    mean = np.ones(n_weights)
+    system = _LeastSquares(by_z, inputs, by_weights, target, folds, penalty, mean, 40.0)
+
+    correction = (by_z[..., None] * inputs[:, None, None]).reshape(40, 3, 20)
+    columns = np.concatenate([correction, by_weights, target[..., None]], axis=2)
+    flat = columns.reshape(120, -1)
+    np.testing.assert_allclose(system.products, flat.T @ flat, rtol=0, atol=1e-12)
+    distances = system.held_out()
+    for test in folds:
+        train = np.delete(columns, test, axis=0).reshape(-1, flat.shape[1])
+        solution = np.append(system.solution(train.T @ train), -1.0)
+        expected = np.linalg.norm(columns[test] @ solution, axis=1)
+        np.testing.assert_allclose(distances[test], expected, rtol=1e-9)

@@ -142,6 +142,23 @@ def test_units_of_the_data_do_not_matter(unit, input_scaling):
     assert_allclose(other.jacobian(unit * X) * unit, 3 * base.jacobian(X), rtol=1e-7, atol=1e-7)
 
 
+@pytest.mark.parametrize("activation", ["logistic", "tanh", "sin"])
+@pytest.mark.parametrize("direct_link", [False, True])
+def test_features_of_a_fit_are_those_of_the_module(activation, direct_link):
+    """Also where they saturate, and near zero; the functions themselves round by about eps."""
+    X, Y = trunk()
+    params = {"activation": activation, "direct_link": direct_link, "input_scaling": BOUNDS}
+    module = elm(40, **params).fit(X, Y).module_
+    scales = np.array([0.0, 1e-12, 1e-3, 1.0, 30.0, 1e4, 1e300])
+    q = torch.from_numpy(np.repeat(X[:5], len(scales), axis=0) * np.tile(scales, 5)[:, None])
+    with torch.no_grad():
+        module.input_bias[0] = 0.0
+        expected = module.features(q)
+        written = torch.empty_like(expected)
+        module.write_features(q, written)
+    torch.testing.assert_close(written, expected, rtol=1e-15, atol=1e-15)
+
+
 # Statistics: add, merge, weigh
 
 

@@ -1,16 +1,28 @@
 """The ELM at scale: streams of chunks, dask, processes, searches over frames, metadata."""
 
+import os
+import pickle
+import re
+import subprocess
+import sys
+import weakref
+from pathlib import Path
+
+import joblib
 import numpy as np
 import pandas as pd
 import polars as pl
 import pytest
 import torch
+from dask.distributed import Client, LocalCluster
 from numpy.testing import assert_allclose
-from sklearn.model_selection import GridSearchCV, cross_val_score
+from sklearn.model_selection import GridSearchCV, GroupKFold, cross_val_score
 
 from hybridkin import (
+    ConstantCurvatureChain,
     ELMRegressor,
     ELMRegressorCV,
+    HybridForwardModel,
 )
 
 BOUNDS = [[-1.0] * 4, [1.0] * 4]
@@ -81,7 +93,90 @@ def test_decay_is_a_weight_that_falls_with_age(fit_intercept):
     assert np.abs(forgetful.predict(X) - elm(**params).fit(X, y).predict(X)).max() > 1e-3
 
 
+def test_a_stream_keeps_none_of_its_rows():
+    model = elm(input_scaling=BOUNDS, fit_intercept=True)
+    chunks, sizes = [], []
+    for seed in range(20):
+        X, y = data(500, seed)
+        model.partial_fit(X, y, np.ones(500))
+        chunks += [weakref.ref(X), weakref.ref(y)]
+        sizes.append(len(pickle.dumps(model)))
+    del X, y
+    assert all(chunk() is None for chunk in chunks)
+    assert len(set(sizes)) == 1
+
+
+def test_a_long_stream_loses_no_digits():
+    """Means and scatter of 300,000 rows, against sums in extended precision."""
+    model = elm(8, input_scaling=BOUNDS, activation="tanh", fit_intercept=True)
+    n, mean, products = 0, 0.0, 0.0
+    for seed in range(30):
+        X, y = data(10_000, seed)
+        model.partial_fit(X, y)
+        phi = model.module_.features(torch.from_numpy(X)).numpy()
+        rows = np.hstack([phi, y]).astype(np.longdouble)
+        n += len(rows)
+        mean = mean + rows.sum(axis=0)
+        products = products + rows.T @ rows
+    mean = mean / n
+    scatter = products - n * np.outer(mean, mean)
+    spread = np.sqrt(scatter.diagonal())
+    # Every one of 30 chunks rounds once; the features themselves by 2 eps.
+    assert np.abs((model._stats.mean - mean) / spread).max() * np.sqrt(n) < 1e-14
+    assert np.abs((model._stats.scatter - scatter) / np.outer(spread, spread)).max() < 1e-13
+
+
 # Dask
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "plot_elm_dask.py"
+
+
+@pytest.mark.slow
+def test_the_example_with_two_workers_runs_as_a_script(tmp_path):
+    """Tree and loop agree, and it says how many rows a worker learns in a second."""
+    source = EXAMPLE.read_text(encoding="utf-8")
+    for long, short in (("range(0, 80, 5)", "range(0, 10, 5)"), ("N_ROWS = 8000", "N_ROWS = 500")):
+        assert long in source
+        source = source.replace(long, short)
+    script = tmp_path / "example.py"
+    script.write_text("import matplotlib\nmatplotlib.use('agg')\n" + source, encoding="utf-8")
+    command = [sys.executable, str(script)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=200, check=False)
+    assert done.returncode == 0, done.stderr
+    (difference,) = re.findall(r"predictions: (\S+)", done.stdout)
+    assert float(difference) < 1e-8
+    rates = re.findall(r"workers: (\d); .* (\d+) thousand rows/s per worker", done.stdout)
+    assert [n_workers for n_workers, _ in rates] == ["1", "2"]
+    assert all(int(rate) > 0 for _, rate in rates)
+
+
+@pytest.mark.slow
+def test_a_search_of_hybrids_in_workers_of_dask_finds_the_same():
+    q, x = data(120)
+    q = 0.25 + 0.04 * q[:, :3]
+    chain = ConstantCurvatureChain([0.06])
+    groups = np.arange(120) // 10
+    hybrid = HybridForwardModel(chain, elm(), calibrate=["base"])
+    x = chain(torch.from_numpy(q)).numpy() + 0.01 * x[:, :1]
+
+    def process(estimator, X, y):
+        return os.getpid()
+
+    search = GridSearchCV(
+        hybrid,
+        {"error_model__alpha": [1e-4, 1e2]},
+        cv=GroupKFold(3),
+        scoring={"r2": "r2", "process": process},
+        refit="r2",
+    )
+    expected = search.fit(q, x, groups=groups).cv_results_["mean_test_r2"]
+    options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None}
+    with LocalCluster(**options) as cluster, Client(cluster):
+        with joblib.parallel_config(backend="dask"):
+            found = search.fit(q, x, groups=groups).cv_results_
+    assert_allclose(found["mean_test_r2"], expected, rtol=1e-9)
+    processes = {pid for k in range(3) for pid in found[f"split{k}_test_process"]}
+    assert os.getpid() not in processes
 
 
 # Frames, pipelines, pictures, metadata

@@ -2,14 +2,16 @@
 
 import json
 import re
+from itertools import groupby
 
 import numpy as np
 import pytest
 import torch
 from simulated_log import FIT, HEADER, ROBOT, document, rows, run, write
 
-from hybridkin import load_model, robots
+from hybridkin import Hysteresis, load_model, robots
 from hybridkin.app import workflow
+from hybridkin.app.cli._terminal import Stages
 from hybridkin.app.cli.main import main
 
 
@@ -53,6 +55,42 @@ def test_fit_without_auto_and_with_a_radius(log, robot, tmp_path, capsys):
     _, record = document(capsys, "evaluate", out, log)
     assert 0.8 < record["all"]["share_in_radius"] <= 1
     assert "mm covers 80 % of the tips" in run(capsys, "describe", out)[1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "options", [["--hysteresis", "auto"], ["--no-auto", "--coverage", "0.8"]], ids=["auto", "none"]
+)
+def test_the_progress_of_a_whole_fit_never_goes_back(options, robot, tmp_path, monkeypatch, capsys):
+    """Every stage is shown once, and what is done of it only grows."""
+    calls = []
+
+    class Recorded(Stages):
+        def __call__(self, what, done, total):
+            calls.append((what, done, total))
+            super().__call__(what, done, total)
+
+    monkeypatch.setattr("hybridkin.app.cli.main.Stages", Recorded)
+    table = rows()
+    for motion in np.split(table, 8):
+        motion[:, 1:7] = Hysteresis.backlash(1.5).command(motion[:, 1:7])[0]
+    log = write(tmp_path / "log.csv", table)
+    arguments = [log, "--robot", robot, "--out", tmp_path / "m", *options, *FIT]
+    code, record = document(capsys, "fit", *arguments)
+    assert code == 0
+    found = re.search("backlash|friction", record["chosen"])
+    assert bool(found) == ("auto" in options)
+    stages = [what for what, *_ in calls]
+    assert len({*stages}) > 5
+    for what, of_stage in groupby(calls, key=lambda call: call[0]):
+        of_stage = [*of_stage]
+        assert len(of_stage) == stages.count(what)  # it does not come again
+        parts = [done / total for _, done, total in of_stage]
+        assert parts == sorted(parts)
+        assert parts[0] == 0.0
+        assert parts[-1] <= 1.0
+        assert len({total for _, _, total in of_stage} - {1}) <= 1
+    assert ("cross-validation by motion", 2, 2) in calls
 
 
 def in_metres(table):
