@@ -143,7 +143,7 @@ def find_by_solving(rows: Tensor, *elasticity: Tensor) -> Tensor:
     def sizes(codes: Tensor, x: Tensor) -> Tensor:
         return applied(maps_of(codes).abs(), x.abs())
 
-    all_taut = torch.tensor([2**n - 1], device=rows.device)
+    all_taut = rows.new_full((1,), 2**n - 1, dtype=torch.long)
     return _pivoted(stretches, sizes, maps_of(all_taut)[0], extended(rows))
 
 

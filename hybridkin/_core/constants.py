@@ -1,0 +1,45 @@
+"""Constants of computations, copied once to each device and precision that asks for them.
+
+A copy from the CPU to a GPU waits for it; made in every call it would empty its queue of work.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import torch
+from torch import Tensor
+
+_MOST = 1024  # constants that are kept
+
+
+def constant(numbers: Any, like: Tensor, dtype: torch.dtype | None = None) -> Tensor:
+    """Return numbers as a tensor on the device of another one; nobody writes into it.
+
+    Parameters
+    ----------
+    numbers : number, or tuple of numbers or tuples
+        The constant.
+    like : Tensor
+        Its device, and without `dtype` its precision, are those of the result.
+    dtype : torch.dtype, optional
+        Default: that of `like`.
+    """
+    dtype = like.dtype if dtype is None else dtype
+    if torch.compiler.is_compiling():
+        return torch.tensor(numbers, dtype=dtype, device=like.device)
+    try:
+        return _kept(numbers, dtype, like.device)
+    except RuntimeError:  # a tensor without memory, as in a graph that is traced
+        return torch.tensor(numbers, dtype=dtype, device=like.device)
+
+
+@lru_cache(_MOST)
+def _kept(numbers: Any, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Return the constant; raise a RuntimeError if it has no memory."""
+    # Later derivatives cannot use tensors of the inference mode.
+    with torch.inference_mode(False):
+        tensor = torch.tensor(numbers, dtype=dtype, device=device)
+    tensor.data_ptr()
+    return tensor
