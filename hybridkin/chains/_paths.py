@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import lru_cache
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -70,18 +69,19 @@ def bend_matrix(
 @lru_cache(_MOST)
 def _segments(counts: tuple[int, ...]) -> tuple[int, ...]:
     """Return the segment (n,) of every actuator."""
-    return tuple(np.repeat(np.arange(len(counts)), counts).tolist())
+    segments = [k for k, count in enumerate(counts) for _ in range(count)]
+    return tuple(segments)
 
 
 @lru_cache(_MOST)
 def _spans(counts: tuple[int, ...], starts: tuple[int, ...]) -> tuple[tuple[float, ...], ...]:
     """Return which segments (n, S) every actuator runs through, as 0 and 1."""
-    spans = np.zeros((sum(counts), len(counts)))
-    row = 0
+    spans = []
     for k, count in enumerate(counts):
-        spans[row : row + count, starts[k] : k + 1] = 1.0
-        row += count
-    return tuple(map(tuple, spans.tolist()))
+        row = [0.0] * len(counts)
+        row[starts[k] : k + 1] = [1.0] * (k + 1 - starts[k])
+        spans += [tuple(row)] * count
+    return tuple(spans)
 
 
 def bend_readings(angles: Tensor, extensible: bool) -> Tensor:
@@ -131,8 +131,9 @@ def free_arcs(angles: Sequence[Tensor], extensible: Sequence[bool], bends: Seque
     the one in the plane of its actuators.
     """
     if 1 not in bends:
-        free = np.concatenate([extensible, np.tile(bends, 2) / 2])
-        return torch.diag(constant(tuple(free.tolist()), angles[0]))
+        components = [0.5 * n_bends for n_bends in bends]
+        free = (*map(float, extensible), *components, *components)
+        return torch.diag(constant(free, angles[0]))
     blocks = []  # (3, 3) for every segment: length, x- and y-bending
     for of_segment, stretches, n_bends in zip(angles, extensible, bends, strict=True):
         if n_bends == 1:

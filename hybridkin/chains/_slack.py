@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import torch
@@ -145,6 +145,37 @@ def find_by_solving(rows: Tensor, *elasticity: Tensor) -> Tensor:
 
     all_taut = rows.new_full((1,), 2**n - 1, dtype=torch.long)
     return _pivoted(stretches, sizes, maps_of(all_taut)[0], extended(rows))
+
+
+def taut_codes(rows: Tensor, *parts: Tensor) -> Tensor:
+    """Return codes (N,) of the taut tendons at rows (N, n), without derivatives.
+
+    `parts` are the stretches of all sets, for `find_in_table`, or the elasticity, for
+    `find_by_solving`.
+    """
+    fixed = [part.detach() for part in parts]
+    if torch.compiler.is_compiling():
+        return _taut_in_graph(rows.detach(), fixed)
+    return WithoutDerivative.apply(_found, rows.detach(), *fixed)
+
+
+def _found(rows: Tensor, *parts: Tensor) -> Tensor:
+    """Return codes (N,) of the taut tendons."""
+    find = find_in_table if len(parts) == 1 else find_by_solving
+    return find(rows, *parts)
+
+
+# One operation of a graph: the number of its steps depends on the numbers.
+@torch.library.custom_op(
+    "hybridkin::taut", mutates_args=(), schema="(Tensor rows, Tensor[] parts) -> Tensor"
+)
+def _taut_in_graph(rows: Tensor, parts: Sequence[Tensor]) -> Tensor:
+    return _found(rows, *parts)
+
+
+@_taut_in_graph.register_fake
+def _like_codes(rows: Tensor, parts: Sequence[Tensor]) -> Tensor:
+    return rows.new_empty(len(rows), dtype=torch.long)
 
 
 _Stretches = Callable[[Tensor, Tensor], Tensor]

@@ -158,9 +158,11 @@ class ArcChain(MarkedChain):
     @property
     def absolute(self) -> Tensor:
         """Which actuators (n,) have absolute lengths: those of extensible segments, bool."""
-        absolute = np.repeat(self.extensible, self.actuators_per_segment)
-        absolute[: self.n_stages] = False
-        return constant(tuple(absolute.tolist()), self.radii, torch.bool)
+        absolute = []
+        for stretches, count in zip(self.extensible, self.actuators_per_segment, strict=True):
+            absolute += [stretches] * count
+        absolute[: self.n_stages] = [False] * self.n_stages
+        return constant(tuple(absolute), self.radii, torch.bool)
 
     @property
     def n_arcs(self) -> int:

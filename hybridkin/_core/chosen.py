@@ -1,0 +1,61 @@
+"""Work for some rows of many: for these alone, or for all where counting them would wait."""
+
+from __future__ import annotations
+
+from typing import NamedTuple, TypeAlias
+
+import torch
+from torch import Tensor
+
+
+class Apart(NamedTuple):
+    """Rows at these places (k,), computed apart from the others."""
+
+    places: Tensor
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether there is no row to compute."""
+        return self.places.numel() == 0
+
+    def take(self, rows: Tensor) -> Tensor:
+        """Return the chosen ones of rows (N, ...)."""
+        return rows[self.places]
+
+    def put(self, rows: Tensor, new: Tensor) -> Tensor:
+        """Return rows (N, ...) with others in the chosen places."""
+        return rows.index_copy(0, self.places, new)
+
+
+class AmongAll(NamedTuple):
+    """Rows of a mask (N,), which are computed with all others."""
+
+    mask: Tensor
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether there is no row to compute: nobody knows without waiting."""
+        return False
+
+    def take(self, rows: Tensor) -> Tensor:
+        """Return all rows."""
+        return rows
+
+    def put(self, rows: Tensor, new: Tensor) -> Tensor:
+        """Return rows (N, ...) with others where the mask holds."""
+        mask = self.mask.reshape(-1, *[1] * (new.ndim - 1))
+        return torch.where(mask, new, rows)
+
+
+Chosen: TypeAlias = Apart | AmongAll
+
+
+def chosen(mask: Tensor) -> Chosen:
+    """Return the rows where a mask (N,) holds.
+
+    A GPU would have to tell their number, and in a compiled graph sizes must not depend on numbers:
+    there all rows are computed, so that results of the others must be finite in a derivative.
+    """
+    if mask.device.type == "cpu" and not torch.compiler.is_compiling():
+        return Apart(mask.nonzero()[:, 0])
+    return AmongAll(mask)
