@@ -43,3 +43,21 @@ def _kept(numbers: Any, dtype: torch.dtype, device: torch.device) -> Tensor:
         tensor = torch.tensor(numbers, dtype=dtype, device=device)
     tensor.data_ptr()
     return tensor
+
+
+def moved(tensor: Tensor, like: Tensor) -> Tensor:
+    """Return a constant tensor on the device and in the precision of another one.
+
+    A copy on another device is kept with the tensor, until this is written.
+    """
+    if tensor.device == like.device or tensor.requires_grad or tensor.is_inference():
+        return tensor.to(like)
+    copies = vars(tensor).setdefault("_copies", {})
+    place = like.dtype, like.device
+    version, copy = copies.get(place, (-1, tensor))
+    if version != tensor._version:
+        version = tensor._version
+        with torch.inference_mode(False):
+            copy = tensor.to(like)
+        copies[place] = version, copy
+    return copy
