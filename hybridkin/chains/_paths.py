@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
 
 import torch
 from torch import Tensor, nn
@@ -11,7 +10,6 @@ from torch import Tensor, nn
 from hybridkin._core.arrays import identity, one_of
 from hybridkin._core.constants import constant
 
-_MOST = 64  # structures that are remembered
 _DETERMINED = 1e-6  # smallest relative reading that determines a direction of bending
 
 
@@ -66,14 +64,12 @@ def bend_matrix(
     return torch.cat([x * spans, y * spans], dim=-1)
 
 
-@lru_cache(_MOST)
 def _segments(counts: tuple[int, ...]) -> tuple[int, ...]:
     """Return the segment (n,) of every actuator."""
     segments = [k for k, count in enumerate(counts) for _ in range(count)]
     return tuple(segments)
 
 
-@lru_cache(_MOST)
 def _spans(counts: tuple[int, ...], starts: tuple[int, ...]) -> tuple[tuple[float, ...], ...]:
     """Return which segments (n, S) every actuator runs through, as 0 and 1."""
     spans = []

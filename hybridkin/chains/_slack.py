@@ -66,7 +66,7 @@ def responses_of(taut: Tensor, elasticity: Elasticity) -> Responses:
     # the inverse of the Hessian would lose digits of a soft backbone.
     by_q = pulling * gains
     constant = stiffness * rest - pulling @ zeros
-    unit_forces = identity(len(stiffness), readings).expand(len(taut), -1, -1)
+    unit_forces = identity(len(stiffness), readings).expand(taut.shape[0], -1, -1)
     forces = torch.cat([by_q, constant[..., None], unit_forces], dim=-1)
 
     # Solved in the units of the shape.
@@ -175,7 +175,7 @@ def _taut_in_graph(rows: Tensor, parts: Sequence[Tensor]) -> Tensor:
 
 @_taut_in_graph.register_fake
 def _like_codes(rows: Tensor, parts: Sequence[Tensor]) -> Tensor:
-    return rows.new_empty(len(rows), dtype=torch.long)
+    return rows.new_empty(rows.shape[0], dtype=torch.long)
 
 
 _Stretches = Callable[[Tensor, Tensor], Tensor]

@@ -391,7 +391,7 @@ class ElasticTendonChain(ElasticBody, LengthDrivenChain):
         """Return the distinct codes, and the place of each code (N,) among them."""
         if self._is_single:
             return codes.unique(return_inverse=True)
-        return codes, torch.arange(len(codes), device=codes.device)  # also in transforms
+        return codes, torch.arange(codes.shape[0], device=codes.device)  # also in transforms
 
     @property
     def _has_table(self) -> bool:

@@ -62,8 +62,8 @@ class Fading(NamedTuple):
         if fading.is_empty:
             return None
         weight, slope = guard.weight_and_jacobian(fading.take(q))
-        weights = fading.put(q.new_ones(len(q), 1), weight)
-        slopes = fading.put(q.new_zeros(len(q), 1, q.shape[1]), slope)
+        weights = fading.put(q.new_ones(q.shape[0], 1), weight)
+        slopes = fading.put(q.new_zeros(q.shape[0], 1, q.shape[1]), slope)
         return cls(weights, slopes)
 
     def times(self, x: Tensor, J: Tensor) -> tuple[Tensor, Tensor]:
@@ -423,8 +423,8 @@ class HybridModule(Hybrid):
         """
         if inside is None:
             inside = self._inside(q)
-        trust = q.new_ones(len(q), 1)
-        total = q.new_zeros(len(q), 1)
+        trust = q.new_ones(q.shape[0], 1)
+        total = q.new_zeros(q.shape[0], 1)
         for weight, correction in self._parts(q):
             value = correction.value(q, inside)
             guard = correction.guard
@@ -440,7 +440,7 @@ class HybridModule(Hybrid):
     def _distance(self, q: Tensor) -> Tensor:
         """Return the largest distance of any guard, and of the groups, at rows q, (N, 1)."""
         guards = [correction.guard for correction in self._corrections]
-        farthest = q.new_zeros(len(q))
+        farthest = q.new_zeros(q.shape[0])
         for measure in (*guards, self.tested):
             if measure is not None:
                 farthest = torch.maximum(farthest, measure.domain_distance(q))
