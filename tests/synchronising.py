@@ -28,6 +28,7 @@ from torch.utils._pytree import tree_leaves
 import hybridkin
 from hybridkin import ELMRegressor, InverseKinematics
 from hybridkin.ik import _box, _search
+from hybridkin.ik._settings import StepSettings
 
 FOLDER = Path(hybridkin.__file__).parent
 ASKS = {"_local_scalar_dense", "equal", "_linalg_check_errors", "_linalg_eigh", "_linalg_svd"}
@@ -119,6 +120,7 @@ def rounds_into(rounds):
             (_search.Search, "_after_step"),
             (_search, "limited_step"),
             (_box, "solve_rows"),  # Newton's method in a box
+            (StepSettings, "evaluate"),
         ):
             counted = counting(name, getattr(owner, name))
             stack.enter_context(mock.patch.object(owner, name, counted))

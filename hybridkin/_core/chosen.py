@@ -50,12 +50,14 @@ class AmongAll(NamedTuple):
 Chosen: TypeAlias = Apart | AmongAll
 
 
-def chosen(mask: Tensor) -> Chosen:
+def chosen(mask: Tensor, costly: bool) -> Chosen:
     """Return the rows where a mask (N,) holds.
 
-    A GPU would have to tell their number, and in a compiled graph sizes must not depend on numbers:
-    there all rows are computed, so that results of the others must be finite in a derivative.
+    In a compiled graph sizes must not depend on numbers: there all rows are computed, and so they
+    are on a GPU, which would have to tell their number, unless that is costly. Then the results of
+    the other rows are dropped; they must be finite, because derivatives of NaN are NaN.
     """
-    if mask.device.type == "cpu" and not torch.compiler.is_compiling():
+    asks = costly or mask.device.type == "cpu"
+    if asks and not torch.compiler.is_compiling():
         return Apart(mask.nonzero()[:, 0])
     return AmongAll(mask)

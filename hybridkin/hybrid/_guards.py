@@ -97,7 +97,7 @@ class Guard(PortableModule):
 
     def shortened_with_jacobian(self, correction: Tensor, J: Tensor) -> tuple[Tensor, Tensor]:
         """Return the `shortened` corrections (N, m), and their Jacobians (N, m, n)."""
-        long = chosen(self.is_long(correction))
+        long = chosen(self.is_long(correction), costly=False)
         if long.is_empty:
             return correction, J
         too_long = long.take(correction)

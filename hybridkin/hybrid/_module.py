@@ -58,7 +58,9 @@ class Fading(NamedTuple):
     @classmethod
     def of(cls, guard: Guard, q: Tensor, distance: Tensor) -> Self | None:
         """Return the fading at rows q (N, n) at this distance (N,), None if all weights are 1."""
-        fading = chosen(~(distance <= guard.FULL))  # written so that NaN is included
+        fades = ~(distance <= guard.FULL)  # written so that NaN is included
+        # Few rows fade, and their leverage takes as long as all of the rest.
+        fading = chosen(fades, costly=True)
         if fading.is_empty:
             return None
         weight, slope = guard.weight_and_jacobian(fading.take(q))
