@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch._subclasses import FakeTensor
 
 _MOST = 1024  # constants that are kept
 
@@ -31,18 +32,27 @@ def constant(numbers: Any, like: Tensor, dtype: torch.dtype | None = None) -> Te
         return torch.tensor(numbers, dtype=dtype, device=like.device)
     try:
         return _kept(numbers, dtype, like.device)
-    except RuntimeError:  # a tensor without memory, as in a graph that is traced
-        return torch.tensor(numbers, dtype=dtype, device=like.device)
+    except _NotKept as error:
+        return error.tensor
 
 
 @lru_cache(_MOST)
 def _kept(numbers: Any, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Return the constant; raise a RuntimeError if it has no memory."""
+    """Return the constant; raise it in a `_NotKept` if it belongs to a graph that is traced."""
     # Later derivatives cannot use tensors of the inference mode.
     with torch.inference_mode(False):
         tensor = torch.tensor(numbers, dtype=dtype, device=device)
-    tensor.data_ptr()
+    if isinstance(tensor, FakeTensor):
+        raise _NotKept(tensor)
     return tensor
+
+
+class _NotKept(Exception):
+    """Brings a tensor past the cache."""
+
+    def __init__(self, tensor: Tensor) -> None:
+        super().__init__()
+        self.tensor = tensor
 
 
 def moved(tensor: Tensor, like: Tensor) -> Tensor:

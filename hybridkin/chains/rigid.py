@@ -670,7 +670,10 @@ class RigidChain(Chain):
 
     def _strokes(self, largest: Tensor) -> Tensor:
         """Return the sum of the strokes of prismatic joints for ``|q| <= largest``."""
-        return (self.couplings[self.slides].abs() @ largest).sum()
+        sliding = tuple(k for k, kind in enumerate(self.kinds) if kind == "prismatic")
+        joints = constant(sliding, self.couplings, torch.long)
+        couplings = self.couplings.index_select(0, joints).to(largest)
+        return (couplings.abs() @ largest).sum()
 
     @property
     def turns(self) -> Tensor:
