@@ -81,7 +81,8 @@ class Guard(PortableModule):
         """Return g(q) (N, 1) and its derivative (N, 1, n) at rows q (N, n)."""
         distance, gradient = self.domain_distance_and_gradient(q)
         weight, excess = self._weight(distance)
-        slope = (-3.0 / self.FULL) * (excess * weight).square()
+        # NaN where the square overflows, as in the kernels: such rows are refused.
+        slope = (-3.0 / self.FULL) * excess.square() * weight.square()
         return weight[:, None], (slope[:, None] * gradient)[:, None]
 
     def _weight(self, distance: Tensor) -> tuple[Tensor, Tensor]:
