@@ -150,6 +150,19 @@ def compare():
         with study.attempt("fits"):
             gpu.compare_fits(study)
 
+        # What is kept of the state follows its changes.
+        for name, entry in (("extensible segments", "radii"), ("network", "input_scale")):
+            kind = gpu.KINDS[name]()
+            q = kind.rows(2)
+            there = gpu.moved(kind.module, NAME)
+            for change in (1.0, 1.1):
+                for module in (kind.module, there):
+                    getattr(module, entry).mul_(change)
+                expected = kind.module.forward_and_jacobian(q)
+                found = there.forward_and_jacobian(q.to(NAME))
+                for ours, theirs in zip(expected, found, strict=True):
+                    study.compare(name, f"{entry} times {change}", gpu.apart(ours, theirs), 1e-12)
+
         # The CPU takes blocks that fit its cache; they would leave a GPU idle.
         sizes = []
         for rows in (torch.zeros(10_000, 2), torch.zeros(10_000, 2, device=device)):

@@ -30,11 +30,12 @@ from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
+from unittest import mock
 
 import numpy as np
 import torch
 from gpu_models import KINDS, Kind, arm, arm_urdf, hybrid, log, network, segment, trunk
-from gpu_report import CORE, Result, Study, write, written
+from gpu_report import COMPILED, CORE, Result, Study, write, written
 from torch import Tensor
 
 from hybridkin import (
@@ -47,6 +48,7 @@ from hybridkin import (
     native,
     save_model,
 )
+from hybridkin._core import blocks
 from hybridkin.chains.chain import Chain
 
 SMOOTH = 1e-10
@@ -583,6 +585,50 @@ def fits_of_many_rows(study: Study) -> None:
     study.say("fits of many rows timed")
 
 
+def compiled_graphs(study: Study) -> None:
+    """Time tips and Jacobians as graphs compiled by torch, for any number of rows."""
+    what = "graphs compiled by torch"
+    if study.quick:
+        study.leave_out(f"{what}: --quick")
+        return
+    for dtype in DTYPES:
+        name = str(dtype).removeprefix("torch.")
+        if not study.has_time(f"{what}, {name}", 1.0, 40.0):
+            continue
+        place = Place(str(study.device), study.device, dtype)
+        with study.attempt(f"{what}, {name}"), torch.no_grad():
+            twin = moved(trunk(), place.device).to(dtype)
+            work = torch.compile(twin.forward_and_jacobian, fullgraph=True, dynamic=True)
+            for n in (100_000, 1_000_000):
+                seconds = time_of(partial(work, place.rows(n, 0.2, 0.3, 9)), place.device, 1.0)
+                row = ("trunk, 9 chambers", COMPILED, place.name, name, n)
+                study.results.append(Result("speed", *row, 1e6 * seconds / n, "us per row"))
+    study.say(f"{what} timed")
+
+
+def sizes_of_blocks(study: Study) -> None:
+    """Time tips and Jacobians in blocks of other sizes: small blocks leave a GPU idle."""
+    if study.device.type != "cuda":
+        study.leave_out("sizes of blocks: of a GPU alone")
+        return
+    place = Place(str(study.device), study.device, torch.float64)
+    models = {"trunk, 9 chambers": trunk(), "trunk, hybrid of 100 units": trunk_hybrid().module_}
+    n = 1_000_000
+    for times in (8, 32, 128, 512):
+        what = f"FK and J, blocks of a CPU times {times}"
+        for name, model in models.items():
+            if not study.has_time(f"{name}, {what}", 1.0):
+                continue
+            with study.attempt(what), torch.no_grad(), mock.patch.object(blocks, "_ON_GPU", times):
+                run = jacobian_job(model, place, n)
+                row = (name, what, place.name, "float64", n)
+                memory = peak_memory(run, place.device) / n
+                seconds = time_of(run, place.device, 0.3)
+                study.results.append(Result("speed", *row, 1e6 * seconds / n, "us per row"))
+                study.results.append(Result("memory", *row, memory, "bytes per row"))
+    study.say("sizes of blocks timed")
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Compare, measure, and write the report; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -605,7 +651,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parts: dict[str, Callable[[], None]] = {
         "correctness": partial(correctness, study, 0.5),
         "speed": partial(speed, study, 0.85),
+        "sizes of blocks": partial(sizes_of_blocks, study),
         "fits of many rows": partial(fits_of_many_rows, study),
+        "compiled graphs": partial(compiled_graphs, study),
     }
     for name, run in parts.items():
         with study.attempt(name):

@@ -23,6 +23,10 @@ import hybridkin
 from hybridkin import __version__, native
 
 CORE = "cpu, compiled core"
+# Work -> rows, and how many times faster than the compiled core on one thread a GPU should be.
+COMPILED = "FK and J, compiled by torch"
+GOALS = {"FK and J": (1_000_000, 50.0), "solve": (100_000, 20.0)}
+GOALS[COMPILED] = GOALS["FK and J"]
 OUT_OF_MEMORY = (MemoryError, torch.cuda.OutOfMemoryError)
 
 
@@ -169,8 +173,61 @@ def written(study: Study) -> str:
         lines.append(in_row(cells))
 
     lines += measured_table(study, "speed", "µs per row", ["cpu", CORE])
+    lines += faster_table(study)
     lines += measured_table(study, "memory", "bytes per row", [])
     return "\n".join(lines) + "\n"
+
+
+def faster_table(study: Study) -> list[str]:
+    """Return the lines of a table: from how many rows the device is faster than one CPU core.
+
+    The core computes on one thread in float64. Where it was not measured at a number of rows, its
+    time per row at the largest smaller number counts.
+    """
+    name = str(study.device)
+    times: dict[tuple[str, ...], dict[int, float]] = {}
+    for result in study.results:
+        if result.part == "speed":
+            job = result.model, result.what, result.device, result.dtype
+            times.setdefault(job, {})[result.rows] = result.value
+            if result.device == CORE and result.what == "FK and J":
+                times.setdefault((result.model, COMPILED, *job[2:]), {})[result.rows] = result.value
+    lines = ["", f"## {name} beside the compiled core on one thread", ""]
+    titles = ["model", "work", "dtype", "faster from rows", "times faster, by rows", "goal"]
+    lines += [in_row(titles), in_row(["---"] * len(titles))]
+    for (model, work, device, dtype), of_device in times.items():
+        of_core = times.get((model, work, CORE, "float64"), {})
+        ratios = {}
+        for n in sorted(of_device):
+            measured = [rows for rows in of_core if rows <= n]
+            if measured:
+                ratios[n] = of_core[max(measured)] / of_device[n]
+        if device == name and ratios:
+            by_rows = ", ".join(f"{n}: {ratio:.2g}" for n, ratio in ratios.items())
+            cells = [model, work, dtype, faster_from(ratios), by_rows, goal(work, ratios)]
+            lines.append(in_row(cells))
+    return lines
+
+
+def faster_from(ratios: dict[int, float]) -> str:
+    """Return the number of rows from which on the device is always faster."""
+    first = "none"
+    for n in sorted(ratios, reverse=True):
+        if ratios[n] <= 1.0:
+            break
+        first = str(n)
+    return first
+
+
+def goal(work: str, ratios: dict[int, float]) -> str:
+    """Return the goal of a kind of work, and whether it is reached."""
+    if work not in GOALS:
+        return ""
+    n, wanted = GOALS[work]
+    text = f"{wanted:g} at {n}"
+    if n not in ratios:
+        return f"{text}: not measured"
+    return f"{text}: {'reached' if ratios[n] >= wanted else 'MISSED'}"
 
 
 def measured_table(study: Study, part: str, unit: str, others: Sequence[str]) -> list[str]:

@@ -35,11 +35,15 @@ def in_blocks(
 def in_blocks_of(
     size: int, function: Callable[[Tensor], tuple[Tensor, ...]], q: Tensor
 ) -> tuple[Tensor, ...]:
-    """Return the result of `in_blocks` with exactly this number of rows in a block."""
+    """Return the result of `in_blocks` with exactly this number of rows in a block.
+
+    In a compiled graph all rows are one block: it is right for any number of rows.
+    """
     if q.ndim == 0:
         return function(q)  # which raises
     lead = q.shape[:-1]
-    blocks = q.reshape(math.prod(lead), q.shape[-1]).split(size)
+    rows = q.reshape(math.prod(lead), q.shape[-1])
+    blocks = (rows,) if torch.compiler.is_compiling() else rows.split(size)
     of_blocks = [function(blocks[0])]
     for k, block in enumerate(blocks[1:], 1):
         with rows_from(k * size):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import wraps
+from functools import partial, wraps
 from typing import Generic, TypeVar
 
 import torch
@@ -21,8 +21,10 @@ def derived(
     """Return a decorator of methods that compute tensors from entries of a module's state.
 
     The result is kept until an entry is another tensor or holds other numbers, however they were
-    written. It is computed anew where derivatives by the state may be asked for, in functional
-    transforms of the state, and while torch compiles.
+    written. On another device than the CPU a comparison of numbers would wait for it: there every
+    write counts that torch counts, which are all except those through ``.data``. The result is
+    computed anew where derivatives by the state may be asked for, in functional transforms of the
+    state, and while torch compiles.
 
     Parameters
     ----------
@@ -83,8 +85,8 @@ def _at_present(module: nn.Module) -> nn.Module:
 class _Kept(Generic[Tensors]):
     """A result, and the entries of a state that it was computed from.
 
-    They are compared by their bytes, because writes through ``.data`` or NumPy do not change the
-    version of a tensor.
+    On the CPU they are compared by their bytes, because writes through ``.data`` or NumPy do not
+    change the version of a tensor; elsewhere by their version.
 
     Raises
     ------
@@ -96,23 +98,15 @@ class _Kept(Generic[Tensors]):
         self.settings = settings
         self.values: Tensors | None = None
         self._absent = [name for name, entry in entries.items() if entry is None]
-        present = [(name, entry) for name, entry in entries.items() if entry is not None]
-        self._elsewhere = [a for _, a in present if a.device.type != "cpu"]
-        self._content = self._read_elsewhere()
         self._entries = []
-        for name, entry in present:
-            read = bytes  # nothing, of an entry elsewhere
+        for name, entry in entries.items():
+            if entry is None:
+                continue
+            read = partial(_version, entry)
             if entry.device.type == "cpu":
                 read = entry.detach().numpy().tobytes
             place = entry.data_ptr()
             self._entries.append((name, entry, place, entry.stride(), read, read()))
-
-    def _read_elsewhere(self) -> bytes:
-        """Return the bytes of all entries on a device other than the CPU, by one copy."""
-        if not self._elsewhere:
-            return b""
-        flat = [entry.detach().flatten() for entry in self._elsewhere]
-        return torch.cat(flat).cpu().numpy().tobytes()
 
     def holds(self, module: nn.Module, settings: tuple[object, ...]) -> bool:
         """Return whether the module still has the same entries, with the same numbers."""
@@ -130,11 +124,7 @@ class _Kept(Generic[Tensors]):
         for name in self._absent:
             if getattr(module, name) is not None:
                 return False
-        return (
-            settings == self.settings
-            and forward_ad._current_level < 0
-            and self._read_elsewhere() == self._content
-        )
+        return settings == self.settings and forward_ad._current_level < 0
 
     def keeps(self, values: Tensors) -> bool:
         """Keep a result; return whether it has memory, also after the transform it is made in."""
@@ -145,6 +135,11 @@ class _Kept(Generic[Tensors]):
         except RuntimeError:
             return False
         return True
+
+
+def _version(entry: Tensor) -> int:
+    """Return how often a tensor was written; raise a RuntimeError if nobody counts."""
+    return entry._version
 
 
 def _has_derivatives(entries: dict[str, Tensor | None]) -> bool:

@@ -84,7 +84,8 @@ def rotation_vector(R: Tensor) -> Tensor:
     trace = R.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
     skew = R - R.mT
     v_products = R + R.mT + (1.0 - trace) * identity(3, R)
-    wv_products = skew[..., [2, 0, 1], [1, 2, 0]][..., None]
+    wv = [skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]]
+    wv_products = torch.stack(wv, dim=-1)[..., None]
     w_row = torch.cat([1.0 + trace, wv_products.mT], dim=-1)
     v_rows = torch.cat([wv_products, v_products], dim=-1)
     products = torch.cat([w_row, v_rows], dim=-2)

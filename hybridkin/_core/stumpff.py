@@ -8,20 +8,23 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from hybridkin._core.constants import constant
+
 # [rad^2]; above it the trigonometric forms lose no digits by cancellation
 _SERIES_END = 1.0
 # Coefficients of c3 and c4 by powers of s, highest first; float32 needs fewer.
 _DEGREE = {torch.float64: 7, torch.float32: 4}
 _SERIES = {}  # of c_k and c_(k + 1)
 for _k in (3, 5):
-    _SERIES[_k] = []
+    _pairs = []
     for _j in range(7, -1, -1):
         _sign = (-1.0) ** _j
         _pair = (
             _sign / math.factorial(2 * _j + _k),
             _sign / math.factorial(2 * _j + _k + 1),
         )
-        _SERIES[_k].append(_pair)
+        _pairs.append(_pair)
+    _SERIES[_k] = tuple(_pairs)
 
 
 class Stumpff(NamedTuple):
@@ -82,9 +85,7 @@ def next_stumpff(s: Tensor, c3: Tensor, c4: Tensor) -> tuple[Tensor, Tensor]:
 def _power_series(s: Tensor, k: int) -> tuple[Tensor, ...]:
     """Return c_k and c_(k + 1) of s up to one radian, and beyond it those at one radian."""
     # Both together need one multiply-add per power, which is fast for small batches too.
-    # Not s.new_tensor: before torch 2.5 it fails in functional transforms.
-    series = _SERIES[k][-1 - _DEGREE.get(s.dtype, 7) :]
-    powers = torch.tensor(series, dtype=s.dtype, device=s.device)
+    powers = constant(_SERIES[k][-1 - _DEGREE.get(s.dtype, 7) :], s)
     powers = powers.reshape(-1, 2, *(1,) * s.ndim).unbind()
     near = s.clamp(max=_SERIES_END)
     both = powers[0]

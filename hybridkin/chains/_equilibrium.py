@@ -144,7 +144,8 @@ class _Live:
 
     def take(self, rows: Tensor) -> _Live:
         """Return some of the rows, a bool mask (N,)."""
-        return _Live(*(getattr(self, field.name)[rows] for field in fields(self)))
+        places = rows.nonzero()[:, 0]
+        return _Live(*(getattr(self, field.name)[places] for field in fields(self)))
 
 
 @dataclass

@@ -40,7 +40,7 @@ def carried_tip(u1: Tensor, u2: Tensor, motions: Tensor, end: Tensor, base: Tens
 
     Carrying one point from the last joint to the base is many times faster than `moving_frames`.
     """
-    point = end[:, None].expand(4, len(u1))
+    point = end[:, None].expand(4, u1.shape[0])
     joints = zip(motions.flatten(1, 2), u1.T, u2.T, strict=True)
     for motion, u1_of_joint, u2_of_joint in reversed([*joints]):
         point = _moved(motion, point, u1_of_joint, u2_of_joint)
@@ -59,7 +59,7 @@ def moving_frames(u1: Tensor, u2: Tensor, motions: Tensor, base: Tensor) -> Tens
 
     Each is given by its three axes and its origin.
     """
-    n_rows = len(u1)
+    n_rows = u1.shape[0]
     # With the three coordinates of all rows side by side, a joint costs one small product.
     frame = base[:3].T.repeat_interleave(n_rows, 1)
     u1 = u1.T.repeat(1, 3)

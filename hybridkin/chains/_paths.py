@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hybridkin._core.arrays import identity, one_of
+from hybridkin._core.constants import constant
 
-_MOST = 64  # structures that are remembered
 _DETERMINED = 1e-6  # smallest relative reading that determines a direction of bending
 
 
@@ -51,7 +48,7 @@ def reading_matrix(
     over the segments from `starts[k]` to its own, k. Columns are the lengths, then the x- and the
     y-bendings of all segments.
     """
-    spans = torch.from_numpy(_spans(tuple(counts), tuple(starts))).to(radii)
+    spans = constant(_spans(tuple(counts), tuple(starts)), radii)
     return torch.cat([spans, bend_matrix(radii, angles, counts, starts)], dim=-1)
 
 
@@ -59,29 +56,28 @@ def bend_matrix(
     radii: Tensor, angles: Tensor, counts: Sequence[int], starts: Sequence[int]
 ) -> Tensor:
     """Return the columns (..., n, 2 S) of the bendings of the `reading_matrix`."""
-    segment = torch.from_numpy(_segments(tuple(counts)))
-    radius = -radii.index_select(-1, segment.to(radii.device))
-    spans = torch.from_numpy(_spans(tuple(counts), tuple(starts))).to(radii)
+    segment = constant(_segments(tuple(counts)), radii, torch.long)
+    radius = -radii.index_select(-1, segment)
+    spans = constant(_spans(tuple(counts), tuple(starts)), radii)
     x = (radius * angles.cos())[..., None]
     y = (radius * angles.sin())[..., None]
     return torch.cat([x * spans, y * spans], dim=-1)
 
 
-@lru_cache(_MOST)
-def _segments(counts: tuple[int, ...]) -> NDArray[np.int64]:
+def _segments(counts: tuple[int, ...]) -> tuple[int, ...]:
     """Return the segment (n,) of every actuator."""
-    return np.repeat(np.arange(len(counts)), counts)
+    segments = [k for k, count in enumerate(counts) for _ in range(count)]
+    return tuple(segments)
 
 
-@lru_cache(_MOST)
-def _spans(counts: tuple[int, ...], starts: tuple[int, ...]) -> NDArray[np.float64]:
+def _spans(counts: tuple[int, ...], starts: tuple[int, ...]) -> tuple[tuple[float, ...], ...]:
     """Return which segments (n, S) every actuator runs through, as 0 and 1."""
-    spans = np.zeros((sum(counts), len(counts)))
-    row = 0
+    spans = []
     for k, count in enumerate(counts):
-        spans[row : row + count, starts[k] : k + 1] = 1.0
-        row += count
-    return spans
+        row = [0.0] * len(counts)
+        row[starts[k] : k + 1] = [1.0] * (k + 1 - starts[k])
+        spans += [tuple(row)] * count
+    return tuple(spans)
 
 
 def bend_readings(angles: Tensor, extensible: bool) -> Tensor:
@@ -131,8 +127,9 @@ def free_arcs(angles: Sequence[Tensor], extensible: Sequence[bool], bends: Seque
     the one in the plane of its actuators.
     """
     if 1 not in bends:
-        free = np.concatenate([extensible, np.tile(bends, 2) / 2])
-        return torch.from_numpy(np.diag(free)).to(angles[0])
+        components = [0.5 * n_bends for n_bends in bends]
+        free = (*map(float, extensible), *components, *components)
+        return torch.diag(constant(free, angles[0]))
     blocks = []  # (3, 3) for every segment: length, x- and y-bending
     for of_segment, stretches, n_bends in zip(angles, extensible, bends, strict=True):
         if n_bends == 1:

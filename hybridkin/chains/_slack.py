@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import torch
@@ -66,7 +66,7 @@ def responses_of(taut: Tensor, elasticity: Elasticity) -> Responses:
     # the inverse of the Hessian would lose digits of a soft backbone.
     by_q = pulling * gains
     constant = stiffness * rest - pulling @ zeros
-    unit_forces = identity(len(stiffness), readings).expand(len(taut), -1, -1)
+    unit_forces = identity(len(stiffness), readings).expand(taut.shape[0], -1, -1)
     forces = torch.cat([by_q, constant[..., None], unit_forces], dim=-1)
 
     # Solved in the units of the shape.
@@ -148,7 +148,7 @@ class Occurring:
     def __init__(self, elasticity: Elasticity) -> None:
         self._elasticity = elasticity
         self._n = len(elasticity.gains)
-        self._sets = torch.empty(0)
+        self._sets = elasticity.gains.new_full((1,), -1, dtype=torch.long)  # no set
         self._responses: Responses
 
     def of(self, codes: Tensor) -> tuple[Tensor, Responses]:
@@ -161,7 +161,7 @@ class Occurring:
 
     def guess(self, rows: Tensor) -> Tensor:
         """Return codes (N,) for the signs of the stretches with all tendons taut."""
-        all_taut = torch.tensor([2**self._n - 1], device=rows.device)
+        all_taut = rows.new_full((1,), 2**self._n - 1, dtype=torch.long)
         return _guess(self._maps_of(all_taut)[0], extended(rows))
 
     def find(self, rows: Tensor, guess: Tensor) -> Tensor:
@@ -177,6 +177,37 @@ class Occurring:
 
     def _sizes(self, codes: Tensor, x: Tensor) -> Tensor:
         return applied(self._maps_of(codes).abs(), x.abs())
+
+
+def taut_codes(rows: Tensor, *parts: Tensor) -> Tensor:
+    """Return codes (N,) of the taut tendons at rows (N, n), without derivatives.
+
+    `parts` are the stretches of all sets, for `find_in_table`, or the elasticity, for
+    `find_by_solving`.
+    """
+    fixed = [part.detach() for part in parts]
+    if torch.compiler.is_compiling():
+        return _taut_in_graph(rows.detach(), fixed)
+    return WithoutDerivative.apply(_found, rows.detach(), *fixed)
+
+
+def _found(rows: Tensor, *parts: Tensor) -> Tensor:
+    """Return codes (N,) of the taut tendons."""
+    find = find_in_table if len(parts) == 1 else find_by_solving
+    return find(rows, *parts)
+
+
+# One operation of a graph: the number of its steps depends on the numbers.
+@torch.library.custom_op(
+    "hybridkin::taut", mutates_args=(), schema="(Tensor rows, Tensor[] parts) -> Tensor"
+)
+def _taut_in_graph(rows: Tensor, parts: Sequence[Tensor]) -> Tensor:
+    return _found(rows, *parts)
+
+
+@_taut_in_graph.register_fake
+def _like_codes(rows: Tensor, parts: Sequence[Tensor]) -> Tensor:
+    return rows.new_empty(rows.shape[0], dtype=torch.long)
 
 
 _Stretches = Callable[[Tensor, Tensor], Tensor]

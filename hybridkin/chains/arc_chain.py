@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from hybridkin._core.actuators import ActuatorLayout
 from hybridkin._core.arrays import as_array, identity, whole
+from hybridkin._core.constants import constant
 from hybridkin._core.frames import Frames
 from hybridkin._core.plan import NoKernel, Plan
 from hybridkin._core.stored import Restore, Stored
@@ -145,7 +146,7 @@ class ArcChain(MarkedChain):
     @property
     def rigid_length(self) -> Tensor:
         """Upper bound of the length of rigid offsets and of the way to a marker, shape () [m]."""
-        beside = self.offsets.new_tensor(self.markers)[:, 1:]
+        beside = constant(self.markers, self.offsets)[:, 1:]
         return self.offsets.abs().sum() + beside.abs().sum()
 
     @property
@@ -157,9 +158,11 @@ class ArcChain(MarkedChain):
     @property
     def absolute(self) -> Tensor:
         """Which actuators (n,) have absolute lengths: those of extensible segments, bool."""
-        absolute = np.repeat(self.extensible, self.actuators_per_segment)
-        absolute[: self.n_stages] = False
-        return torch.from_numpy(absolute).to(self.radii.device)
+        absolute = []
+        for stretches, count in zip(self.extensible, self.actuators_per_segment, strict=True):
+            absolute += [stretches] * count
+        absolute[: self.n_stages] = [False] * self.n_stages
+        return constant(tuple(absolute), self.radii, torch.bool)
 
     @property
     def n_arcs(self) -> int:
@@ -730,10 +733,8 @@ class ArcChain(MarkedChain):
 
     def _beside(self, like: Tensor) -> Tensor:
         """Return the offsets (3, K, 1) of the markers from the backbone [m]."""
-        beside = [offset for _, *offset in self.markers]
-        # Not new_tensor: before torch 2.5 it fails in functional transforms.
-        offsets = torch.tensor(beside, dtype=like.dtype, device=like.device)
-        return offsets.mT[..., None]
+        beside = tuple(tuple(offset) for _, *offset in self.markers)
+        return constant(beside, like).mT[..., None]
 
     def _leading(self, arcs: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return lengths (..., S) and bending vectors (..., S, 2)."""

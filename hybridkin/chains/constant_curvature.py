@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from hybridkin._core.arrays import Numbers, Transform, as_array, identity
 from hybridkin._core.blocks import in_blocks
+from hybridkin._core.constants import constant
 from hybridkin._core.derived import derived
 from hybridkin._core.model import ForwardModel
 from hybridkin._core.plan import NoKernel, Plan
@@ -509,8 +510,9 @@ class ConstantCurvatureChain(LengthDrivenChain):
 
     def _placed(self, lengths: Tensor) -> Tensor:
         """Return lengths (..., S), 0 if extensible, from those of the other segments."""
+        fixed = tuple(k for k, stretches in enumerate(self.extensible) if not stretches)
         place = identity(self.n_segments, lengths)
-        return lengths @ place[np.logical_not(self.extensible)]
+        return lengths @ place.index_select(0, constant(fixed, lengths, torch.long))
 
     def _by_segment(self, q: Tensor) -> Tensor:
         """Return the RMS (..., S) of q (..., n) over the actuators of each segment."""

@@ -384,14 +384,12 @@ class ElasticTendonChain(ElasticBody, LengthDrivenChain):
             return self._found_once(*self._compiled, rows)
         if self.n_actuators <= _TABLE:
             table = self._all_responses(rows)
-            stretch = table.stretch.detach()
-            codes = _slack.WithoutDerivative.apply(_slack.find_in_table, rows.detach(), stretch)
+            codes = _slack.taut_codes(rows, table.stretch)
             return codes, codes, table
         elasticity = self._elasticity().to(rows)
-        fixed = (part.detach() for part in elasticity)
-        codes = _slack.WithoutDerivative.apply(_slack.find_by_solving, rows.detach(), *fixed)
+        codes = _slack.taut_codes(rows, *elasticity)
         taut = _slack.as_mask(codes, self.n_actuators)
-        places = torch.arange(len(codes), device=codes.device)
+        places = torch.arange(codes.shape[0], device=codes.device)
         return codes, places, _slack.responses_of(taut, elasticity)
 
     def _found_once(self, compiled: ElasticTendonChain, rows: Tensor) -> _Found:
@@ -430,7 +428,8 @@ class ElasticTendonChain(ElasticBody, LengthDrivenChain):
         changes, bendings = shape.split([self.n_segments, 2 * self.n_segments], dim=1)
         lengths = rest + changes
         is_short = lengths < HK_LEAST_LENGTH * rest
-        _slack.WithoutDerivative.apply(self._warn, rows.detach(), is_short)
+        if not torch.compiler.is_compiling():  # a graph has no warnings
+            _slack.WithoutDerivative.apply(self._warn, rows.detach(), is_short)
         lengths = torch.where(is_short, torch.nan, lengths)
         return torch.cat([lengths, bendings], dim=1).mT.contiguous()
 

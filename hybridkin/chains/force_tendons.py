@@ -13,6 +13,7 @@ from typing_extensions import Self
 
 from hybridkin._core.arrays import Numbers, Transform, whole
 from hybridkin._core.blocks import in_blocks
+from hybridkin._core.constants import constant
 from hybridkin._core.frames import Marker
 from hybridkin._core.model import is_at_rest
 from hybridkin._core.named_rows import first_row
@@ -361,7 +362,7 @@ class ForceTendonChain(ElasticBody):
         rest_x, rest_y = self.rest_bends.double()[..., None].expand(-1, -1, k).unbind(1)
         rest = torch.stack([length, rest_x / k, rest_y / k])
         readings = self._readings().to(base).unflatten(-1, (3, -1))
-        down = torch.tensor(self.gravity, dtype=base.dtype, device=base.device)
+        down = constant(tuple(self.gravity), base)
         return Statics(
             stiffness=torch.stack([axial, bending, bending]).flatten(),
             rest=rest.flatten(),

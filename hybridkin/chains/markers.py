@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from hybridkin._core.arrays import number
+from hybridkin._core.constants import constant
 from hybridkin._core.frames import Marker
 from hybridkin._core.model import ForwardModel
 from hybridkin.chains._checks import filled, place_on_body
@@ -189,12 +190,10 @@ class MarkedChain(Chain):
 
     def _reached(self, like: Tensor) -> Tensor:
         """Return the part (m, K) of the arc of every segment that lies before each marker."""
-        places = [at * self.arcs_per_segment for at, *_ in self.markers]
-        segments = [*range(math.ceil(max(places)))]
-        # Not new_tensor: before torch 2.5 it fails in functional transforms.
-        before = torch.tensor(segments, dtype=like.dtype, device=like.device)[:, None]
-        at = torch.tensor(places, dtype=like.dtype, device=like.device)
-        return (at - before).clamp(0.0, 1.0)
+        places = tuple(at * self.arcs_per_segment for at, *_ in self.markers)
+        segments = tuple(range(math.ceil(max(places))))
+        before = constant(segments, like)[:, None]
+        return (constant(places, like) - before).clamp(0.0, 1.0)
 
     def _marked(self, markers: Sequence[Marker]) -> Self:
         chain = self.with_geometry()  # shares the buffers

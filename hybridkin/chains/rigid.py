@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from hybridkin._core.arrays import Numbers, Transform
+from hybridkin._core.constants import constant
 from hybridkin._core.derived import derived
 from hybridkin._core.plan import NoKernel, Plan
 from hybridkin._core.stored import Layout, Restore, Stored
@@ -497,8 +498,8 @@ class RigidChain(Chain):
     @property
     def slides(self) -> Tensor:
         """Which joints (n_joints,) are prismatic, bool."""
-        slides = [kind == "prismatic" for kind in self.kinds]
-        return torch.tensor(slides, dtype=torch.bool, device=self.axes.device)
+        slides = tuple(kind == "prismatic" for kind in self.kinds)
+        return constant(slides, self.axes, torch.bool)
 
     @property
     def unit_axes(self) -> Tensor:
@@ -669,7 +670,10 @@ class RigidChain(Chain):
 
     def _strokes(self, largest: Tensor) -> Tensor:
         """Return the sum of the strokes of prismatic joints for ``|q| <= largest``."""
-        return (self.couplings[self.slides].abs() @ largest).sum()
+        sliding = tuple(k for k, kind in enumerate(self.kinds) if kind == "prismatic")
+        joints = constant(sliding, self.couplings, torch.long)
+        couplings = self.couplings.index_select(0, joints).to(largest)
+        return (couplings.abs() @ largest).sum()
 
     @property
     def turns(self) -> Tensor:

@@ -10,13 +10,14 @@ from torch import Tensor, nn
 
 from hybridkin._core.arrays import identity
 from hybridkin._core.blocks import in_blocks
+from hybridkin._core.chosen import chosen
 from hybridkin._core.directions import Directions, moved_directions
 from hybridkin._core.kernel_numbers import (
     HK_FULL,
     HK_GROUP,
     HK_LONGEST,
 )
-from hybridkin._core.model import ForwardModel, reverse_jacobian
+from hybridkin._core.model import ForwardModel
 from hybridkin._core.plan import Plan
 from hybridkin._core.portable import PortableModule
 from hybridkin._core.stored import Layout, Stored
@@ -68,15 +69,27 @@ class Guard(PortableModule):
         """Return the distance of q from the training rows, at most 1 in the domain, (...)."""
         raise NotImplementedError
 
+    def domain_distance_and_gradient(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the distances (N,) of rows q (N, n), and their derivatives (N, n)."""
+        raise NotImplementedError
+
     def forward(self, q: Tensor) -> Tensor:
         """Return g(q), shape (..., 1)."""
-        excess = (self.domain_distance(q) / self.FULL - 1.0).clamp(min=0.0)
-        # 0 where the distance overflows.
-        return (1.0 / (1.0 + excess**3)).nan_to_num()[..., None]
+        return self._weight(self.domain_distance(q))[0][..., None]
 
     def weight_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return g(q) (N, 1) and its derivative (N, 1, n) at rows q (N, n)."""
-        return reverse_jacobian(self, q)
+        distance, gradient = self.domain_distance_and_gradient(q)
+        weight, excess = self._weight(distance)
+        # NaN where the square overflows, as in the kernels: such rows are refused.
+        slope = (-3.0 / self.FULL) * excess.square() * weight.square()
+        return weight[:, None], (slope[:, None] * gradient)[:, None]
+
+    def _weight(self, distance: Tensor) -> tuple[Tensor, Tensor]:
+        """Return g at distances (...), and how far these exceed `FULL`, in parts of it."""
+        excess = (distance / self.FULL - 1.0).clamp(min=0.0)
+        # 0 where the distance overflows.
+        return (1.0 / (1.0 + excess**3)).nan_to_num(), excess
 
     def shortened(self, correction: Tensor) -> Tensor:
         """Return corrections (..., m); those longer than `largest` are shortened [m]."""
@@ -85,19 +98,20 @@ class Guard(PortableModule):
 
     def shortened_with_jacobian(self, correction: Tensor, J: Tensor) -> tuple[Tensor, Tensor]:
         """Return the `shortened` corrections (N, m), and their Jacobians (N, m, n)."""
-        long = self.is_long(correction).nonzero()[:, 0]
-        if not len(long):
+        long = chosen(self.is_long(correction), costly=False)
+        if long.is_empty:
             return correction, J
-        too_long = correction[long]
-        J_own = J[long]
+        too_long = long.take(correction)
+        J_own = long.take(J)
         relative = self._relative(too_long)
         remaining, slope = self._kept(relative)
         # Derivative along the correction: the slope; across it: the factor.
         factor = remaining / relative
-        along = (too_long / too_long.norm(dim=-1, keepdim=True))[..., None]
+        length = too_long.norm(dim=-1, keepdim=True).clamp(min=_shortest(correction))
+        along = (too_long / length)[..., None]
         change = (slope - factor)[..., None] * along @ (along.mT @ J_own)
         J_own = factor[..., None] * J_own + change
-        return correction.index_copy(0, long, factor * too_long), J.index_copy(0, long, J_own)
+        return long.put(correction, factor * too_long), long.put(J, J_own)
 
     def is_long(self, correction: Tensor) -> Tensor:
         """Return which corrections (..., m) are longer than `largest`, shape (...)."""
@@ -105,7 +119,7 @@ class Guard(PortableModule):
 
     def _relative(self, correction: Tensor) -> Tensor:
         # Lengths up to `largest` count as one. They are not shortened, and the root stays smooth.
-        unit = self.largest.to(correction).clamp(min=torch.finfo(correction.dtype).tiny ** 0.25)
+        unit = self.largest.to(correction).clamp(min=_shortest(correction))
         squares = (correction / unit).square().sum(-1, keepdim=True)
         return squares.clamp(min=1.0).sqrt()
 
@@ -114,6 +128,11 @@ class Guard(PortableModule):
         margin = self.MOST - 1.0
         bent = torch.tanh((relative - 1.0) / margin)
         return 1.0 + margin * bent, 1.0 - bent * bent
+
+
+def _shortest(like: Tensor) -> float:
+    """Return a length whose square, and the square of that, do not underflow."""
+    return torch.finfo(like.dtype).tiny ** 0.25
 
 
 def _write_leverage_guard(plan: Plan, stored: Stored) -> int:
@@ -209,6 +228,12 @@ class LeverageGuard(Guard):
         """Return the leverage of q divided by the limit, shape (...)."""
         return self.model.leverage(q) / self.limit.to(q)
 
+    def domain_distance_and_gradient(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the distances (N,) of rows q (N, n), and their derivatives (N, n)."""
+        leverage, gradient = self.model.leverage_and_gradient(q)
+        limit = self.limit.to(q)
+        return leverage / limit, gradient / limit
+
 
 def _rows_beside(q: Tensor) -> Tensor:
     """Return rows of the log q (N, n), and rows beside them in random directions."""
@@ -279,10 +304,25 @@ class QuadraticLeverage(LeverageModule):
     def leverage(self, q: Tensor) -> Tensor:
         """Return phi^T (Phi^T Phi + alpha 1)^-1 phi, shape (...)."""
         phi = self(q)
-        upper = self.factor.to(q).mT
         # One solve for all rows, not one for each.
-        white = torch.linalg.solve_triangular(upper, torch.atleast_2d(phi), upper=True, left=False)
+        white = self._white(torch.atleast_2d(phi))
         return white.square().sum(-1).view(phi.shape[:-1])
+
+    def leverage_and_gradient(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the leverage (N,) of rows q (N, n), and its derivative (N, n)."""
+        half_width = self.half_width.to(q)
+        phi = self(q)
+        white = self._white(phi)
+        lower = self.factor.to(q)
+        by_phi = 2.0 * torch.linalg.solve_triangular(lower, white, upper=False, left=False)
+        _, u, _ = phi.tensor_split([1, 1 + len(half_width)], dim=1)
+        _, by_u, by_square = by_phi.tensor_split([1, 1 + len(half_width)], dim=1)
+        return white.square().sum(1), (by_u + 2.0 * u * by_square) / half_width
+
+    def _white(self, phi: Tensor) -> Tensor:
+        """Return L^-1 phi of rows phi (N, 2 n + 1)."""
+        upper = self.factor.to(phi).mT
+        return torch.linalg.solve_triangular(upper, phi, upper=True, left=False)
 
 
 def fit_guard(

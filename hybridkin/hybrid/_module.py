@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
 from typing import NamedTuple, cast
 
 import torch
@@ -12,6 +11,7 @@ from typing_extensions import Self
 
 from hybridkin._core.actuation import DIRECT, Actuation
 from hybridkin._core.blocks import in_blocks
+from hybridkin._core.chosen import chosen
 from hybridkin._core.model import ForwardModel
 from hybridkin._core.plan import CHAINS, NoKernel, Plan
 from hybridkin._core.planes import PlaneOfQ
@@ -29,17 +29,24 @@ class Inside:
     def __init__(self, mechanical: ForwardModel, q: Tensor) -> None:
         self.mechanical = mechanical
         self.z, self.slope = mechanical.coordinates(q)
+        # Computed once for all corrections. Not by cached_property, which torch cannot compile.
+        self._x: Tensor | None = None
+        self._x_and_jacobian: tuple[Tensor, Tensor] | None = None
 
-    @cached_property
+    @property
     def x(self) -> Tensor:
         """The tip f(q) = F(z), (N, m)."""
-        return self.mechanical.from_coordinates(self.z)
+        if self._x is None:
+            self._x = self.mechanical.from_coordinates(self.z)
+        return self._x
 
-    @cached_property
+    @property
     def x_and_jacobian(self) -> tuple[Tensor, Tensor]:
         """The tip f(q) (N, m), and df/dq (N, m, n)."""
-        x, slope = self.mechanical.from_coordinates_and_jacobian(self.z)
-        return x, slope @ self.slope
+        if self._x_and_jacobian is None:
+            x, slope = self.mechanical.from_coordinates_and_jacobian(self.z)
+            self._x_and_jacobian = x, slope @ self.slope
+        return self._x_and_jacobian
 
 
 class Fading(NamedTuple):
@@ -52,12 +59,13 @@ class Fading(NamedTuple):
     def of(cls, guard: Guard, q: Tensor, distance: Tensor) -> Self | None:
         """Return the fading at rows q (N, n) at this distance (N,), None if all weights are 1."""
         fades = ~(distance <= guard.FULL)  # written so that NaN is included
-        rows = fades.nonzero()[:, 0]
-        if not len(rows):
+        # Few rows fade, and their leverage takes as long as all of the rest.
+        fading = chosen(fades, costly=True)
+        if fading.is_empty:
             return None
-        weight, slope = guard.weight_and_jacobian(q[rows])
-        weights = q.new_ones(len(q), 1).index_copy(0, rows, weight)
-        slopes = q.new_zeros(len(q), 1, q.shape[1]).index_copy(0, rows, slope)
+        weight, slope = guard.weight_and_jacobian(fading.take(q))
+        weights = fading.put(q.new_ones(q.shape[0], 1), weight)
+        slopes = fading.put(q.new_zeros(q.shape[0], 1, q.shape[1]), slope)
         return cls(weights, slopes)
 
     def times(self, x: Tensor, J: Tensor) -> tuple[Tensor, Tensor]:
@@ -417,8 +425,8 @@ class HybridModule(Hybrid):
         """
         if inside is None:
             inside = self._inside(q)
-        trust = q.new_ones(len(q), 1)
-        total = q.new_zeros(len(q), 1)
+        trust = q.new_ones(q.shape[0], 1)
+        total = q.new_zeros(q.shape[0], 1)
         for weight, correction in self._parts(q):
             value = correction.value(q, inside)
             guard = correction.guard
@@ -434,7 +442,7 @@ class HybridModule(Hybrid):
     def _distance(self, q: Tensor) -> Tensor:
         """Return the largest distance of any guard, and of the groups, at rows q, (N, 1)."""
         guards = [correction.guard for correction in self._corrections]
-        farthest = q.new_zeros(len(q))
+        farthest = q.new_zeros(q.shape[0])
         for measure in (*guards, self.tested):
             if measure is not None:
                 farthest = torch.maximum(farthest, measure.domain_distance(q))

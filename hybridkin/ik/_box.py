@@ -94,9 +94,9 @@ def box_limited_step(problem: BoxProblem, mu: Tensor | None = None) -> tuple[Ten
 
         # Go on with the rows that are not solved up to rounding.
         unsolved = (residual.abs() > noise * size).any(-1)
-        going = unsolved & ~settled
-        if not going.all():
-            left = going.nonzero()[:, 0]
+        # One question for each iteration: a device waits for the answer.
+        left = (unsolved & ~settled).nonzero()[:, 0]
+        if len(left) < len(rows):
             live = live.take(left)
             rows = rows[left]
             mu = mu[left]

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from hybridkin._core.arrays import as_array, number, whole
+from hybridkin._core.constants import moved
 from hybridkin._core.kernel_numbers import (
     IK_BENT_WAY,
     IK_INSIDE_OBSTACLE,
@@ -115,8 +116,8 @@ class KeptClear(Portable):
         The pairs of every point and every obstacle of a scene come first, then the pairs of points.
         The gap is infinite where no configuration makes it positive: the robot is mounted there.
         """
-        scene = scene.to(x)
-        keep = self.keep.to(x)[:, None]
+        scene = moved(scene, x)
+        keep = moved(self.keep, x)[:, None]
         distance, normal = distances(x, scene)
         free = torch.where(self._is_never_free(scene), math.inf, distance - keep).flatten(1)
         first, second = self.meeting.to(x.device)
@@ -129,17 +130,17 @@ class KeptClear(Portable):
 
     def _is_never_free(self, scene: Tensor) -> Tensor:
         """Return which points (P, K) no configuration frees: the robot is mounted there."""
-        at_base, _ = distances(self.base.to(scene), scene)
-        return self.keep.to(scene)[:, None] > at_base + self.along.to(scene)[:, None]
+        at_base, _ = distances(moved(self.base, scene), scene)
+        return moved(self.keep, scene)[:, None] > at_base + moved(self.along, scene)[:, None]
 
     def distances(self, q: Tensor, scene: Tensor) -> Tensor:
         """Return the distances (N, K) of the body at q (N, n) to every obstacle of a scene [m].
 
         Those of points that are never free do not count.
         """
-        scene = scene.to(q)
+        scene = moved(scene, q)
         distance, _ = distances(self.points(q), scene)
-        distance = distance - self.radii.to(q)[:, None]
+        distance = distance - moved(self.radii, q)[:, None]
         return torch.where(self._is_never_free(scene), math.inf, distance).amin(1)
 
     def relative(self, rows: Tensor, n_obstacles: int) -> Tensor:
@@ -183,6 +184,8 @@ class KeptClear(Portable):
 
         Rows that cannot be free stay in them.
         """
+        if not self:
+            return q
         for _ in range(_AROUND):
             inside = self.smallest(q, self.scene) < 0.0
             rows = inside.nonzero()[:, 0]

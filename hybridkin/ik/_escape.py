@@ -7,6 +7,7 @@ import math
 import torch
 from torch import Tensor
 
+from hybridkin._core.constants import moved
 from hybridkin._core.kernel_numbers import (
     IK_BENDS,
     IK_BENDS_MOST,
@@ -46,7 +47,7 @@ def way_out(
         Their bounds.
     """
     n = q.shape[1]
-    spans = settings.spans.to(q).expand(n)
+    spans = moved(settings.spans, q).expand(n)
     spans = torch.where(torch.isfinite(spans), spans, 1.0)
     # Open is what the bounds allow, and what does not raise the error to first order.
     slope = apply_columns(J, e)

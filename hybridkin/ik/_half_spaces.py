@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from hybridkin._core.arrays import Numbers, Transform, as_tensor
+from hybridkin._core.constants import moved
 from hybridkin._core.portable import Portable
 from hybridkin.ik._nearest import Polyhedron, nearest
 from hybridkin.ik.tasks import PositionTask, Task
@@ -33,18 +34,18 @@ class HalfSpaces(Portable):
 
     def margin(self, x: Tensor) -> Tensor:
         """Return the distances (N, k) of points (N, m) to the planes, negative outside."""
-        return self.offsets.to(x) - self.along(x)
+        return moved(self.offsets, x) - self.along(x)
 
     def along(self, way: Tensor) -> Tensor:
         """Return the components (N, k) of displacements (N, m) along the normals."""
-        return way @ self.normals.to(way).T
+        return way @ moved(self.normals, way).T
 
     def way_in(self, margin: Tensor) -> Tensor:
         """Return the shortest displacements (N, m) with along(way) <= margin.
 
         Planes that contradict the ones before them are moved as far as these need.
         """
-        normals = self.normals.to(margin).expand(len(margin), -1, -1)
+        normals = moved(self.normals, margin).expand(len(margin), -1, -1)
         still = torch.zeros_like(normals[:, 0])
         infinite = torch.full_like(still, math.inf)
         none = still.new_empty(len(still), 0)

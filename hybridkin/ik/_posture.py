@@ -8,6 +8,7 @@ from typing import TypeAlias
 import torch
 from torch import Tensor
 
+from hybridkin._core.constants import moved
 from hybridkin._core.portable import Portable
 
 Function: TypeAlias = Callable[[Tensor], Tensor]
@@ -53,7 +54,7 @@ class FixedPosture(NoPosture):
 
     def at(self, q: Tensor) -> Tensor:
         """Return the configuration."""
-        return self._q.to(q)
+        return moved(self._q, q)
 
     def start(self, middle: Tensor) -> Tensor:
         """Return the configuration."""

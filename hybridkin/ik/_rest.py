@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from typing_extensions import Self
 
+from hybridkin._core.constants import moved
 from hybridkin._core.kernel_numbers import (
     IK_CURVED,
     IK_EASED,
@@ -112,7 +113,7 @@ class Rest(NamedTuple):
 
         They promised motions of the tip (N, m).
         """
-        span = settings.spans.to(dq)
+        span = moved(settings.spans, dq)
         span = torch.where(torch.isfinite(span), span, 1.0)
         way_sq = _squared(dq / settings.unit(dq))
         share = (dq.abs() / span).amax(-1)

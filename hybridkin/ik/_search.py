@@ -10,6 +10,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
+from hybridkin._core.constants import moved
 from hybridkin._core.kernel_numbers import (
     IK_INSIDE,
     IK_INSIDE_OBSTACLE,
@@ -59,13 +60,20 @@ class Point:
         return self.e.norm(dim=-1)
 
     def take(self: RowsT, rows: Tensor) -> RowsT:
-        """Return some rows."""
+        """Return some rows, by their places."""
         return type(self)(*(a[rows] for a in vars(self).values()))
 
     def put(self, rows: Tensor, other: Point) -> None:
-        """Overwrite some rows, in place, in the fields that both have."""
+        """Overwrite some rows, by their places, in the fields that both have."""
         for name in vars(self).keys() & vars(other).keys():
             vars(self)[name][rows] = vars(other)[name]
+
+    def replace(self, better: Tensor, other: Point) -> None:
+        """Take rows of another one where these are better, in the fields that both have."""
+        for name in vars(self).keys() & vars(other).keys():
+            present = vars(self)[name]
+            mask = better.reshape(-1, *[1] * (present.ndim - 1))
+            vars(self)[name] = torch.where(mask, vars(other)[name], present)
 
 
 @dataclass
@@ -115,7 +123,8 @@ class Search:
             q = self._beside_singular_start(q, target)
         best = self._attempt(q, target)
         missed = (~best.reached).nonzero()[:, 0]
-        rows = missed[row_gram(best.J[missed], settings.task.n_free).is_singular]
+        singular = row_gram(best.J[missed], settings.task.n_free).is_singular
+        rows = missed[singular.nonzero()[:, 0]]
         nudged = self._nudged(best)[rows]
         self._try_again(best, rows, nudged[:, None])
         if restarts > 0:
@@ -150,7 +159,7 @@ class Search:
             target = best.target[rows]
             starts = nearest_starts(self.settings, q[rows], size, target, restarts)
             for part in starts.tensor_split(_PARTS, dim=1):
-                still_open = self._cost(best)[rows] > _DONE
+                still_open = (self._cost(best)[rows] > _DONE).nonzero()[:, 0]
                 self._try_again(best, rows[still_open], part[still_open])
 
     def _return_inside(self, best: Found) -> None:
@@ -186,7 +195,7 @@ class Search:
             self._turn_towards(ends, near)
 
             # The reached ends of every row that differ, the nearest first.
-            way = (ends.q - near) / self.settings.spans.to(near)
+            way = (ends.q - near) / moved(self.settings.spans, near)
             distance = way.norm(dim=-1)
             distance[fine._cost(ends) != _DONE] = torch.inf
             for k, row in enumerate(rows.tolist()):
@@ -211,7 +220,7 @@ class Search:
             picks.append(pick)
             apart = q - q[pick]
             apart = apart - self.settings.whole_turns(apart)
-            relative = (apart / self.settings.spans.to(q)).abs()
+            relative = (apart / moved(self.settings.spans, q)).abs()
             same = relative.amax(-1) <= _SAME
             distance = torch.where(same, torch.inf, distance)
         return torch.tensor(picks, dtype=torch.long, device=q.device)
@@ -260,7 +269,8 @@ class Search:
         ends.n_iter = best.n_iter[rows]
         ends.n_starts = best.n_starts[rows]
         better = self._cost(ends) < self._cost(best)[rows]
-        best.put(rows[better], ends.take(better))
+        ends.replace(~better, best.take(rows))
+        best.put(rows, ends)
 
     def _cost(self, ends: Found) -> Tensor:
         """Return the error, or -1 for rows reached outside the domain, -2 for inside.
@@ -299,7 +309,9 @@ class Search:
         rows = torch.arange(len(q), device=q.device)
         damping = torch.full_like(state.error, _FIRST_DAMPING)
         none = torch.zeros_like(damping)
-        live = _Descent(**vars(state), start=state.error, nu=damping, growth=2.0 + none, slow=none)
+        live = _Descent(
+            **vars(state.take(rows)), start=state.error, nu=damping, growth=2.0 + none, slow=none
+        )
         for iteration in range(self.max_iter + 1):
             live.reached = self._reached(live)
             live.stationary = (
@@ -307,10 +319,12 @@ class Search:
             )
             live.n_iter = torch.full_like(live.n_iter, iteration)
             going = ~live.reached & ~live.stationary & (iteration < self.max_iter)
-            if not going.all():
-                state.put(rows[~going], live.take(~going))
-                rows = rows[going]
-                live = live.take(going)
+            # One question for each iteration: a device waits for the answer.
+            left = going.nonzero()[:, 0]
+            if len(left) < len(rows):
+                state.put(rows, live)
+                rows = rows[left]
+                live = live.take(left)
             if rows.numel() == 0:
                 break
             self._lower_once(live)
@@ -325,7 +339,7 @@ class Search:
         size = (live.J * settings.unit(live.J)).flatten(1).square().sum(-1)
         # A turning joint may pass its limit and continue at the other one.
         lower, upper = settings.step_bounds(live.q)
-        half_turn = 0.5 * settings.periods.to(live.q)
+        half_turn = 0.5 * moved(settings.periods, live.q)
         stays = torch.isinf(half_turn)
         lower = lower.where(stays, -half_turn)
         upper = upper.where(stays, half_turn)
@@ -348,7 +362,7 @@ class Search:
         little = better & (error - error_new < IK_SLOW * metres)
         live.slow = torch.where(little, live.slow + 1.0, 0.0)
         live.held = step.saturated.any(-1)
-        live.put(better, new.take(better))
+        live.replace(better, new)
 
     def _within(self, e: Tensor) -> Tensor:
         return self.settings.task.reached(e, self.tol)
@@ -388,7 +402,7 @@ class Search:
         pull = apply_columns(at.J, at.e)
         above = (at.q >= upper) & (pull > 0.0)
         below = (at.q <= lower) & (pull < 0.0)
-        turns = torch.isfinite(self.settings.periods.to(at.q.device))
+        turns = torch.isfinite(moved(self.settings.periods, at.q))
         held = (above | below) & ~turns
         free_pull = torch.where(held, 0.0, pull).norm(dim=-1)
         return free_pull <= IK_STATIONARY * at.J.flatten(1).norm(dim=-1) * at.error
@@ -453,7 +467,8 @@ class Search:
             stays_inside &= self._stays_free(live.q, new.q)
             taken = ((small & (gain > 0.0)) | corrects | last) & stays_inside
             recorded = taken & reached_new
-            ends.put(rows[recorded], point.take(recorded))
+            point.replace(~recorded, ends.take(rows))
+            ends.put(rows, point)
             ends.n_iter[rows] += 1
 
             # Go on while it is worth it, or with shorter steps.
@@ -468,16 +483,18 @@ class Search:
             fraction = torch.where(curvature > 0.0, newton, 2.0 * live.fraction)
             new.fraction = fraction.clamp(0.1, 4.0)
             live.fraction = 0.25 * live.fraction
-            live.put(taken, new.take(taken))
-            rows = rows[going]
-            live = live.take(going)
+            live.replace(taken, new)
+            left = going.nonzero()[:, 0]
+            rows = rows[left]
+            live = live.take(left)
             if rows.numel() == 0:
                 break
         # A step of the free actuators removes what is left of the error.
         best = ends.take(all_rows)
         corrected = self._after_step(best, torch.zeros_like(best.q), hold=True)
         better = (corrected.error < best.error) & self._reached(corrected)
-        ends.put(all_rows[better], corrected.take(better))
+        best.replace(better, corrected)
+        ends.put(all_rows, best)
 
     def _slide(self, at: Point, wanted: Callable[[Tensor], Tensor], fraction: Tensor) -> _Slide:
         wish = wanted(at.q)

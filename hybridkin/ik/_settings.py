@@ -21,6 +21,7 @@ from hybridkin._core.arrays import (
     countable,
     real_array,
 )
+from hybridkin._core.constants import moved
 from hybridkin._core.kernel_numbers import (
     IK_ACCELERATES,
     IK_AXIS,
@@ -109,9 +110,10 @@ class StepSettings(Portable):
 
     Limits and weights are float64 tensors of shape () or (n,). `posture` is `q_pref`, by default
     the middle of the limits if they are finite. `of_model` names the limits taken from the
-    model. `periods`, shape () or (n,), are the periods of q: a turn for an angle with a range of a
-    whole turn, else inf. `pulls` is that of the robot, see `ForwardModel`. `n_actuators` is None if
-    neither settings nor model define it.
+    model. `middle` is that of the limits, not finite where they are not. `periods`, shape () or
+    (n,), are the periods of q: a turn for an angle with a range of a whole turn, else inf. `spans`
+    are the ranges of q, at most its periods. `pulls` is that of the robot, see `ForwardModel`.
+    `n_actuators` is None if neither settings nor model define it.
     """
 
     task: Task
@@ -134,7 +136,9 @@ class StepSettings(Portable):
     body_points: BodyPoints
     posture: NoPosture = field(init=False)
     clear: KeptClear = field(init=False)
+    middle: Tensor = field(init=False)
     periods: Tensor = field(init=False)
+    spans: Tensor = field(init=False)
     pulls: Tensor = field(init=False)
     n_actuators: int | None = field(init=False)
     farthest: float = field(init=False)
@@ -172,10 +176,12 @@ class StepSettings(Portable):
         turns = torch.as_tensor(model.turns, device="cpu") & (self.limits != "off")
         full = self.q_max - self.q_min >= _FULL * _TURN
         periods = torch.where(turns & full, self.q_max.new_tensor(_TURN), math.inf)
+        vars(self).update(middle=0.5 * (self.q_min + self.q_max))
         vars(self).update(
             posture=self._posture(),
             clear=self._clear(),
             periods=periods,
+            spans=torch.minimum(self.q_max - self.q_min, periods),
             pulls=bound(model.robot.pulls, "pulls"),
             n_actuators=next(iter(sizes), None),
             farthest=model.robot.farthest,
@@ -282,23 +288,13 @@ class StepSettings(Portable):
         return self.task.misses(target, largest)
 
     @property
-    def middle(self) -> Tensor:
-        """The middle of the limits; not finite where they are not."""
-        return 0.5 * (self.q_min + self.q_max)
-
-    @property
     def accelerates(self) -> bool:
         """Whether there is a limit of acceleration."""
         return self.limits != "off" and bool(torch.isfinite(self.ddq_max).any())
 
-    @property
-    def spans(self) -> Tensor:
-        """The ranges of q, shape () or (n,), at most its periods."""
-        return torch.minimum(self.q_max - self.q_min, self.periods)
-
     def whole_turns(self, dq: Tensor) -> Tensor:
         """Return the whole turns nearest to dq (..., n)."""
-        periods = self.periods.to(dq)
+        periods = moved(self.periods, dq)
         turns = periods * (dq / periods).round()
         return torch.where(torch.isfinite(periods), turns, 0.0)
 
@@ -409,7 +405,7 @@ class StepSettings(Portable):
     def start(self, like: Tensor) -> Tensor:
         """Return the preferred configuration (n,); if it is a function, evaluate it mid-range."""
         n = self.n_actuators
-        middle = self.middle.to(like)
+        middle = moved(self.middle, like)
         if n is not None:
             middle = middle.expand(n)
         start = self.posture.start(middle).to(like)
@@ -432,7 +428,7 @@ class StepSettings(Portable):
 
     def unit(self, q: Tensor) -> Tensor:
         """Return the units of q, shape () or (n,), in which all weights are 1."""
-        return self.weights.to(q).rsqrt()
+        return moved(self.weights, q).rsqrt()
 
     # Limits of q and of its steps.
 
@@ -440,7 +436,7 @@ class StepSettings(Portable):
         """Return the limits of q."""
         if self.limits == "off":
             return Bounds(q.new_tensor(-math.inf), q.new_tensor(math.inf))
-        return Bounds(self.q_min.to(q), self.q_max.to(q))
+        return Bounds(moved(self.q_min, q), moved(self.q_max, q))
 
     def inside(self, q: Tensor) -> Tensor:
         """Return q moved into the limits: by whole turns if q is periodic, then clipped."""
@@ -462,7 +458,7 @@ class StepSettings(Portable):
         limits = self.tip_limits
         if limits.n > 0:
             x = x + limits.way_in(limits.margin(x))
-        if self.is_in_obstacle(x).any():
+        if self.clear and self.is_in_obstacle(x).any():
             x = self.clear.freed_tip(x)
         return x
 
@@ -474,7 +470,7 @@ class StepSettings(Portable):
 
     def change(self, q: Tensor, period: float) -> Tensor:
         """Return the largest difference between consecutive steps."""
-        return self.ddq_max.to(q) * period**2
+        return moved(self.ddq_max, q) * period**2
 
     def step_bounds(
         self, q: Tensor, period: float | None = None, last: Tensor | float = 0.0
@@ -499,7 +495,7 @@ class StepSettings(Portable):
         lower = torch.where(q + lower < q_min, one_more, lower)
         if self.limits == "off" or period is None:
             return Bounds(lower, upper)
-        fastest = self.dq_max.to(q) * period
+        fastest = moved(self.dq_max, q) * period
         speed = Bounds(-fastest, fastest)
         if self.accelerates:
             change = self.change(q, period)
@@ -511,7 +507,9 @@ class StepSettings(Portable):
 
     def margin(self, q: Tensor) -> Tensor:
         """Return the smallest distance of an actuator to its limits."""
-        return torch.minimum(q - self.q_min.to(q), self.q_max.to(q) - q).amin(-1)
+        low = moved(self.q_min, q)
+        high = moved(self.q_max, q)
+        return torch.minimum(q - low, high - q).amin(-1)
 
     # Conversion of a caller's arrays to tensors.
 

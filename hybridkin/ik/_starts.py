@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from hybridkin._core.constants import moved
 from hybridkin.ik._settings import StepSettings
 
 _SHARED = 2048  # configurations within the limits, the same for every row
@@ -66,10 +67,10 @@ def even_starts(settings: StepSettings, q: Tensor, size: Tensor, count: int) -> 
     If an actuator has no limits they fill a range around q (N, n): (N, count, n).
     """
     n = q.shape[-1]
-    low = settings.q_min.to(q).expand(1, n)
-    high = settings.q_max.to(q).expand(1, n)
+    low = moved(settings.q_min, q).expand(1, n)
+    high = moved(settings.q_max, q).expand(1, n)
     if not torch.isfinite(high - low).all():
-        reach = torch.minimum(size[:, None], 0.5 * settings.periods.to(q))
+        reach = torch.minimum(size[:, None], 0.5 * moved(settings.periods, q))
         below = torch.minimum(q, high) - reach
         above = torch.maximum(q, low) + reach
         low = torch.where(torch.isfinite(low), low, below)

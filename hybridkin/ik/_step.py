@@ -11,6 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from hybridkin._core.constants import moved
 from hybridkin._core.kernel_numbers import (
     IK_AROUND,
     IK_BALANCE,
@@ -166,10 +167,10 @@ def control_step(
     if spaces.n > 0:
         margin = spaces.margin(torch.where(fine, tip, 0.0))
         if settings.accelerates:
-            normals = spaces.normals.to(J)[:, None].expand(-1, len(J), -1)
+            normals = moved(spaces.normals, J)[:, None].expand(-1, len(J), -1)
             brakes = [_braking(law, J, normal, change) for normal in normals]
             margin = stopping(margin, torch.stack(brakes, dim=-1))
-        limits = limits.with_rows(spaces.normals.to(J) @ J, margin)
+        limits = limits.with_rows(moved(spaces.normals, J) @ J, margin)
         left = margin - spaces.along(v)
         rounding = 32.0 * torch.finfo(v.dtype).eps  # of a motion [m]
         stopped = (left < -rounding).any(-1)
@@ -458,7 +459,7 @@ def _only_taut(settings: StepSettings, J: Tensor) -> Tensor:
     """
     size = J.norm(dim=-2, keepdim=True)
     small = size <= IK_SLACK * size.amax(-1, keepdim=True)
-    return torch.where(small & (settings.pulls.to(J) != 0.0), 0.0, J)
+    return torch.where(small & (moved(settings.pulls, J) != 0.0), 0.0, J)
 
 
 class _End(NamedTuple):
@@ -546,7 +547,7 @@ def _arriving(
 
     # Pull in the slack tendons of weak steps: the whole way to their bound, then less. None of them
     # is let out: else they could be let out where they began.
-    pulls = settings.pulls.to(q)
+    pulls = moved(settings.pulls, q)
     to = torch.where(pulls < 0.0, *bounds)
     slack = (end.J == 0.0).all(-2) & (pulls != 0.0) & torch.isfinite(to)
     to = torch.where(slack, to, end.dq)

@@ -304,7 +304,7 @@ class InverseKinematics:
         q_rows = settings.configurations(q, "q")
         too_long = q_rows.norm(dim=-1) > settings.longest_usual
         too_far = torch.as_tensor(step.error, device=q_rows.device) > settings.farthest
-        if too_long.any() or too_far.any():
+        if too_long.any() | too_far.any():
             self._warn_of_units(q, x_target, x_measured)
         return step
 

@@ -52,8 +52,9 @@ def gather(stats, elm, X, y, sample_weight, block_size):
         block = z[:-1]
         elm.write_features(q, block[:, :n_features])
         block[:, n_features:] = copied(y[rows], device)
-        w = copied(sample_weight[rows], device)
-        n_block = w.sum().item()
+        weights = copied(sample_weight[rows], "cpu")
+        n_block = weights.sum().item()
+        w = weights.to(device)
         mean_block = (w @ block) / n_block
         block -= mean_block
         block *= w.sqrt()[:, None]

@@ -134,6 +134,10 @@ class LeverageModule(ForwardModel):
         """Return the leverage of `q`, shape (...): smooth, at most 1 on the training rows."""
         raise NotImplementedError
 
+    def leverage_and_gradient(self, q):
+        """Return the leverage (N,) of rows `q` (N, n_inputs), and its derivative (N, n_inputs)."""
+        raise NotImplementedError
+
     def forward_jacobian_and_leverage(self, q):
         """Return ``forward(q)``, ``jacobian(q)`` and ``leverage(q)``."""
         return *self.forward_and_jacobian(q), self.leverage(q)
@@ -299,6 +303,26 @@ class ELM(LeverageModule):
     def leverage(self, q):
         """Return the leverage of `q`, shape (...): smooth, at most 1 on the training rows."""
         return self._leverage(self.features(q))
+
+    def leverage_and_gradient(self, q):
+        """Return the leverage (N,) of rows `q` (N, n_inputs), and its derivative (N, n_inputs)."""
+
+        def rows(u, a, s):
+            phi = self._features(u, s)
+            v = phi - self.leverage_center.to(phi)
+            factor = self.leverage_factor.to(phi)
+            by_squares = 2.0 * (v @ factor) @ factor.T
+            prior = self.leverage_prior.to(phi)
+            by_phi = torch.where(prior > 0.0, 2.0 * prior * v - by_squares, by_squares)
+            slope = ACTIVATIONS[self.activation][1](a, s)
+            by_hidden, by_direct = by_phi.tensor_split([s.shape[-1]], dim=-1)
+            by_u = (by_hidden * slope) @ self.input_weights.to(s)
+            if by_direct.shape[-1] > 0:
+                by_u = by_u + by_direct
+            return self._leverage(phi)[..., None], by_u / self.input_scale.to(s)
+
+        leverage, gradient = self._in_blocks(q, rows)
+        return leverage[..., 0], gradient
 
     def _leverage(self, phi):
         v = phi - self.leverage_center.to(phi)

@@ -4,7 +4,7 @@ import torch
 from scipy.optimize import lsq_linear
 from torch.testing import assert_close
 
-from hybridkin import ConstantCurvatureChain, ForwardModel
+from hybridkin import ConstantCurvatureChain, ForwardModel, RigidChain
 from hybridkin.ik._gram import (
     apply_columns,
     apply_rows,
@@ -304,6 +304,21 @@ def test_numpy_and_torch_come_back_as_they_went_in(rng, dtype):
             if tensor.is_floating_point():
                 assert array.dtype == dtype
     assert ik.solve(target.tolist()).q.dtype == np.float64
+
+
+def test_float32_solves_an_arm():
+    origins = np.stack([np.eye(4)] * 3)
+    origins[:, 0, 3] = 0.2
+    axes = [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]
+    kinds = ["revolute", "revolute", "prismatic"]
+    limits = {"q_min": [-1.0, -1.0, 0.0], "q_max": [1.0, 1.0, 0.1]}
+    arm = RigidChain(origins, axes, kinds=kinds, **limits).float()
+    q = torch.tensor([[0.3, -0.4, 0.05], [-0.7, 0.5, 0.01]])
+    solution = InverseKinematics(arm).solve(arm(q))
+    assert solution.q.dtype == torch.float32
+    assert_close(arm(solution.q), arm(q), rtol=0.0, atol=1e-4)
+    far = InverseKinematics(arm).solve(arm(q) + 2.0, max_iter=5)
+    assert (far.status == IKStatus.UNREACHABLE).all()
 
 
 def test_float32_solves_to_a_tenth_of_a_millimetre(rng):
