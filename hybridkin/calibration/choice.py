@@ -160,7 +160,7 @@ class GeometryChoice:
             return self.chain
         q = as_tensor(q, "q")
         x = as_tensor(x, "x")
-        weights = torch.ones(len(q)).to(q)
+        weights = q.new_ones(len(q))
         return refitted(self.started(q, x, weights).start, q, x, weights, loss)
 
 
