@@ -381,7 +381,7 @@ class ElasticTendonChain(ElasticBody, LengthDrivenChain):
     def _find(self, rows: Tensor) -> _Found:
         """Return the sets of taut tendons (N,) as bits, their places in responses, and those."""
         if self._compiled:
-            return self._found_once(*self._compiled, rows)
+            return self._found_once(self._compiled[0], rows)
         if self.n_actuators <= _TABLE:
             table = self._all_responses(rows)
             codes = _slack.taut_codes(rows, table.stretch)
