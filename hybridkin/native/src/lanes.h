@@ -28,7 +28,7 @@
 #else
 #define HK_TILE 1
 #endif
-#define HK_AT_ONCE 64 /* hidden units */
+#define HK_AT_ONCE 128 /* hidden units */
 
 typedef real hk_lanes __attribute__((vector_size(HK_LANES * sizeof(real))));
 typedef hk_bits hk_mask __attribute__((vector_size(HK_LANES * sizeof(real))));
@@ -47,9 +47,15 @@ static inline V *hkv_aligned(real *work) {
 }
 
 static inline int hkv_any(M m) {
+#if defined(__AVX512F__)
+    return _mm512_test_epi64_mask((__m512i)m, (__m512i)m) != 0;
+#elif defined(__AVX__)
+    return _mm256_movemask_pd((__m256d)m) != 0;
+#else
     hk_bits any = 0;
     EACH(i) any |= m[i];
     return any != 0;
+#endif
 }
 
 static inline V hkv_sqrt(V x) {
@@ -124,8 +130,14 @@ static inline void hkv_from_rows(int width, int count, const real *rows, V *lane
         hkv_transpose(part);
         EACH(i) lanes[at + i] = part[i];
     }
-    for (; at < width; at++)
-        EACH(i) lanes[at][i] = rows[width * (i < count ? i : count - 1) + at];
+    for (; at < width; at++) {
+        V column;
+        if (count == HK_LANES)
+            EACH(i) column[i] = rows[width * i + at];
+        else
+            EACH(i) column[i] = rows[width * (i < count ? i : count - 1) + at];
+        lanes[at] = column;
+    }
 }
 
 /* Rows (count, width) of lanes (width). Where the width is no multiple of HK_LANES, the last columns
@@ -144,27 +156,32 @@ static inline void hkv_to_rows(int width, int count, const V *lanes, real *rows)
         for (int i = 0; i < count; i++) rows[width * i + at] = lanes[at][i];
 }
 
-/* exp by x = k ln 2 + r and a minimax polynomial in r, right to 3e-16 up to ln 2 / 2. The product
-   with 2^k keeps every NaN; a sum of bits would not. Step by step for `count` x, at most HK_GROUP,
-   in their place: one alone would wait for each of its steps. */
-HK_INLINE void hkv_exps(int count, V *x) {
+/* exp(x) = y 2^k by x = k ln 2 + r and a minimax polynomial y in r, right to 3e-16 up to ln 2 / 2.
+   The product with 2^k keeps every NaN; a sum of bits would not. Step by step for `count` x, at most
+   HK_GROUP, which become y: one alone would wait for each of its steps. */
+HK_INLINE void hkv_powers(int count, V *x, V *scale) {
     static const real factors[] = {
         2.7635013162445406779e-6, 2.4801932040583279556e-5, 1.9841184185666530655e-4,
         1.3888888515778345185e-3, 8.3333333709071248824e-3, 4.166666666813876456e-2,
         1.6666666666611474018e-1, 4.9999999999998320886e-1, 1.0, 1.0};
     const V round = SPLAT(6755399441056767.0); /* 1.5 * 2^52 + 1023: the sum's last bits are those
                                                   of the exponent of 2^k */
-    V shifted[HK_GROUP], r[HK_GROUP], y[HK_GROUP];
+    V r[HK_GROUP];
     for (int i = 0; i < count; i++) {
         const V within = hkv_min(hkv_max(x[i], SPLAT(-708.0)), SPLAT(709.0));
-        shifted[i] = within * 1.4426950408889634 + round;
-        const V k = shifted[i] - round;
+        const V shifted = within * 1.4426950408889634 + round, k = shifted - round;
         r[i] = (within - k * 6.93147180369123816490e-1) - k * 1.90821492927058770002e-10;
-        y[i] = SPLAT(2.7476727591429536815e-7);
+        scale[i] = (V)((M)shifted << 52);
+        x[i] = SPLAT(2.7476727591429536815e-7);
     }
     for (int step = 0; step < 10; step++)
-        for (int i = 0; i < count; i++) y[i] = y[i] * r[i] + factors[step];
-    for (int i = 0; i < count; i++) x[i] = y[i] * (V)((M)shifted[i] << 52);
+        for (int i = 0; i < count; i++) x[i] = x[i] * r[i] + factors[step];
+}
+
+HK_INLINE void hkv_exps(int count, V *x) {
+    V scale[HK_GROUP];
+    hkv_powers(count, x, scale);
+    for (int i = 0; i < count; i++) x[i] = x[i] * scale[i];
 }
 
 static inline V hkv_exp(V x) {
@@ -173,8 +190,10 @@ static inline V hkv_exp(V x) {
 }
 
 HK_INLINE void hkv_logistics(int count, V *x) {
-    hkv_exps(count, x);
-    for (int i = 0; i < count; i++) x[i] = x[i] / (1.0 + x[i]);
+    V scale[HK_GROUP];
+    for (int i = 0; i < count; i++) x[i] = -x[i];
+    hkv_powers(count, x, scale);
+    for (int i = 0; i < count; i++) x[i] = 1.0 / (x[i] * scale[i] + 1.0);
 }
 
 HK_INLINE void hkv_tanhs(int count, V *x) {

@@ -25,14 +25,23 @@ HK_INLINE void HK(activate)(int activation, int count, V *a, V *d) {
     }
 }
 
-/* The weights of HK_GROUP units stand together: W transposed (n, HK_GROUP), b (HK_GROUP), output
-   weights (m, HK_GROUP). Of `count` units, at most HK_GROUP, with these weights: sigma and sigma'. */
-HK_INLINE void HK(group_of)(int n, int count, int activation, const real *w, const V *u, V shift,
-                            V *s, V *d) {
-    for (int i = 0; i < count; i++) s[i] = shift + w[HK_GROUP * n + i];
-    for (int j = 0; j < n; j++)
+/* The next `count` units: their sigma' in d, and their share in x (m). `features` as for `units_of`.
+   The weights of HK_GROUP units stand together: W transposed (n, HK_GROUP), b (HK_GROUP), output
+   weights (m, HK_GROUP); units that fill up the last group have none. */
+HK_INLINE void HK(next_units)(int n, int m, int count, int activation, const real *w, const V *u,
+                              V shift, V *x, V *d, V *features) {
+    const real *bias = w + HK_GROUP * n, *out = bias + HK_GROUP;
+    V s[HK_GROUP];
+    for (int i = 0; i < count; i++) s[i] = shift + bias[i];
+    HK_UNROLLED for (int j = 0; j < n; j++)
         for (int i = 0; i < count; i++) s[i] = s[i] + u[j] * w[HK_GROUP * j + i];
     HK(activate)(activation, count, s, d);
+    for (int o = 0; o < m; o++, out += HK_GROUP) {
+        V sum = s[0] * out[0]; /* which need not wait for the units before */
+        for (int i = 1; i < count; i++) sum = sum + s[i] * out[i];
+        x[o] = x[o] + sum;
+    }
+    for (int i = 0; features && i < count; i++) features[i] = s[i];
 }
 
 /* Adds what `count` units contribute to a part of their slope J (m, n): the rows o to o + rows, of
@@ -69,28 +78,22 @@ HK_INLINE void HK(slope_rows)(int n, int m, int count, const real *w, const V *d
 }
 
 /* Adds the share of all hidden units in x (m) and in its slope J (m, n) by u (n), where not NULL, and
-   writes their sigma into `features`, where not NULL. */
+   writes their sigma into `features`, where not NULL: whole groups, or halves of them. */
 HK_INLINE void HK(units_of)(int n, int m, int units, int activation, const real *w, const V *u,
                             V shift, V *x, V *J, V *features) {
     const int stride = HK_GROUP * (n + 1 + m);
-    V s[HK_GROUP], d[HK_AT_ONCE];
-    for (; units > 0; units -= HK_AT_ONCE) {
-        const int count = units < HK_AT_ONCE ? units : HK_AT_ONCE;
+    V d[HK_AT_ONCE];
+    while (units > 0) {
         const real *first = w;
-        for (int h = 0; h < count; h += HK_GROUP, w += stride) {
-            const real *out = w + HK_GROUP * (n + 1);
-            if (count - h > HK_GROUP / 2)
-                HK(group_of)(n, HK_GROUP, activation, w, u, shift, s, d + h);
+        int count = 0;
+        for (; units > 0 && count < HK_AT_ONCE; units -= HK_GROUP, w += stride) {
+            const int half = units <= HK_GROUP / 2;
+            if (half)
+                HK(next_units)(n, m, HK_GROUP / 2, activation, w, u, shift, x, d + count, features);
             else
-                HK(group_of)(n, HK_GROUP / 2, activation, w, u, shift, s, d + h);
-            const int some = count - h < HK_GROUP ? count - h : HK_GROUP;
-            for (int i = 0; features && i < some; i++) features[i] = s[i];
-            if (features) features += some;
-            for (int o = 0; o < m; o++) {
-                V sum = x[o];
-                for (int i = 0; i < some; i++) sum = sum + s[i] * out[HK_GROUP * o + i];
-                x[o] = sum;
-            }
+                HK(next_units)(n, m, HK_GROUP, activation, w, u, shift, x, d + count, features);
+            count += half ? HK_GROUP / 2 : HK_GROUP;
+            if (features) features += HK_GROUP;
         }
         int o = 0;
         for (; J && o + HK_TILE <= m; o += HK_TILE)
@@ -181,6 +184,20 @@ static inline void HK(scaled)(int n, const real *center, const V *q, V *u) {
     for (int j = 0; j < n; j++) u[j] = (q[j] - center[j]) * center[n + j];
 }
 
+/* From the sums of the units x (m) and their slopes J (m, n) by u to c + D u + x, and the slopes by q. */
+HK_INLINE void HK(network_end)(int n, int m, int gaussian, const real *inverse, const real *c,
+                               const V *u, V *x, V *J) {
+    const real *direct = c + m;
+    for (int o = 0; o < m; o++, direct += n) {
+        for (int j = 0; J && j < n; j++) {
+            if (gaussian) J[n * o + j] = J[n * o + j] - x[o] * u[j];
+            J[n * o + j] = (J[n * o + j] + direct[j]) * inverse[j];
+        }
+        x[o] = x[o] + c[o];
+        for (int j = 0; j < n; j++) x[o] = x[o] + u[j] * direct[j];
+    }
+}
+
 /* x = c + D u + V sigma(W u + b): networks with direct link, affine maps, Gaussian kernels.
 
    Writes the features too where asked: the hidden units', then u. A Gaussian at u_i is the unit
@@ -190,21 +207,17 @@ static inline void HK(elm)(const hk_plan *p, int at, const V *q, V *x, V *J, V *
     const int n = node[HK_N], m = node[HK_M], n_hidden = more[0], activation = more[1];
     const int gaussian = activation == HK_GAUSSIAN;
     const real *center = hk_numbers(p, at), *inverse = center + n;
-    const real *intercept = inverse + n, *direct = intercept + m;
+    const real *intercept = inverse + n, *units = intercept + m + m * n;
     V *u = HK(take)(&work, n), shift = SPLAT(0.0);
     HK(scaled)(n, center, q, u);
     for (int j = 0; gaussian && j < n; j++) shift = shift - R(0.5) * u[j] * u[j];
     for (int o = 0; o < m; o++) x[o] = SPLAT(0.0);
     for (int k = 0; J && k < m * n; k++) J[k] = SPLAT(0.0);
-    HK(units)(n, m, n_hidden, activation, direct + m * n, u, shift, x, J, features, work);
-    for (int o = 0; o < m; o++) {
-        for (int j = 0; J && j < n; j++) {
-            if (gaussian) J[n * o + j] = J[n * o + j] - x[o] * u[j];
-            J[n * o + j] = (J[n * o + j] + direct[n * o + j]) * inverse[j];
-        }
-        x[o] = x[o] + intercept[o];
-        for (int j = 0; j < n; j++) x[o] = x[o] + u[j] * direct[n * o + j];
-    }
+    HK(units)(n, m, n_hidden, activation, units, u, shift, x, J, features, work);
+    if (HK_COMMON(n == 9 && m == 3 && !gaussian))
+        HK(network_end)(9, 3, 0, inverse, intercept, u, x, J);
+    else
+        HK(network_end)(n, m, gaussian, inverse, intercept, u, x, J);
     if (features)
         for (int j = 0; j < n; j++) features[n_hidden + j] = u[j];
 }
