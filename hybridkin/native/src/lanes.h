@@ -29,6 +29,7 @@
 #define HK_TILE 1
 #endif
 #define HK_AT_ONCE 128 /* hidden units */
+#define HK_FIRST_COLUMNS 12 /* columns of a leverage after which it is first looked at */
 
 typedef real hk_lanes __attribute__((vector_size(HK_LANES * sizeof(real))));
 typedef hk_bits hk_mask __attribute__((vector_size(HK_LANES * sizeof(real))));
