@@ -134,6 +134,8 @@ static inline int HK(leverage)(const hk_factor *lever, real enough, V *phi, V *w
         *leverage = sum;
         if (falls && !HK(any)(NOT(sum <= SPLAT(enough)))) return 0;
     }
+    /* `leverage_slope` reads whole groups. */
+    for (at = lever->k; at % HK_GROUP; at++) white[at] = SPLAT(0.0);
     return 1;
 }
 
