@@ -160,9 +160,7 @@ class Core:
         Their lengths.
     """
 
-    def __init__(
-        self, settings: StepSettings, models: list[Program], shares: bool = True
-    ) -> None:
+    def __init__(self, settings: StepSettings, models: list[Program], shares: bool = True) -> None:
         self.plan = Plan(settings.write_plan, shares)
         self.made_of = (settings, models)
         self.own: Core | None = None  # with copies of what this one shares, once it was needed

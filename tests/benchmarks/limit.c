@@ -21,22 +21,30 @@ ALWAYS V all(double c) { return _mm512_set1_pd(c); }
 ALWAYS V madd(V a, V b, V c) { return _mm512_fmadd_pd(a, b, c); }
 
 /* 2^r up to |r| = 1/2, minimax; from the highest power on, as the next ones. */
-static const double EXP2[11] = {
-    7.072585949269223e-09, 1.0208690299958306e-07, 1.321544258792169e-06, 1.5252657260200837e-05,
-    0.0001540353044173605, 0.0013333558230164974, 0.009618129107606888, 0.05550410866444772,
-    0.24022650695910097, 0.69314718055995, 1.0};
+static const double EXP2[11] = {7.072585949269223e-09,
+                                1.0208690299958306e-07,
+                                1.321544258792169e-06,
+                                1.5252657260200837e-05,
+                                0.0001540353044173605,
+                                0.0013333558230164974,
+                                0.009618129107606888,
+                                0.05550410866444772,
+                                0.24022650695910097,
+                                0.69314718055995,
+                                1.0};
 
 /* (1 - sin t / t) / t^2 by t^2, up to a half turn. */
 static const double C3[10] = {
-    -1.775165055612406e-20, 8.183034366062202e-18, -2.811024030605762e-15, 7.647133470817639e-13,
+    -1.775165055612406e-20,  8.183034366062202e-18,  -2.811024030605762e-15, 7.647133470817639e-13,
     -1.6059042526461696e-10, 2.5052108350866163e-08, -2.755731922346156e-06, 0.00019841269841265803,
-    -0.008333333333333321, 0.16666666666666666};
+    -0.008333333333333321,   0.16666666666666666};
 
 /* (1/2 - (1 - cos t) / t^2) / t^2 likewise. */
-static const double C4[10] = {
-    -8.135186188193454e-22, 4.094574861070063e-19, -1.5617392046473866e-16, 4.7794646505496603e-14,
-    -1.1470745048458593e-11, 2.0876756973372715e-09, -2.7557319223766046e-07,
-    2.4801587301585607e-05, -0.0013888888888888883, 0.041666666666666664};
+static const double C4[10] = {-8.135186188193454e-22,  4.094574861070063e-19,
+                              -1.5617392046473866e-16, 4.7794646505496603e-14,
+                              -1.1470745048458593e-11, 2.0876756973372715e-09,
+                              -2.7557319223766046e-07, 2.4801587301585607e-05,
+                              -0.0013888888888888883,  0.041666666666666664};
 
 /* 2^t */
 ALWAYS V power_of_two(V t) {
@@ -52,10 +60,11 @@ ALWAYS void transpose(V a[8]) {
         b[2 * i] = _mm512_unpacklo_pd(a[2 * i], a[2 * i + 1]);
         b[2 * i + 1] = _mm512_unpackhi_pd(a[2 * i], a[2 * i + 1]);
     }
-    EACH(i, 2) EACH(k, 2) {
-        c[4 * i + k] = _mm512_shuffle_f64x2(b[4 * i + k], b[4 * i + 2 + k], 0x88);
-        c[4 * i + 2 + k] = _mm512_shuffle_f64x2(b[4 * i + k], b[4 * i + 2 + k], 0xdd);
-    }
+    EACH(i, 2)
+        EACH(k, 2) {
+            c[4 * i + k] = _mm512_shuffle_f64x2(b[4 * i + k], b[4 * i + 2 + k], 0x88);
+            c[4 * i + 2 + k] = _mm512_shuffle_f64x2(b[4 * i + k], b[4 * i + 2 + k], 0xdd);
+        }
     EACH(k, 4) {
         a[k] = _mm512_shuffle_f64x2(c[k], c[4 + k], 0x88);
         a[4 + k] = _mm512_shuffle_f64x2(c[k], c[4 + k], 0xdd);
@@ -134,11 +143,13 @@ ALWAYS void chain(const V *q, V *x, V *J) {
             C[2][j] = c[k] * C[2][j] - f[k] * along;
         }
     }
-    EACH(i, 3) for (int k = 0; k < 3; k++) EACH(j, 3) {
-        const double *to = ARCS + 9 * k + j;
-        J[9 * i + 3 * k + j] =
-            C[i][3 * k] * to[0] + C[i][3 * k + 1] * to[3] + C[i][3 * k + 2] * to[6];
-    }
+    EACH(i, 3)
+        for (int k = 0; k < 3; k++)
+            EACH(j, 3) {
+                const double *to = ARCS + 9 * k + j;
+                J[9 * i + 3 * k + j] =
+                    C[i][3 * k] * to[0] + C[i][3 * k + 1] * to[3] + C[i][3 * k + 2] * to[6];
+            }
 }
 
 /* Features of 16 rows and their derivatives by what enters the units, whose weights are such that
@@ -146,15 +157,18 @@ ALWAYS void chain(const V *q, V *x, V *J) {
 ALWAYS void units(const V (*q)[9], V (*s)[2], V (*d)[2]) {
     for (int h = 0; h < UNITS; h += AT_ONCE) {
         V t[AT_ONCE][2];
-        EACH(i, AT_ONCE) EACH(r, 2) t[i][r] = all(BIAS[h + i]);
-        EACH(j, 9) EACH(i, AT_ONCE) {
-            const V w = all(WEIGHTS[9 * (h + i) + j]);
-            EACH(r, 2) t[i][r] = madd(q[r][j], w, t[i][r]);
-        }
-        EACH(i, AT_ONCE) EACH(r, 2) {
-            s[h + i][r] = 1.0 / (1.0 + power_of_two(t[i][r]));
-            d[h + i][r] = s[h + i][r] - s[h + i][r] * s[h + i][r];
-        }
+        EACH(i, AT_ONCE)
+            EACH(r, 2) t[i][r] = all(BIAS[h + i]);
+        EACH(j, 9)
+            EACH(i, AT_ONCE) {
+                const V w = all(WEIGHTS[9 * (h + i) + j]);
+                EACH(r, 2) t[i][r] = madd(q[r][j], w, t[i][r]);
+            }
+        EACH(i, AT_ONCE)
+            EACH(r, 2) {
+                s[h + i][r] = 1.0 / (1.0 + power_of_two(t[i][r]));
+                d[h + i][r] = s[h + i][r] - s[h + i][r] * s[h + i][r];
+            }
     }
 }
 
@@ -162,7 +176,8 @@ ALWAYS void units(const V (*q)[9], V (*s)[2], V (*d)[2]) {
 #define SUMS(features, weights, width, first, COUNT, to)                                           \
     do {                                                                                           \
         V sum[COUNT][2];                                                                           \
-        EACH(k, COUNT) EACH(r, 2) sum[k][r] = to[r][(first) + k];                                  \
+        EACH(k, COUNT)                                                                             \
+            EACH(r, 2) sum[k][r] = to[r][(first) + k];                                             \
         for (int h = 0; h < UNITS; h++) {                                                          \
             const V one = features[h][0], two = features[h][1];                                    \
             EACH(k, COUNT) {                                                                       \
@@ -171,7 +186,8 @@ ALWAYS void units(const V (*q)[9], V (*s)[2], V (*d)[2]) {
                 sum[k][1] = madd(two, w, sum[k][1]);                                               \
             }                                                                                      \
         }                                                                                          \
-        EACH(k, COUNT) EACH(r, 2) to[r][(first) + k] = sum[k][r];                                  \
+        EACH(k, COUNT)                                                                             \
+            EACH(r, 2) to[r][(first) + k] = sum[k][r];                                             \
     } while (0)
 
 static void block(const double *rows, double *to_x, double *to_J, int hybrid) {
@@ -182,7 +198,8 @@ static void block(const double *rows, double *to_x, double *to_J, int hybrid) {
     for (int r = 0; r < 2; r++) chain(q[r], x[r], J[r]);
     if (hybrid) {
         units((const V(*)[9])q, s, d);
-        EACH(r, 2) EACH(i, 3) x[r][i] += all(INTERCEPT[i]);
+        EACH(r, 2)
+            EACH(i, 3) x[r][i] += all(INTERCEPT[i]);
         SUMS(s, OUT, 3, 0, 3, x);
         SUMS(d, SLOPES, 27, 0, 14, J);
         SUMS(d, SLOPES, 27, 14, 13, J);

@@ -1,7 +1,7 @@
 """Against a program of one model, written by hand for AVX-512 in a day: how near the kernels are.
 
-`limit.c` knows one hybrid, with all its numbers as constants, and the chain alone. The kernels compute
-any model of their kinds.
+`limit.c` knows one hybrid, with all its numbers as constants, and the chain alone. The kernels
+compute any model of their kinds.
 """
 
 import ctypes

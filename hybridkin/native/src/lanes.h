@@ -28,7 +28,7 @@
 #else
 #define HK_TILE 1
 #endif
-#define HK_AT_ONCE 128 /* hidden units */
+#define HK_AT_ONCE 128      /* hidden units */
 #define HK_FIRST_COLUMNS 12 /* columns of a leverage after which it is first looked at */
 
 typedef real hk_lanes __attribute__((vector_size(HK_LANES * sizeof(real))));
@@ -141,8 +141,8 @@ static inline void hkv_from_rows(int width, int count, const real *rows, V *lane
     }
 }
 
-/* Rows (count, width) of lanes (width). Where the width is no multiple of HK_LANES, the last columns
-   are written together with some before them. */
+/* Rows (count, width) of lanes (width). Where the width is no multiple of HK_LANES, the last
+   columns are written together with some before them. */
 static inline void hkv_to_rows(int width, int count, const V *lanes, real *rows) {
     V part[HK_LANES];
     int at = 0;
@@ -158,13 +158,19 @@ static inline void hkv_to_rows(int width, int count, const V *lanes, real *rows)
 }
 
 /* exp(x) = y 2^k by x = k ln 2 + r and a minimax polynomial y in r, right to 3e-16 up to ln 2 / 2.
-   The product with 2^k keeps every NaN; a sum of bits would not. Step by step for `count` x, at most
-   HK_GROUP, which become y: one alone would wait for each of its steps. */
+   The product with 2^k keeps every NaN; a sum of bits would not. Step by step for `count` x, at
+   most HK_GROUP, which become y: one alone would wait for each of its steps. */
 HK_INLINE void hkv_powers(int count, V *x, V *scale) {
-    static const real factors[] = {
-        2.7635013162445406779e-6, 2.4801932040583279556e-5, 1.9841184185666530655e-4,
-        1.3888888515778345185e-3, 8.3333333709071248824e-3, 4.166666666813876456e-2,
-        1.6666666666611474018e-1, 4.9999999999998320886e-1, 1.0, 1.0};
+    static const real factors[] = {2.7635013162445406779e-6,
+                                   2.4801932040583279556e-5,
+                                   1.9841184185666530655e-4,
+                                   1.3888888515778345185e-3,
+                                   8.3333333709071248824e-3,
+                                   4.166666666813876456e-2,
+                                   1.6666666666611474018e-1,
+                                   4.9999999999998320886e-1,
+                                   1.0,
+                                   1.0};
     const V round = SPLAT(6755399441056767.0); /* 1.5 * 2^52 + 1023: the sum's last bits are those
                                                   of the exponent of 2^k */
     V r[HK_GROUP];

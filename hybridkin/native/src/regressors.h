@@ -25,15 +25,16 @@ HK_INLINE void HK(activate)(int activation, int count, V *a, V *d) {
     }
 }
 
-/* The next `count` units: their sigma' in d, and their share in x (m). `features` as for `units_of`.
-   The weights of HK_GROUP units stand together: W transposed (n, HK_GROUP), b (HK_GROUP), output
-   weights (m, HK_GROUP); units that fill up the last group have none. */
+/* The next `count` units: their sigma' in d, and their share in x (m). `features` as for
+   `units_of`. The weights of HK_GROUP units stand together: W transposed (n, HK_GROUP), b
+   (HK_GROUP), output weights (m, HK_GROUP); units that fill up the last group have none. */
 HK_INLINE void HK(next_units)(int n, int m, int count, int activation, const real *w, const V *u,
                               V shift, V *x, V *d, V *features) {
     const real *bias = w + HK_GROUP * n, *out = bias + HK_GROUP;
     V s[HK_GROUP];
     for (int i = 0; i < count; i++) s[i] = shift + bias[i];
-    HK_UNROLLED for (int j = 0; j < n; j++)
+    HK_UNROLLED
+    for (int j = 0; j < n; j++)
         for (int i = 0; i < count; i++) s[i] = s[i] + u[j] * w[HK_GROUP * j + i];
     HK(activate)(activation, count, s, d);
     for (int o = 0; o < m; o++, out += HK_GROUP) {
@@ -57,8 +58,7 @@ HK_INLINE void HK(slope_part)(int n, int m, int count, const real *w, const V *d
         for (int i = 0; i < HK_GROUP && i < count; i++) {
             for (int r = 0; r < rows; r++) t[r] = d[i] * out[HK_GROUP * r + i];
             for (int c = 0; c < columns; c++)
-                for (int r = 0; r < rows; r++)
-                    sum[r][c] = sum[r][c] + t[r] * in[HK_GROUP * c + i];
+                for (int r = 0; r < rows; r++) sum[r][c] = sum[r][c] + t[r] * in[HK_GROUP * c + i];
         }
     }
     for (int r = 0; r < rows; r++)
@@ -77,8 +77,8 @@ HK_INLINE void HK(slope_rows)(int n, int m, int count, const real *w, const V *d
     if (j < n) HK(slope_part)(n, m, count, w, d, o, rows, j, n - j, J);
 }
 
-/* Adds the share of all hidden units in x (m) and in its slope J (m, n) by u (n), where not NULL, and
-   writes their sigma into `features`, where not NULL: whole groups, or halves of them. */
+/* Adds the share of all hidden units in x (m) and in its slope J (m, n) by u (n), where not NULL,
+   and writes their sigma into `features`, where not NULL: whole groups, or halves of them. */
 HK_INLINE void HK(units_of)(int n, int m, int units, int activation, const real *w, const V *u,
                             V shift, V *x, V *J, V *features) {
     const int stride = HK_GROUP * (n + 1 + m);
@@ -184,7 +184,8 @@ static inline void HK(scaled)(int n, const real *center, const V *q, V *u) {
     for (int j = 0; j < n; j++) u[j] = (q[j] - center[j]) * center[n + j];
 }
 
-/* From the sums of the units x (m) and their slopes J (m, n) by u to c + D u + x, and the slopes by q. */
+/* From the sums of the units x (m) and their slopes J (m, n) by u to c + D u + x, and the slopes by
+ * q. */
 HK_INLINE void HK(network_end)(int n, int m, int gaussian, const real *inverse, const real *c,
                                const V *u, V *x, V *J) {
     const real *direct = c + m;
