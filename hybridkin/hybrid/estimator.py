@@ -751,11 +751,14 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return (distance,)
 
     def _are_states_seen(self, X: object) -> NDArray[np.bool_]:
-        """Return whether the log had the states inside of the hysteresis, and such a pace (N,)."""
-        commands = Commands.of(X)
+        """Return whether the log had the states inside of the hysteresis, and such a pace, (N,).
+
+        Without states one True, of shape (), stands for all rows.
+        """
         states_of_log = self._fit.state_range
         if not self.hysteresis_ or states_of_log is None:
-            return np.ones(len(commands), dtype=bool)
+            return np.ones((), dtype=bool)
+        commands = Commands.of(X)
         rows = check_inputs(self, commands.q)
         low, high = states_of_log.shifted(-self.change_.shift)
         is_tested = np.ones(len(commands), dtype=bool)

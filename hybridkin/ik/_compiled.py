@@ -86,14 +86,30 @@ class Tick(NamedTuple):
 def core_of(settings: StepSettings) -> Core | None:
     """Return the core of settings, or None if a part of the task has no kernel.
 
-    The core is kept with the settings, and made again if a model has changed.
+    The core is kept with the settings, and made again if a model has changed. Large buffers it
+    shares with the model.
     """
-    programs = [program_of(model) for model in settings.task.models]
+    return _made(settings, copies=False).core
+
+
+def own_core_of(settings: StepSettings) -> Core | None:
+    """Return a core that keeps what the models are now, or None; see `core_of`."""
+    core = _made(settings, copies=True).core
+    if core is None or not core.plan.shared:
+        return core
+    if core.own is None:
+        core.own = Core(*core.made_of, shares=False)
+    return core.own
+
+
+def _made(settings: StepSettings, copies: bool) -> _Made:
+    """Return what was made for settings; for `copies` see `program_of`."""
+    programs = [program_of(model, copies) for model in settings.task.models]
     made = vars(settings).get("_program")
     if made is None or made.programs != programs:
         made = _Made(settings, programs)
         object.__setattr__(settings, "_program", made)
-    return made.core
+    return made
 
 
 class _Made:
@@ -129,6 +145,8 @@ class Core:
         Task, limits, posture and rates.
     models : list of Program
         The models of the task.
+    shares : bool, default=True
+        Whether large buffers stay those of the models, see `Plan`.
 
     Attributes
     ----------
@@ -142,9 +160,10 @@ class Core:
         Their lengths.
     """
 
-    def __init__(self, settings: StepSettings, models: list[Program]) -> None:
-        self.plan = Plan(settings.write_plan)
-        self._made_of = (settings, models)
+    def __init__(self, settings: StepSettings, models: list[Program], shares: bool = True) -> None:
+        self.plan = Plan(settings.write_plan, shares)
+        self.made_of = (settings, models)
+        self.own: Core | None = None  # with copies of what this one shares, once it was needed
         self.n, self.m = self.plan.lengths(self.plan.root)
         self.width = math.prod(settings.task.shape)
         self._call = ThreadCall(self.plan, opened_library())
@@ -166,8 +185,8 @@ class Core:
             "saturated": places["held"],
         }
 
-    def __reduce__(self) -> tuple[type[Core], tuple[StepSettings, list[Program]]]:
-        return Core, self._made_of
+    def __reduce__(self) -> tuple[type[Core], tuple[StepSettings, list[Program], bool]]:
+        return Core, (*self.made_of, len(self.plan.shared) > 0)
 
     def step(
         self, q: object, target: object, dx: object, tip: object

@@ -17,7 +17,7 @@ from torch import Tensor
 from hybridkin._core.arrays import as_array, as_tensor, is_numpy, number
 from hybridkin._core.kernel_numbers import IK_ON_TIME
 from hybridkin._core.portable import Portable
-from hybridkin.ik._compiled import Follower, Tick, core_of, why_torch
+from hybridkin.ik._compiled import Follower, Tick, own_core_of, why_torch
 from hybridkin.ik._feedback import MOST_PERIODS, Feedback, Readings
 from hybridkin.ik._gram import row_gram
 from hybridkin.ik._hysteresis import lead_of
@@ -271,7 +271,7 @@ class Tracker(Portable):
     def _start(self, q: Tensor, dq: Tensor | None, hysteresis: Any) -> None:
         """Read the model, and start at q (n,), after a step dq (n,) or at rest."""
         self._settings = settings = self._settings.present()
-        core = core_of(settings)
+        core = own_core_of(settings)
         task = settings.task
         if core is None:
             reason = why_torch(settings)

@@ -34,7 +34,8 @@ class Result(NamedTuple):
 
     def cells(self):
         faster = self.peer / self.ours
-        ratio, goal, met = f"{faster:.1f}x faster", "", True
+        digits = 1 if faster >= 1.0 else 2
+        ratio, goal, met = f"{faster:.{digits}f}x faster", "", True
         if self.at_least is not None:
             goal, met = f">= {self.at_least:g}", faster >= self.at_least
         elif self.at_most is not None:

@@ -67,7 +67,7 @@ def test_price_of_the_guard(race, hybrids, draw, trunk, batch, rows):
         of_numpy(guarded, q),
         of_numpy(plain, q),
         rows=batch,
-        at_most=1.7,
+        at_most=1.3,
     )
 
 

@@ -6,7 +6,9 @@ from compiled import random_settings
 from hybridkin import (
     ConstantCurvatureChain,
     ElasticTendonChain,
+    HybridForwardModel,
     InverseKinematics,
+    datasets,
     robots,
 )
 from hybridkin._core.plan import NoKernel, Plan
@@ -176,3 +178,26 @@ def test_what_is_infinite_or_overflows_holds_still(limits):
     dq = ik.step(q[0], x[0]).dq
     assert dq[3] < 0.0
     np.testing.assert_array_equal(np.delete(dq, 3), 0.0)
+
+
+def test_steps_see_writes_to_large_buffers_and_trackers_keep_what_was():
+    """Steps read the factor of the leverage where it is; a tracker has a copy of its own."""
+    data = datasets.load_trunk()
+    module = HybridForwardModel(BHA, random_state=0).fit(data.q[:500], data.x[:500]).module_
+    low, high = data.q.min(0), data.q.max(0)
+    q = low + (high - low) * np.array([1.6, -0.6, 0.5] * 3)  # where the guard fades
+    assert 3.0 < float(module.domain_distance(torch.from_numpy(q))) < 300.0
+    x = module(torch.from_numpy(q)).detach().numpy() + 0.01
+    ik = InverseKinematics(module)
+    before = ik.step(q, x).dq
+    tracker, right = ik.tracker(q), ik.tracker(q)
+    assert tracker.backend == "compiled"
+    expected = [right.step(x) for _ in range(3)]
+    factor = module.corrections[0].guard.model.leverage_factor
+    factor.data.mul_(0.999)
+    after = ik.step(q, x).dq
+    assert np.abs(after - before).max() > 1e-9
+    np.testing.assert_allclose(after, ik.step(*in_torch(q, x)).dq, rtol=0, atol=1e-9)
+    for command in expected:
+        np.testing.assert_array_equal(tracker.step(x), command)
+    assert np.abs(ik.tracker(q).step(x) - expected[0]).max() > 1e-9

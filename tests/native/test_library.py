@@ -7,7 +7,14 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from hybridkin import ConstantCurvatureChain, ForwardModel, as_forward_model
+from hybridkin import (
+    ConstantCurvatureChain,
+    ForwardModel,
+    HybridForwardModel,
+    as_forward_model,
+    datasets,
+    robots,
+)
 from hybridkin.native import available, backend, library
 
 CHAIN = {"radii": [0.01, 0.012], "lengths": [0.1, 0.08], "routing": "base"}
@@ -71,6 +78,33 @@ def test_the_number_of_threads_changes_nothing():
     for one, other in [(0, 1), (0, 2)]:
         assert all(np.array_equal(a, b) for a, b in zip(found[one], found[other], strict=True))
     agree(found[0][:2], by_torch(chain(), ROWS))
+
+
+@pytest.mark.needs_core
+def test_a_row_is_the_same_in_every_batch():
+    """Wherever it stands, also in a last block that is not full, and beside a row of NaN."""
+    data = datasets.load_trunk()
+    model = HybridForwardModel(robots.bionic_handling_assistant(), random_state=0)
+    program = library.program_of(model.fit(data.q[:300], data.x[:300]).module_)
+    middle = data.q.mean(axis=0)
+    rows = middle + np.linspace(0.2, 1.5, 40)[:, None] * (data.q[:40] - middle)
+    whole = program.evaluate(rows, jacobian=True, distance=True)
+    assert (whole[2] > 3.0).any()  # the guard fades these
+    assert (whole[2] < 2.0).any()
+    beside = rows.copy()
+    beside[::5] = np.nan
+    for batch in range(2, 25):
+        for start in (0, 1, 7, 40 - batch):
+            some = slice(start, start + batch)
+            expected = [part[some] for part in whole]
+            assert all(map(np.array_equal, program.evaluate(rows[some], True, True), expected))
+            assert all(map(np.array_equal, program.evaluate(rows[some], True), expected))
+            finite = np.isfinite(beside[some, 0])
+            for part, right in zip(
+                program.evaluate(beside[some], True, True), expected, strict=True
+            ):
+                assert np.array_equal(part[finite], right[finite])
+                assert np.isnan(part[~finite]).all()
 
 
 @pytest.mark.needs_core

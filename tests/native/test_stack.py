@@ -21,7 +21,7 @@ from hybridkin import (
     obstacles,
 )
 from hybridkin._core.plan import MOST, Plan
-from hybridkin.ik._compiled import core_of
+from hybridkin.ik._compiled import own_core_of
 from hybridkin.ik.tasks import PointsTask, PoseTask
 from hybridkin.native import library
 from hybridkin.native.library import program_of
@@ -105,15 +105,15 @@ def test_functions_of_the_library_take_little_stack(tmp_path, kind):
         tasks = [PoseTask(model)] if kind in CHAINS else [model]
         if kind in ("arcs", "elastic"):
             tasks.append(PointsTask(model, np.linspace(1.0, SEGMENTS, MOST["rows of a task"] // 3)))
-        plans += [core_of(InverseKinematics(task, **options).settings).plan for task in tasks]
+        plans += [own_core_of(InverseKinematics(task, **options).settings).plan for task in tasks]
         spaces = np.random.default_rng(0).standard_normal((ACTUATORS, 3)), np.ones(ACTUATORS)
         ik = InverseKinematics(model, **options, weights=2.0, tip_limits=spaces)
-        plans.append(core_of(ik.settings).plan)
+        plans.append(own_core_of(ik.settings).plan)
     if kind in ("arcs", "elastic"):
         balls = [obstacles.Sphere([0.1 * k, 0.0, 1.0], 0.01) for k in range(4)]
         points = [(0.5 + k, 0.01) for k in range(SEGMENTS - 1)] + [(float(SEGMENTS), 0.01)]
         among = {"obstacles": balls, "body_points": points, "tip_limits": spaces}
-        plans.append(core_of(InverseKinematics(model, **options, **among).settings).plan)
+        plans.append(own_core_of(InverseKinematics(model, **options, **among).settings).plan)
     program = painted(tmp_path)
     for plan in plans:
         write_plan(tmp_path / "plan", plan, q)
@@ -126,7 +126,7 @@ def test_functions_of_the_library_take_little_stack(tmp_path, kind):
 def test_a_thread_of_128_kib_computes():
     chain = elastic()
     q = rows(chain.n_actuators, 9)
-    program, core = program_of(chain), core_of(InverseKinematics(chain, q_max=0.02).settings)
+    program, core = program_of(chain), own_core_of(InverseKinematics(chain, q_max=0.02).settings)
     expected = program.evaluate(q, True, True)
     x = torch.from_numpy(expected[0])
     found = []

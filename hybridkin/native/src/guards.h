@@ -73,18 +73,57 @@ static inline void HK(products)(int rows, const real *const *column, const V *v,
 #endif
 }
 
+/* v = phi - center in place of the features phi; returns |v|^2. */
+static inline V HK(centered)(const hk_factor *lever, V *phi) {
+    V squares = SPLAT(0.0);
+    for (int i = 0; i < lever->f; i++) {
+        phi[i] = phi[i] - lever->center[i];
+        squares = squares + phi[i] * phi[i];
+    }
+    return squares;
+}
+
+#if HK_LANES > 1
+/* The same, with the products r of v with the first HK_FIRST_COLUMNS, in threes: so few places fit
+   into registers. */
+static inline V hkv_first_products(const hk_factor *lever, V *phi, V *r) {
+    const int f = lever->f;
+    const real *a = lever->R, *b = a + 3 * f, *c = b + 3 * f, *d = c + 3 * f;
+    V squares = SPLAT(0.0), sum[HK_FIRST_COLUMNS];
+    for (int l = 0; l < HK_FIRST_COLUMNS; l++) sum[l] = SPLAT(0.0);
+    for (int i = 0; i < f; i++) {
+        const V v = phi[i] - lever->center[i];
+        phi[i] = v;
+        squares = squares + v * v;
+        for (int l = 0; l < 3; l++) {
+            sum[l] = sum[l] + v * a[f * l + i];
+            sum[3 + l] = sum[3 + l] + v * b[f * l + i];
+            sum[6 + l] = sum[6 + l] + v * c[f * l + i];
+            sum[9 + l] = sum[9 + l] + v * d[f * l + i];
+        }
+    }
+    for (int l = 0; l < HK_FIRST_COLUMNS; l++) r[l] = sum[l];
+    return squares;
+}
+#endif
+
 /* The leverage of features phi, which become v, and its r in `white`. With a prior it only falls
    from column to column: returns 0 as soon as it is at most `enough` for all rows, else 1. */
 static inline int HK(leverage)(const hk_factor *lever, real enough, V *phi, V *white, V *leverage) {
     const int falls = lever->prior > R(0.0);
     const real *column[HK_GROUP];
-    V sum = SPLAT(0.0);
-    for (int i = 0; i < lever->f; i++) {
-        phi[i] = phi[i] - lever->center[i];
-        sum = sum + phi[i] * phi[i];
-    }
-    sum = sum * lever->prior + lever->offset;
-    for (int at = 0; at < lever->k; at += HK_GROUP) {
+    V sum;
+    int at = 0;
+#if HK_LANES > 1
+    if (falls && lever->full && lever->k >= HK_FIRST_COLUMNS) {
+        sum = hkv_first_products(lever, phi, white) * lever->prior + lever->offset;
+        for (; at < HK_FIRST_COLUMNS; at++) sum = sum - white[at] * white[at];
+        *leverage = sum;
+        if (!HK(any)(NOT(sum <= SPLAT(enough)))) return 0;
+    } else
+#endif
+        *leverage = sum = HK(centered)(lever, phi) * lever->prior + lever->offset;
+    for (; at < lever->k; at += HK_GROUP) {
         const int rows = HK(columns)(lever, at, column);
         HK(products)(rows, column, phi, white + at);
         for (int l = 0; l < HK_GROUP; l++) {
@@ -95,6 +134,8 @@ static inline int HK(leverage)(const hk_factor *lever, real enough, V *phi, V *w
         *leverage = sum;
         if (falls && !HK(any)(NOT(sum <= SPLAT(enough)))) return 0;
     }
+    /* `leverage_slope` reads whole groups. */
+    for (at = lever->k; at % HK_GROUP; at++) white[at] = SPLAT(0.0);
     return 1;
 }
 

@@ -78,21 +78,26 @@ HK_API int64_t hk_work(const int32_t *code, int32_t at) {
     return (int64_t)HK_LANES * (1 + around + model) + of_units + slots;
 }
 
-static void hk_block(const hk_plan *p, int at, V *work, const real *q, int rows, real *x, real *J,
-                     real *distance) {
+/* Rows that will be written soon: the cache has their lines then, and the stores need not wait. */
+static inline void hk_expect(const real *rows, int count) {
+    for (int i = 0; i < count; i += 64 / (int)sizeof(real)) __builtin_prefetch(rows + i, 1);
+}
+
+/* At most HK_LANES rows. With `next`, as many follow. */
+static void hk_block(const hk_plan *p, int at, V *work, const real *q, int rows, int next, real *x,
+                     real *J, real *distance) {
     const int n = p->code[at + HK_N], m = x ? p->code[at + HK_M] : 1;
     V *vq = hkv_take(&work, n), *vx = hkv_take(&work, m), *vJ = hkv_take(&work, m * n), far;
-    EACH(i)
-        for (int j = 0; j < n; j++) vq[j][i] = q[(i < rows ? i : rows - 1) * n + j];
+    hkv_from_rows(n, rows, q, vq);
+    if (next && x) hk_expect(x + rows * m, rows * m);
+    if (next && J) hk_expect(J + rows * m * n, rows * m * n);
     if (x)
         hkv_model(p, at, vq, vx, J ? vJ : NULL, distance ? &far : NULL, work);
     else
         hkv_domain(p, at, vq, &far, J ? vJ : NULL, work);
-    for (int i = 0; i < rows; i++) {
-        for (int j = 0; x && j < m; j++) x[i * m + j] = vx[j][i];
-        for (int j = 0; J && j < m * n; j++) J[i * m * n + j] = vJ[j][i];
-        if (distance) distance[i] = far[i];
-    }
+    if (x) hkv_to_rows(m, rows, vx, x);
+    if (J) hkv_to_rows(m * n, rows, vJ, J);
+    if (distance) hkv_to_rows(1, rows, &far, distance);
 }
 
 /* x (rows, m), J (rows, m, n) and domain distances (rows) of q (rows, n); NULL: no J, no distance.
@@ -106,10 +111,15 @@ HK_API void hk_evaluate(const hk_call *call, const real *q, int64_t rows, real *
     else if (rows == 1)
         hk_model(&plan, at, q, x, J, distance, call->work);
     else
-        for (int64_t r = 0; r < rows; r += HK_LANES)
-            hk_block(&plan, at, hkv_aligned(call->work), q + r * n,
-                     (int)(rows - r < HK_LANES ? rows - r : HK_LANES), x ? x + r * m : NULL,
-                     J ? J + r * m * n : NULL, distance ? distance + r : NULL);
+        for (int64_t r = 0; r < rows; r += HK_LANES) {
+            /* The last block is a whole one too, with rows that come out the same once more. */
+            const int64_t left = rows - r;
+            const int64_t from = left < HK_LANES && rows > HK_LANES ? rows - HK_LANES : r;
+            const int count = left < HK_LANES ? (int)(rows - from) : HK_LANES;
+            hk_block(&plan, at, hkv_aligned(call->work), q + from * n, count, left >= 2 * HK_LANES,
+                     x ? x + from * m : NULL, J ? J + from * m * n : NULL,
+                     distance ? distance + from : NULL);
+        }
 }
 
 /* Bytes that a plan was made of, and a copy of what they were then. */

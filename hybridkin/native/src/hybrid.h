@@ -5,6 +5,7 @@
 /* What all corrections of a row add to. C and its own `pull` hold df/dq in inner coordinates. */
 typedef struct {
     V *x, *J;        /* x (m), and dx/dq without what C brings, or NULL */
+    int has_J;       /* whether J holds any of it yet */
     V *z, f[3];      /* inner coordinates (k) of q, and their tip */
     V *C0;           /* df/dz (3, k), if it was needed */
     V *C;            /* the total derivative (3, k) by z */
@@ -44,6 +45,18 @@ static inline void HK(fade)(int m, int k, V g, const V *slope, const V *x, V *J)
         }
 }
 
+/* Where a correction writes its slope: where the sum stands, if it is the first one. */
+static inline V *HK(first_or)(const HK(total) * sum, V *own) { return sum->has_J ? own : sum->J; }
+
+/* Adds w times that slope. */
+static inline void HK(add_slope)(int length, real w, const V *J, HK(total) * sum) {
+    if (sum->has_J)
+        HK(add)(length, w, J, sum->J);
+    else
+        for (int i = 0; w != R(1.0) && i < length; i++) sum->J[i] = sum->J[i] * w;
+    sum->has_J = 1;
+}
+
 /* The guard's weight of a correction; keeps its part of trust and domain. */
 static inline int HK(guarded)(const hk_plan *p, int guard, const V *q, real w, HK(total) * sum,
                               V *g, V *slope, V *work) {
@@ -70,6 +83,7 @@ static inline void HK(tip_correction)(const hk_plan *p, const int32_t *part, con
     V *x = HK(take)(&work, m), *J = HK(take)(&work, m * n), *slope = HK(take)(&work, n), g;
     HK(shortening) how;
     how.along = HK(take)(&work, m);
+    J = HK(first_or)(sum, J);
     HK(regress)(p, at, q, x, sum->J ? J : NULL, own ? sum->seen.phi : NULL, work);
     if (own) sum->seen.phi_of = at;
     if (HK(guarded)(p, guard, q, w, sum, &g, slope, work)) {
@@ -81,7 +95,7 @@ static inline void HK(tip_correction)(const hk_plan *p, const int32_t *part, con
         for (int i = 0; i < m; i++) x[i] = x[i] * how.factor;
     }
     HK(add)(m, w, x, sum->x);
-    if (sum->J) HK(add)(m * n, w, J, sum->J);
+    if (sum->J) HK(add_slope)(m * n, w, J, sum);
 }
 
 /* Adds a correction inside the robot, w (f + s(q)) with s = F(z + delta(q)) - f. Rows that fade or
@@ -94,6 +108,7 @@ static inline void HK(inner_correction)(const hk_plan *p, int base, const int32_
     V *J = HK(take)(&work, 3 * n), *slope = HK(take)(&work, n), along[3], x[3], g;
     HK(shortening) how;
     how.along = along;
+    J = HK(first_or)(sum, J);
     HK(regress)(p, part[HK_REGRESSOR], q, z, sum->J ? turn : NULL, NULL, work);
     for (int i = 0; i < k; i++) z[i] = z[i] + sum->z[i];
     HK(from_coordinates)(p, base, z, x, sum->J ? C : NULL, work);
@@ -120,7 +135,7 @@ static inline void HK(inner_correction)(const hk_plan *p, int base, const int32_
     }
     HK(add)(3, w, x, sum->x);
     if (sum->J) HK(add)(3 * k, w, C, sum->C);
-    if (sum->J) HK(add)(3 * n, w, J, sum->J);
+    if (sum->J) HK(add_slope)(3 * n, w, J, sum);
 }
 
 static inline void HK(hybrid)(const hk_plan *p, int at, const V *q, V *x, V *J, V *distance,
@@ -128,7 +143,7 @@ static inline void HK(hybrid)(const hk_plan *p, int at, const V *q, V *x, V *J, 
     const int32_t *node = p->code + at, *more = node + HK_MORE, *part = more + HK_FIRST;
     const int n = node[HK_N], m = node[HK_M], base = more[HK_BASE], count = more[HK_COUNT];
     const real *w = hk_numbers(p, at), share = w[count]; /* of f beside inner corrections */
-    const int inner = w[count + 1] != R(0.0), k = inner ? HK(n_coordinates)(p, base) : 0;
+    const int inner = w[count + 1] != R(0.0), k = base < 0 ? 0 : HK(n_coordinates)(p, base);
     HK(total) sum;
     sum.x = HK(take)(&work, m);
     sum.J = J;
@@ -136,28 +151,28 @@ static inline void HK(hybrid)(const hk_plan *p, int at, const V *q, V *x, V *J, 
     sum.C0 = HK(take)(&work, 3 * k);
     sum.C = HK(take)(&work, 3 * k);
     sum.slope = HK(take)(&work, n);
-    if (inner) sum.in = HK(inside_of)(p, base, &work);
+    if (base >= 0) sum.in = HK(inside_of)(p, base, &work);
     sum.seen = HK(seen_of)(p, &work);
-    sum.has_C0 = sum.fades = 0;
+    sum.has_J = sum.has_C0 = sum.fades = 0;
     sum.measures = distance != NULL;
     sum.trust = SPLAT(1.0);
     sum.farthest = SPLAT(0.0);
     for (int i = 0; i < m; i++) sum.x[i] = SPLAT(0.0);
-    for (int i = 0; J && i < m * n; i++) J[i] = SPLAT(0.0);
+    if (base >= 0) HK(coordinates)(p, base, q, sum.z, &sum.in);
     if (inner) {
-        HK(coordinates)(p, base, q, sum.z, &sum.in);
         HK(from_coordinates)(p, base, sum.z, sum.f, NULL, work);
         HK(add)(3, share, sum.f, sum.x);
         for (int i = 0; i < 3 * k; i++) sum.C[i] = SPLAT(0.0);
         if (J && share != R(0.0)) HK(add)(3 * k, share, HK(base_slope)(p, base, &sum, work), sum.C);
     } else if (base >= 0)
-        HK(chain)(p, base, q, sum.x, J, work);
+        HK(from_coordinates)(p, base, sum.z, sum.x, J ? sum.C : NULL, work);
     for (int c = 0; c < count; c++, part += HK_STRIDE)
         if (part[HK_INNER])
             HK(inner_correction)(p, base, part, q, w[c], &sum, work);
         else
             HK(tip_correction)(p, part, q, m, w[c], &sum, work);
-    if (inner && J) HK(pull)(p, base, &sum.in, sum.C, J);
+    for (int i = 0; J && !sum.has_J && i < m * n; i++) J[i] = SPLAT(0.0);
+    if (base >= 0 && J) HK(pull)(p, base, &sum.in, sum.C, J);
     if (more[HK_DRIFT] >= 0) {
         V *d = HK(take)(&work, m), *slope = HK(take)(&work, m * n);
         HK(regress)(p, more[HK_DRIFT], q, d, J ? slope : NULL, NULL, work);

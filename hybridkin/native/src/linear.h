@@ -31,6 +31,9 @@ HK_INLINE void HK(multiply)(int k, int n, const V *restrict C, const V *restrict
 }
 
 /* y += w x, for `length` of them. */
-static inline void HK(add)(int length, real w, const V *x, V *y) {
-    for (int i = 0; i < length; i++) y[i] = y[i] + x[i] * w;
+static inline void HK(add)(int length, real w, const V *restrict x, V *restrict y) {
+    int i = 0;
+    for (; HK_COMMON(i + 9 <= length); i += 9)
+        for (int j = i; j < i + 9; j++) y[j] = y[j] + x[j] * w;
+    for (; i < length; i++) y[i] = y[i] + x[i] * w;
 }

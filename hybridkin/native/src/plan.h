@@ -41,7 +41,11 @@ typedef int64_t hk_bits;
 #define HK_COMMON(sizes) (sizes) /* have instances of their own, which keep all in registers */
 #define HK_INLINE static inline __attribute__((always_inline))
 #define HK_NOINLINE __attribute__((noinline))
-
+#endif
+#if defined(__GNUC__) && !defined(__clang__) && !defined(HK_KINDS) /* clang does so by itself */
+#define HK_UNROLLED _Pragma("GCC unroll 9")
+#else
+#define HK_UNROLLED
 #endif
 #include "kinds.h"
 #define HK_MOST_Z(n, S) (3 * (S) > (n) ? 3 * (S) : (n)) /* inner coordinates */

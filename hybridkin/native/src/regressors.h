@@ -4,16 +4,12 @@
 HK_INLINE void HK(activate)(int activation, int count, V *a, V *d) {
     switch (activation) {
     case HK_LOGISTIC:
-        for (int i = 0; i < count; i++) {
-            a[i] = HK(logistic)(a[i]);
-            d[i] = a[i] - a[i] * a[i];
-        }
+        HK(logistics)(count, a);
+        for (int i = 0; i < count; i++) d[i] = a[i] - a[i] * a[i];
         break;
     case HK_TANH:
-        for (int i = 0; i < count; i++) {
-            a[i] = HK(tanh)(a[i]);
-            d[i] = R(1.0) - a[i] * a[i];
-        }
+        HK(tanhs)(count, a);
+        for (int i = 0; i < count; i++) d[i] = R(1.0) - a[i] * a[i];
         break;
     case HK_SIN:
         for (int i = 0; i < count; i++) {
@@ -23,44 +19,87 @@ HK_INLINE void HK(activate)(int activation, int count, V *a, V *d) {
         }
         break;
     default: /* a Gaussian, of minus half the squared distance */
-        for (int i = 0; i < count; i++) d[i] = a[i] = HK(exp)(HK(min)(a[i], SPLAT(0.0)));
+        for (int i = 0; i < count; i++) a[i] = HK(min)(a[i], SPLAT(0.0));
+        HK(exps)(count, a);
+        for (int i = 0; i < count; i++) d[i] = a[i];
     }
 }
 
-/* Adds the share of `count` hidden units in x (m) and in its slope J (m, n) by u (n), where not
-   NULL, and writes their sigma into `features`, where not NULL. */
-HK_INLINE void HK(group_of)(int n, int m, int count, int activation, const real *w, const V *u,
-                            V shift, V *x, V *J, V *features) {
+/* The next `count` units: their sigma' in d, and their share in x (m). `features` as for
+   `units_of`. The weights of HK_GROUP units stand together: W transposed (n, HK_GROUP), b
+   (HK_GROUP), output weights (m, HK_GROUP); units that fill up the last group have none. */
+HK_INLINE void HK(next_units)(int n, int m, int count, int activation, const real *w, const V *u,
+                              V shift, V *x, V *d, V *features) {
     const real *bias = w + HK_GROUP * n, *out = bias + HK_GROUP;
-    V s[HK_GROUP], d[HK_GROUP];
+    V s[HK_GROUP];
     for (int i = 0; i < count; i++) s[i] = shift + bias[i];
+    HK_UNROLLED
     for (int j = 0; j < n; j++)
         for (int i = 0; i < count; i++) s[i] = s[i] + u[j] * w[HK_GROUP * j + i];
     HK(activate)(activation, count, s, d);
-    for (int i = 0; features && i < count; i++) features[i] = s[i];
     for (int o = 0; o < m; o++, out += HK_GROUP) {
-        V row[HK_MAX_N], sum = x[o];
-        for (int i = 0; i < count; i++) sum = sum + s[i] * out[i];
-        x[o] = sum;
-        if (!J) continue;
-        for (int j = 0; j < n; j++) row[j] = J[n * o + j];
-        for (int i = 0; i < count; i++) {
-            const V t = d[i] * out[i];
-            for (int j = 0; j < n; j++) row[j] = row[j] + t * w[HK_GROUP * j + i];
-        }
-        for (int j = 0; j < n; j++) J[n * o + j] = row[j];
+        V sum = s[0] * out[0]; /* which need not wait for the units before */
+        for (int i = 1; i < count; i++) sum = sum + s[i] * out[i];
+        x[o] = x[o] + sum;
     }
+    for (int i = 0; features && i < count; i++) features[i] = s[i];
 }
 
-/* All hidden units. The weights of HK_GROUP units stand together: W transposed (n, HK_GROUP),
-   b (HK_GROUP), output weights (m, HK_GROUP). */
+/* Adds what `count` units contribute to a part of their slope J (m, n): the rows o to o + rows, of
+   these the columns j to j + columns, which fit into registers. d (count) holds sigma'. */
+HK_INLINE void HK(slope_part)(int n, int m, int count, const real *w, const V *d, int o, int rows,
+                              int j, int columns, V *J) {
+    V sum[HK_TILE][HK_MAX_N], t[HK_TILE];
+    J += n * o + j;
+    for (int r = 0; r < rows; r++)
+        for (int c = 0; c < columns; c++) sum[r][c] = J[n * r + c];
+    for (; count > 0; count -= HK_GROUP, d += HK_GROUP, w += HK_GROUP * (n + 1 + m)) {
+        const real *in = w + HK_GROUP * j, *out = w + HK_GROUP * (n + 1 + o);
+        for (int i = 0; i < HK_GROUP && i < count; i++) {
+            for (int r = 0; r < rows; r++) t[r] = d[i] * out[HK_GROUP * r + i];
+            for (int c = 0; c < columns; c++)
+                for (int r = 0; r < rows; r++) sum[r][c] = sum[r][c] + t[r] * in[HK_GROUP * c + i];
+        }
+    }
+    for (int r = 0; r < rows; r++)
+        for (int c = 0; c < columns; c++) J[n * r + c] = sum[r][c];
+}
+
+/* The same for all columns of these rows. */
+HK_INLINE void HK(slope_rows)(int n, int m, int count, const real *w, const V *d, int o, int rows,
+                              V *J) {
+    int j = 0;
+    if (HK_COMMON(1)) {
+        for (; j + 9 <= n; j += 9) HK(slope_part)(n, m, count, w, d, o, rows, j, 9, J);
+        for (; j + 6 <= n; j += 6) HK(slope_part)(n, m, count, w, d, o, rows, j, 6, J);
+        for (; j + 3 <= n; j += 3) HK(slope_part)(n, m, count, w, d, o, rows, j, 3, J);
+    }
+    if (j < n) HK(slope_part)(n, m, count, w, d, o, rows, j, n - j, J);
+}
+
+/* Adds the share of all hidden units in x (m) and in its slope J (m, n) by u (n), where not NULL,
+   and writes their sigma into `features`, where not NULL: whole groups, or halves of them. */
 HK_INLINE void HK(units_of)(int n, int m, int units, int activation, const real *w, const V *u,
                             V shift, V *x, V *J, V *features) {
-    for (; units > HK_GROUP / 2; units -= HK_GROUP, w += HK_GROUP * (n + 1 + m)) {
-        HK(group_of)(n, m, HK_GROUP, activation, w, u, shift, x, J, features);
-        if (features) features += HK_GROUP;
+    const int stride = HK_GROUP * (n + 1 + m);
+    V d[HK_AT_ONCE];
+    while (units > 0) {
+        const real *first = w;
+        int count = 0;
+        for (; units > 0 && count < HK_AT_ONCE; units -= HK_GROUP, w += stride) {
+            const int half = units <= HK_GROUP / 2;
+            if (half)
+                HK(next_units)(n, m, HK_GROUP / 2, activation, w, u, shift, x, d + count, features);
+            else
+                HK(next_units)(n, m, HK_GROUP, activation, w, u, shift, x, d + count, features);
+            count += half ? HK_GROUP / 2 : HK_GROUP;
+            if (features) features += HK_GROUP;
+        }
+        int o = 0;
+        for (; J && o + HK_TILE <= m; o += HK_TILE)
+            HK(slope_rows)(n, m, count, first, d, o, HK_TILE, J);
+        for (; J && o < m; o++) HK(slope_rows)(n, m, count, first, d, o, 1, J);
     }
-    if (units > 0) HK(group_of)(n, m, HK_GROUP / 2, activation, w, u, shift, x, J, features);
 }
 
 #if HK_LANES == 1 && defined(HK_ROW_LANES)
@@ -69,12 +108,6 @@ static void hkr_units(int n, int m, int units, int activation, const real *w, co
                       real shift, real *x, real *J, real *features, real *work);
 #endif
 #if HK_LANES > 1
-static inline V HK(load)(const real *a) {
-    V v;
-    __builtin_memcpy(&v, a, sizeof v);
-    return v;
-}
-
 static inline real HK(sum)(V v) {
     for (int half = HK_LANES / 2; half > 0; half /= 2)
         for (int i = 0; i < half; i++) v[i] += v[i + half];
@@ -97,7 +130,9 @@ HK_INLINE void hkr_units_of(int n, int m, int units, int activation, const real 
             s[i] = HK(load)(of + HK_GROUP * n) + shift;
             for (int j = 0; j < n; j++) s[i] = s[i] + HK(load)(of + HK_GROUP * j) * u[j];
         }
-        HK(activate)(activation, count, s, d);
+        int done = 0; /* few at a time: the lanes of `count` units fill registers */
+        for (; done + 4 <= count; done += 4) HK(activate)(activation, 4, s + done, d + done);
+        for (; done < count; done++) HK(activate)(activation, 1, s + done, d + done);
         for (int i = 0; features && i < count; i++, features += HK_LANES)
             __builtin_memcpy(features, s + i, sizeof(V));
         for (int o = 0; o < m; o++) {
@@ -138,8 +173,6 @@ static inline void HK(units)(int n, int m, int units, int activation, const real
     (void)work;
     if (HK_COMMON(n == 9 && m == 3))
         HK(units_of)(9, 3, units, activation, w, u, shift, x, J, features);
-    else if (HK_COMMON(n == 6 && m == 3))
-        HK(units_of)(6, 3, units, activation, w, u, shift, x, J, features);
     else
         HK(units_of)(n, m, units, activation, w, u, shift, x, J, features);
 #endif
@@ -151,6 +184,21 @@ static inline void HK(scaled)(int n, const real *center, const V *q, V *u) {
     for (int j = 0; j < n; j++) u[j] = (q[j] - center[j]) * center[n + j];
 }
 
+/* From the sums of the units x (m) and their slopes J (m, n) by u to c + D u + x, and the slopes by
+ * q. */
+HK_INLINE void HK(network_end)(int n, int m, int gaussian, const real *inverse, const real *c,
+                               const V *u, V *x, V *J) {
+    const real *direct = c + m;
+    for (int o = 0; o < m; o++, direct += n) {
+        for (int j = 0; J && j < n; j++) {
+            if (gaussian) J[n * o + j] = J[n * o + j] - x[o] * u[j];
+            J[n * o + j] = (J[n * o + j] + direct[j]) * inverse[j];
+        }
+        x[o] = x[o] + c[o];
+        for (int j = 0; j < n; j++) x[o] = x[o] + u[j] * direct[j];
+    }
+}
+
 /* x = c + D u + V sigma(W u + b): networks with direct link, affine maps, Gaussian kernels.
 
    Writes the features too where asked: the hidden units', then u. A Gaussian at u_i is the unit
@@ -160,21 +208,17 @@ static inline void HK(elm)(const hk_plan *p, int at, const V *q, V *x, V *J, V *
     const int n = node[HK_N], m = node[HK_M], n_hidden = more[0], activation = more[1];
     const int gaussian = activation == HK_GAUSSIAN;
     const real *center = hk_numbers(p, at), *inverse = center + n;
-    const real *intercept = inverse + n, *direct = intercept + m;
+    const real *intercept = inverse + n, *units = intercept + m + m * n;
     V *u = HK(take)(&work, n), shift = SPLAT(0.0);
     HK(scaled)(n, center, q, u);
     for (int j = 0; gaussian && j < n; j++) shift = shift - R(0.5) * u[j] * u[j];
     for (int o = 0; o < m; o++) x[o] = SPLAT(0.0);
     for (int k = 0; J && k < m * n; k++) J[k] = SPLAT(0.0);
-    HK(units)(n, m, n_hidden, activation, direct + m * n, u, shift, x, J, features, work);
-    for (int o = 0; o < m; o++) {
-        for (int j = 0; J && j < n; j++) {
-            if (gaussian) J[n * o + j] = J[n * o + j] - x[o] * u[j];
-            J[n * o + j] = (J[n * o + j] + direct[n * o + j]) * inverse[j];
-        }
-        x[o] = x[o] + intercept[o];
-        for (int j = 0; j < n; j++) x[o] = x[o] + u[j] * direct[n * o + j];
-    }
+    HK(units)(n, m, n_hidden, activation, units, u, shift, x, J, features, work);
+    if (HK_COMMON(n == 9 && m == 3 && !gaussian))
+        HK(network_end)(9, 3, 0, inverse, intercept, u, x, J);
+    else
+        HK(network_end)(n, m, gaussian, inverse, intercept, u, x, J);
     if (features)
         for (int j = 0; j < n; j++) features[n_hidden + j] = u[j];
 }
