@@ -49,32 +49,17 @@ LOSSES: dict[str, _Loss] = {
 
 
 class Accuracy(NamedTuple):
-    """When a fit ends.
-
-    Attributes
-    ----------
-    tolerance : float
-        Relative change by a step, of the objective or of theta.
-    rounds : int
-        Rounds of the noise level.
-    least_gain : float
-        Gain of a step, in what the noise of one coordinate adds to the objective.
-    """
+    """When a fit ends: relative change of a step, and rounds of the noise level."""
 
     tolerance: float
     rounds: int
-    least_gain: float
-
-    def change(self, n_coordinates: float) -> float:
-        """Return the relative change of the objective at which a fit ends."""
-        return max(self.tolerance, self.least_gain / n_coordinates)
 
 
-EXACT = Accuracy(1e-12, 12, 0.0)
-HELD_OUT = Accuracy(1e-6, 12, 0.0)  # for errors of held-out rows
-ROUGH = Accuracy(1e-5, 2, 0.0)  # to compare initial guesses
-REFITTED = Accuracy(1e-4, 2, 1.0)  # for errors of held-out rows, with corrections
-COMPARED = Accuracy(1e-4, 1, 1.0)  # for errors of held-out rows, to compare sets
+EXACT = Accuracy(1e-12, 12)
+HELD_OUT = Accuracy(1e-6, 12)  # for errors of held-out rows
+ROUGH = Accuracy(1e-5, 2)  # to compare initial guesses
+REFITTED = Accuracy(1e-4, 2)  # for errors of held-out rows, with corrections
+COMPARED = Accuracy(1e-4, 1)  # for errors of held-out rows, to compare sets
 
 
 class Slopes(NamedTuple):
@@ -375,7 +360,7 @@ def solve(
             whitened,
             theta,
             bounds=(problem.low, problem.high),
-            ftol=accuracy.change(3.0 * float(weight.sum())),
+            ftol=accuracy.tolerance,
             xtol=accuracy.tolerance,
             gtol=accuracy.tolerance,
             max_nfev=100,
