@@ -7,6 +7,7 @@ import torch
 from hybridkin import (
     ConstantCurvatureChain,
     ElasticTendonChain,
+    GeometryChoice,
     HybridForwardModel,
     RigidChain,
     calibrate,
@@ -224,6 +225,20 @@ def test_rows_held_out_of_a_long_log_are_predicted_from_evenly_spaced_others():
     noisy = torch.from_numpy(measured(truth, q))
     chain = refitted(choice.start, torch.from_numpy(q), noisy, weights)
     assert (chain(torch.from_numpy(q)) - exact).norm(dim=1).mean() < 0.3 * NOISE
+
+
+def test_the_chain_alone_is_that_of_the_calibration_far_within_the_noise():
+    truth = bent(base=moved_base())
+    nominal = ConstantCurvatureChain([0.05])
+    q = chambers(80)
+    x = measured(truth, q)
+    at = torch.from_numpy(chambers(50, seed=2))
+    for choice in (choose_geometry(nominal, q, x), GeometryChoice(nominal, ("base",))):
+        whole = choice.calibrate(q, x).chain
+        apart = (choice.fitted(q, x)(at) - whole(at)).norm(dim=1)
+        assert apart.max() < 0.1 * NOISE
+        assert (whole(at) - nominal(at)).norm(dim=1).min() > 100 * NOISE
+    assert GeometryChoice(nominal, ()).fitted(q, x) is nominal
 
 
 def test_unknown_parameters_are_named():

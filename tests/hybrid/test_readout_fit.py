@@ -116,6 +116,23 @@ def test_gradient_is_zero_at_the_optimum(robot, kind, rng):
         assert objective(readout + move) > objective(readout)
 
 
+@pytest.mark.parametrize("n", [150, 1500])
+def test_down_to_the_noise_held_out_rows_are_predicted_as_well(n, rng):
+    """The search takes part of the steps; of many rows every second one chooses the penalties."""
+    chain, q = rows_of("trunk", rng, n + 300)
+    truth, x = disturbed(chain, q, rng, noise=0.003)
+    features = QuadraticFeatures.of_range(q[:n])
+    errors = []
+    for exact in (True, False):
+        fit = read_out(chain, features, q[:n], x[:n], exact=exact)
+        predicted = hybrid(chain, fit.readout)(q[n:])
+        errors.append(float((predicted - truth(q[n:])).norm(dim=1).mean()))
+        assert (fit.gradient < 1e-7) == exact
+        assert bool(fit.scores) == (exact or n == 150)  # of few rows all choose
+    assert errors[1] < 1.05 * errors[0]
+    assert errors[1] < 0.2 * float((chain(q[n:]) - truth(q[n:])).norm(dim=1).mean())
+
+
 def ridge(rng, unused, n=30, m=3, C=4, K=7, n_linear=0):
     rows = uniform(rng, n, m, C), uniform(rng, n, K), uniform(rng, n, m)
     linear = Linearised(*rows, n_linear=n_linear)
