@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybridkin._core.arrays import countable
 from hybridkin._core.directions import moved_directions
+from hybridkin._core.groups import Groups
 
 # fractions of rows by distance: end of the inner, start of the outer
 _INNER = 0.4
@@ -92,6 +93,17 @@ def check_unscaled(name: str, values: NDArray, meant: str) -> None:
 def evenly_spaced(n: int, most: int) -> NDArray[np.intp]:
     """Return the places of at most `most` of n rows, evenly spaced."""
     return np.linspace(0, n - 1, min(most, n)).astype(np.intp)
+
+
+def evenly_spaced_of(groups: Groups, most: int) -> NDArray[np.intp]:
+    """Return `evenly_spaced` rows, or all rows where these would lack a whole group.
+
+    Their groups are then those of all rows, so that the same ones are held out.
+    """
+    rows = evenly_spaced(len(groups), most)
+    if groups.whole and groups.take(rows).number < groups.number:
+        return np.arange(len(groups))
+    return rows
 
 
 def inner_and_outer(X: NDArray) -> tuple[NDArray, NDArray]:

@@ -393,7 +393,10 @@ class ElasticTendonChain(ElasticBody, LengthDrivenChain):
         return codes, places, _slack.responses_of(taut, elasticity)
 
     def _found_once(self, compiled: ElasticTendonChain, rows: Tensor) -> _Found:
-        """Return `_find`, in a search that starts at the tendons that move the compiled chain."""
+        """Return `_find`, from a guess: the tendons that move the tip of the compiled chain.
+
+        A slack one does not, so that the search confirms nearly all guesses at its first look.
+        """
         _, J = evaluate(compiled, rows.numpy(), jacobian=True)
         guess = _slack.as_codes(torch.from_numpy(J).ne(0.0).any(1))
         occurring = _slack.Occurring(self._elasticity().to(rows))

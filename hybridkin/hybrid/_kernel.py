@@ -16,7 +16,7 @@ from sklearn.metrics.pairwise import euclidean_distances
 
 from hybridkin._core.groups import Groups
 from hybridkin._core.turns import TURNS
-from hybridkin.calibration.measured import distance, evenly_spaced
+from hybridkin.calibration.measured import distance, evenly_spaced_of
 
 _MOST = 10_000  # rows; the matrices then take 3 GB
 _FOLDS = 5
@@ -56,10 +56,7 @@ def tuned_kernel(X: NDArray, error: NDArray, weights: NDArray, groups: Groups) -
     spread = np.average(squares, axis=0, weights=weights).mean() or 1.0
 
     def held_out(most: int) -> _HeldOut:
-        rows = evenly_spaced(len(X), most)
-        # Without a whole motion the folds would not be those of the log.
-        if groups.whole and groups.take(rows).number < groups.number:
-            rows = np.arange(len(X))
+        rows = evenly_spaced_of(groups, most)
         return _HeldOut(X[rows], error[rows], weights[rows], groups.take(rows), spread)
 
     few = held_out(_FIRST)

@@ -98,11 +98,7 @@ def _comparable(errors: Sequence[float]) -> NDArray:
 def _quick_corrections(spec: Spec, rows: Rows) -> dict[str, ErrorModel]:
     """Return corrections with the penalties that suit these mechanics."""
     corrections = Candidates(
-        {
-            "none": NoCorrection(),
-            "quadratic": QuadraticModel("serial"),
-            "kernel": KernelModel(),
-        }
+        {"none": NoCorrection(), "quadratic": QuadraticModel("serial"), "kernel": KernelModel()}
     )
     quick = replace(spec, error_model=corrections).without_errors()
     return Settled.of(fit_hybrid(quick, rows), rows).models

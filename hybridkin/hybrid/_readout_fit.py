@@ -15,7 +15,7 @@ from torch import Tensor
 from hybridkin._core.arrays import identity
 from hybridkin._core.groups import Groups
 from hybridkin._core.model import ForwardModel
-from hybridkin.calibration.measured import points
+from hybridkin.calibration.measured import evenly_spaced_of, points
 from hybridkin.hybrid import _linearised
 from hybridkin.hybrid._features import Features, Readout
 from hybridkin.hybrid._linearised import Linearised, Pair
@@ -110,11 +110,12 @@ def fit_readout(
         The readout with its penalties and held-out residuals.
     """
     if alphas is None and not exact and len(rows) > _ENOUGH:
-        few = rows.thinned(_ENOUGH)
-        chosen = fit_readout(mechanical, features, few, coupling, exact=False)
-        alphas = chosen.alphas
-        noise_ratio = chosen.noise_ratio
-        start = chosen.readout
+        few = rows.take(evenly_spaced_of(rows.groups, _ENOUGH))
+        if len(few) <= _ENOUGH:
+            chosen = fit_readout(mechanical, features, few, coupling, exact=False)
+            alphas = chosen.alphas
+            noise_ratio = chosen.noise_ratio
+            start = chosen.readout
     x = torch.from_numpy(rows.tips.astype(np.float64))
     weight = torch.from_numpy(rows.counts.astype(np.float64))
     with torch.no_grad():

@@ -35,6 +35,7 @@ CHAINS = {
     "chambers": chambers,
     "tendons": tendons,
     "elastic": elastic,
+    "fifteen elastic": lambda: ElasticTendonChain(RADII, LENGTHS, n_actuators=5),
     "part": lambda: tendons().with_tip(1.4),
     "elastic part": lambda: elastic().with_tip(1.4),
     "markers": lambda: chambers().with_markers(MARKERS),

@@ -133,6 +133,17 @@ def test_down_to_the_noise_held_out_rows_are_predicted_as_well(n, rng):
     assert errors[1] < 0.2 * float((chain(q[n:]) - truth(q[n:])).norm(dim=1).mean())
 
 
+def test_no_motion_is_missing_among_the_rows_that_choose_penalties(rng):
+    """The second row is not among the evenly spaced ones: as a motion it makes all rows choose."""
+    chain, q = rows_of("cables", rng, 2200)
+    x = disturbed(chain, q, rng, noise=0.003)[1]
+    row = torch.arange(2200)
+    for groups, all_choose in ((row % 2, False), ((row == 1).long(), True)):
+        fit = read_out(chain, Features.of_range(q), q, x, groups=groups, exact=False)
+        assert bool(fit.scores) == all_choose
+        assert not torch.from_numpy(fit.residual).isnan().any()
+
+
 def ridge(rng, unused, n=30, m=3, C=4, K=7, n_linear=0):
     rows = uniform(rng, n, m, C), uniform(rng, n, K), uniform(rng, n, m)
     linear = Linearised(*rows, n_linear=n_linear)
