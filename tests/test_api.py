@@ -90,12 +90,12 @@ def test_modules_with_an_underscore_are_their_folders_own(path):
             assert not any(re.match("_[^_]", name) for name in names_within), module
 
 
-API = (ROOT.parent / "docs/api.rst").read_text(encoding="utf-8")
+API = (ROOT.parent / "docs/reference/api.rst").read_text(encoding="utf-8")
 DOCUMENTED = {*re.findall(r"^   (\w[\w.]*)$", API, flags=re.MULTILINE)}
 
 
 def is_public(module, name):
-    """Return whether docs/api.rst lists a name, or the module that has it in its `__all__`."""
+    """Return whether docs/reference/api.rst lists a name, or the module that has it in its `__all__`."""
     if module == "hybridkin":
         return name in hybridkin.__all__
     path = module.removeprefix("hybridkin.")

@@ -1,26 +1,20 @@
-"""The pages can be reached, their code runs, and every public name says what it takes and gives."""
+"""The pages can be reached, and every public name says what it takes and gives."""
 
 import inspect
+import os
 import re
-import runpy
-import shlex
-import sys
-import textwrap
 from enum import Enum
 from pathlib import Path
 
-import matplotlib.pyplot as plt
-import numpy as np
-import pandas as pd
 import pytest
-import torch
+from page_blocks import DOCS, GENERATED, PAGES, SHELVES, blocks_of
 
 import hybridkin
-from hybridkin import ForwardModel, app, load_model, robots
-from hybridkin.app.cli.main import main
+from hybridkin import app
 
-DOCS = Path(__file__).parent.parent / "docs"
-PAGES = sorted(DOCS.glob("*.md"))
+WRITTEN = [page for page in PAGES if page.name not in GENERATED and page.name != "index.md"]
+# Words alone, or equations.
+WITHOUT_CODE = {"glossary.md"}
 MODULES = (
     "app",
     "datasets",
@@ -46,34 +40,36 @@ WITHOUT_UNIT = {
 # The pages
 
 
-def blocks(page, language):
-    text = (DOCS / page).read_text(encoding="utf-8")
-    found = re.findall(rf"^ *```{language}\n(.*?)```", text, re.DOTALL | re.MULTILINE)
-    return [textwrap.dedent(block) for block in found]
+def listed_in(page):
+    """Return the pages that the tables of contents of a page list, from the folder of the pages."""
+    tables = re.findall(r"```\{toctree\}\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+    lines = [line for table in tables for line in table.splitlines()]
+    return {line for line in lines if line and not line.startswith(":")}
 
 
 def test_every_page_is_in_the_table_of_contents():
-    listed = {line for block in blocks("index.md", r"\{toctree\}") for line in block.splitlines()}
-    pages = {page.stem for page in PAGES} - {"index"} | {"api"}
-    assert pages <= listed
-    assert {name for name in listed if name and ":" not in name} - pages == {"gallery/index"}
+    pages = {page.relative_to(DOCS).with_suffix("").as_posix() for page in PAGES}
+    listed = listed_in(DOCS / "index.md")
+    assert listed == pages - {"index"} | {"reference/api", "gallery/index"}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_links_lead_somewhere(page):
-    examples = {f"gallery/{p.stem}.rst" for p in DOCS.parent.glob("examples/plot_*.py")}
+    examples = DOCS.parent.glob("examples/plot_*.py")
+    made = {DOCS / "gallery" / "index.rst"} | {DOCS / f"gallery/{p.stem}.rst" for p in examples}
     for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8")):
         if link.startswith("http"):
             continue
         name, _, heading = link.partition("#")
-        assert not name or (DOCS / name).is_file() or name in {*examples, "gallery/index.rst"}, link
+        file = Path(os.path.normpath(page.parent / name)) if name else page
+        assert file.is_file() or file in made, link
         if heading:
-            headings = re.findall(r"^#+ (.*)$", (DOCS / (name or page.name)).read_text(), re.M)
+            headings = re.findall(r"^#+ (.*)$", file.read_text(), re.M)
             assert heading in {h.lower().replace(" ", "-").replace("'", "") for h in headings}, link
 
 
 def test_equations_are_numbered_as_they_come():
-    text = (DOCS / "theory.md").read_text(encoding="utf-8")
+    text = (DOCS / "explanation" / "theory.md").read_text(encoding="utf-8")
     numbers = [int(n) for n in re.findall(r"^\$\$ .* \$\$ \((\d+)\)$", text, re.MULTILINE)]
     assert numbers == list(range(1, len(numbers) + 1))
     assert len(numbers) > 20
@@ -81,109 +77,23 @@ def test_equations_are_numbered_as_they_come():
     assert {int(n) for n in re.findall(r"(?<=[\s~])\((\d{1,2})\)", outside)} <= {*numbers}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "page", ["getting_started.md", "your_robot.md", "rigid_arms.md", "next_rows.md"]
-)
-def test_code_of_a_page_runs_as_printed(page, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    for block in blocks(page, "toml"):
-        Path("robot.toml").write_text(block, encoding="utf-8")
-    space = {}
-    for block in blocks(page, "python"):
-        exec(compile(block, page, "exec"), space)
-    if page == "your_robot.md":
-        errors = dict(re.findall(r"(\w+): mean ([\d.]+) mm", capsys.readouterr().out))
-        assert float(errors["hybrid"]) < 0.6 * float(errors["mechanical"])
-        assert len(Path("commands.csv").read_text().splitlines()) == len(space["path"].x)
-    if page == "rigid_arms.md":
-        assert "q_max=1.5 to 2 of the model, dq_max=3 to 4 of the model" in capsys.readouterr().out
-        assert "<!-- measured in May -->" in Path("calibrated.urdf").read_text()
-        assert space["result"].rmse < 2.5e-4
+def test_every_page_is_read_by_the_tests_of_its_shelf():
+    folders = {page.parent.name for page in PAGES} - {"docs"}
+    assert folders == {*SHELVES}
+    assert all((DOCS.parent / f"tests/docs/test_{shelf}.py").is_file() for shelf in folders)
+    assert not blocks_of(DOCS / "index.md")
 
 
-@pytest.mark.parametrize("page", sorted(path.name for path in DOCS.glob("*.md")))
-def test_code_of_every_page_is_python(page):
-    for block in blocks(page, "python"):
-        compile(block, page, "exec")
-
-
-@pytest.mark.slow
-def test_models_of_the_page_on_the_inside_run_as_printed(capsys):
-    mechanical, error, writer, layout = blocks("how_it_works.md", "python")
-    space = {}
-    exec(compile(mechanical, "how_it_works.md", "exec"), space)
-    printed = capsys.readouterr().out
-    assert "boom 1.045 m" in printed
-    assert "[ True  True  True  True  True]" in printed
-    crane = space["chain"]
-    q = torch.tensor([[0.1, 0.5, 0.2], [-0.3, 0.9, 0.3]], dtype=torch.float64)
-    assert torch.autograd.gradcheck(crane, q.requires_grad_())
-    exec(compile(error, "how_it_works.md", "exec"), space)
-    assert float(capsys.readouterr().out.split()[0]) < 12.5
-    waves = space["model"].error_model_.module_
-    q = torch.from_numpy(space["data"].q[:2])
-    x, J = ForwardModel.forward_and_jacobian(waves, q)
-    torch.testing.assert_close(waves.forward_and_jacobian(q), (x, J))
-    exec(
-        compile(writer + "from hybridkin._core.stored import Layout\n" + layout, "", "exec"), space
-    )
-    assert space["layout"].write_plan is space["write_plan"]
-
-
-@pytest.mark.slow
-def test_code_of_the_learners_page_runs_as_printed(capsys):
-    exec(compile(blocks("elm.md", "python")[0], "elm.md", "exec"), {})
-    new_rows, left_out = map(float, capsys.readouterr().out.split()[:2])
-    assert new_rows < 0.6  # against the truth without noise
-    assert 0.9 < left_out < 1.2  # the noise is 1
-
-
-@pytest.mark.slow
-def test_the_stream_of_the_learners_page_learns_a_folder_of_parquet(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    Path("night").mkdir()
-    rng = np.random.default_rng(0)
-    chain = robots.bionic_handling_assistant()
-
-    def log(n_rows):
-        q = rng.uniform(0.2, 0.25, (n_rows, 9))
-        x = chain(torch.from_numpy(q)).numpy()
-        return q, x + np.array([0.01, 0.0, 0.0]) + 0.05 * x * x[:, 2:]
-
-    for number in range(4):
-        q, x = log(4000)
-        table = pd.DataFrame(np.hstack([q, x]), columns=[*(f"q{i}" for i in range(9)), *"xyz"])
-        table.astype(np.float32).to_parquet(f"night/{number}.parquet")
-    space = {}
-    exec(compile(blocks("elm.md", "python")[1], "elm.md", "exec"), space)
-    assert space["network"].n_samples_seen_ == 12000  # the first file is held out
-    q, x = log(500)
-    loaded = load_model("night.safetensors")
-    error = np.linalg.norm(loaded.predict(q) - x, axis=1).mean()
-    mechanical = np.linalg.norm(loaded.predict_mechanical(q) - x, axis=1).mean()
-    assert error < 0.3 * mechanical
-    assert loaded.in_domain(q).mean() > 0.8
-
-
-@pytest.mark.slow
-def test_commands_of_two_minutes_at_the_robot_run(tmp_path, monkeypatch, capsys):
-    """Those up to the fit, which is done without auto."""
-    pytest.importorskip("mujoco", reason='needs MuJoCo: pip install "hybridkin[sim]"')
-    studies = DOCS.parent / "examples" / "studies"
-    monkeypatch.setattr(sys, "path", [*sys.path, str(studies)])
-    monkeypatch.chdir(tmp_path)
-    lines = "".join(blocks("two_minutes.md", "console")).splitlines()
-    describe, plan, measure, fit = (shlex.split(line) for line in lines[:4])
-    assert main(describe[1:]) == 0
-    robot = Path("trunk.toml")
-    geometry, _, _ = robot.read_text(encoding="utf-8").partition("[limits]")
-    robot.write_text(geometry + blocks("two_minutes.md", "toml")[0], encoding="utf-8")
-    assert main(plan[1:]) == 0
-    runpy.run_path(str(DOCS.parent / measure[1]))["main"](measure[2:])
-    assert main([*fit[1:], "--folds", "2", "--jobs", "1", "--no-auto"]) == 0
-    assert "25 rows" in capsys.readouterr().out
-    assert Path("model/model.safetensors").is_file()
+@pytest.mark.parametrize("page", WRITTEN, ids=lambda page: page.stem)
+def test_a_page_begins_with_who_needs_it_and_code(page):
+    """The first code comes before the second heading."""
+    text = page.read_text(encoding="utf-8")
+    title, first, *_ = text.split("\n\n")
+    assert title.startswith("# ")
+    assert re.match("(For|You) ", first), "who needs this page?"
+    if page.name not in WITHOUT_CODE:
+        beginning = text.partition("\n## ")[0]
+        assert re.search(r"^```(python|console|toml)\n", beginning, re.MULTILINE)
 
 
 # The gallery
@@ -297,15 +207,9 @@ def check_array(entry, names, what, text):
 
 def test_reference_lists_every_class():
     """Functions and classes of the modules are listed from `__all__` by the pages' template."""
-    text = (DOCS / "api.rst").read_text(encoding="utf-8")
+    text = (DOCS / "reference" / "api.rst").read_text(encoding="utf-8")
     for name, thing in PUBLIC.items():
         if inspect.isclass(thing):
             home = name.split(".")[0]
             listed = re.search(rf"^   (app\.)?{home}(\.\w+)?$", text, re.MULTILINE)
             assert listed, name
-
-
-@pytest.fixture(autouse=True)
-def _close_figures():
-    yield
-    plt.close("all")

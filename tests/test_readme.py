@@ -36,7 +36,7 @@ def commands(text):
 COMMANDS = commands(README)
 FIRST_USE = [c for c in COMMANDS if c[0] == "hybridkin" and c[1] in ("demo", "init", "view")]
 OWN_LOG = [c for c in COMMANDS if c[0] == "hybridkin" and c not in FIRST_USE]
-RECORDING = commands((ROOT / "docs" / "results.md").read_text(encoding="utf-8"))
+RECORDING = commands((ROOT / "docs" / "reference" / "results.md").read_text(encoding="utf-8"))
 
 
 def hybridkin(command):
@@ -180,7 +180,7 @@ QUICK = ["--folds", "2", "--jobs", "1", "--max-rows", "200"]  # of `fit`: less w
 @pytest.mark.slow
 def test_commands_for_a_log_of_ones_own_run(tmp_path, monkeypatch, capsys):
     """Those of the README and of the docs, on the robot and the simulated log of the docs."""
-    page = (ROOT / "docs" / "your_robot.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "tutorials" / "your_robot.md").read_text(encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     Path("robot.toml").write_text(re.search(r"```toml\n(.*?)```", page, re.DOTALL)[1])
     exec(
