@@ -36,9 +36,8 @@ suppress_warnings = ["config.cache"]
 # Reference: from the docstrings.
 default_role = "py:obj"
 autosummary_generate = True
-shutil.rmtree(
-    ROOT / "docs" / "reference" / "api", ignore_errors=True
-)  # or pages of names that are gone stay
+# Pages of names that are gone would stay.
+shutil.rmtree(ROOT / "docs" / "reference" / "api", ignore_errors=True)
 autosummary_ignore_module_all = False
 autodoc_typehints = "none"
 autodoc_class_signature = "mixed"

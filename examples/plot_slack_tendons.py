@@ -5,7 +5,7 @@ On a real robot with nine tendons a plain constant-curvature chain errs by centi
 are slack. `ElasticTendonChain` describes that a tendon can only pull. Every row is predicted by
 models that were fitted without its motion. The recording is not part of the package (its source:
 ``help(hybridkin.datasets.load_ftdcr)``). Without it this example stops, and the picture is that of
-:doc:`another run </slack_tendons>`.
+:doc:`another run </how_to/slack_tendons>`.
 
 .. image:: /images/slack_tendons.png
    :alt: Tip error of every row of held-out motions, before and after

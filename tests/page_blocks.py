@@ -1,9 +1,9 @@
 """The code blocks of a page, run in order in one folder, as a reader of the page does.
 
 `python` blocks share one namespace. A `toml` block is a file: a comment in its first line names it,
-``# scene.toml``, else it is robot.toml; a block that begins with a ``[section]`` replaces this section
-of the file. Of `console` blocks each command runs in this process. `text` and `csv` are outputs.
-Other languages have tests of their own.
+``# scene.toml``, else it is robot.toml; a block that begins with a ``[section]`` replaces this
+section of the file. Of `console` blocks each command runs in this process. `text` and `csv` are
+outputs. Other languages have tests of their own.
 """
 
 import contextlib
@@ -32,6 +32,12 @@ WAITS = ("demo", "view")
 """Commands whose arguments are read only: one takes a minute, one waits for a browser."""
 ELSEWHERE = ("pip", "uv", "git", "cd", "ssh", "mex", "mkoctfile", "cc", "docker", "ros2", "colcon")
 """Programs that no page runs here: they install, or belong to other systems."""
+
+
+def written_on(shelf):
+    """Return the names of the pages on a shelf, without those that are generated."""
+    pages = sorted((DOCS / shelf).glob("*.md"))
+    return [page.stem for page in pages if page.name not in GENERATED]
 
 
 @dataclass(frozen=True)
@@ -156,11 +162,7 @@ def _run_python(arguments):
     assert script.exists(), arguments
     if script.name == "measured_trunk.py":
         pytest.importorskip("mujoco", reason='needs MuJoCo: pip install "hybridkin[sim]"')
-        before = sys.argv
-        sys.argv = [str(script), *arguments[1:]]
-        try:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(sys, "argv", [str(script), *arguments[1:]])
+            patch.setattr(sys, "path", [str(script.parent), *sys.path])
             runpy.run_path(str(script), run_name="__main__")
-        except SystemExit as end:
-            assert not end.code, arguments
-        finally:
-            sys.argv = before

@@ -95,7 +95,7 @@ DOCUMENTED = {*re.findall(r"^   (\w[\w.]*)$", API, flags=re.MULTILINE)}
 
 
 def is_public(module, name):
-    """Return whether docs/reference/api.rst lists a name, or the module that has it in its `__all__`."""
+    """Return whether the API page lists a name, or the module that has it in its `__all__`."""
     if module == "hybridkin":
         return name in hybridkin.__all__
     path = module.removeprefix("hybridkin.")

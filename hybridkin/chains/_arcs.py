@@ -1,8 +1,8 @@
 """From the arcs of a chain to the position of its tip, and the derivatives.
 
 The batch comes last: lengths (S, ...), vectors as three tensors x, y, z. The formulas are those of
-docs/explanation/theory.md, "Constant curvature": a segment of length l and bending b takes a vector v, given
-in its end frame, into its start frame by
+docs/explanation/theory.md, "Constant curvature": a segment of length l and bending b takes a vector
+v, given in its end frame, into its start frame by
 
     e = l - b . v_xy      m = g e + f v_z      (v_xy + m b,  f e + c v_z)
 

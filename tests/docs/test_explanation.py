@@ -2,11 +2,9 @@
 
 import pytest
 import torch
-from page_blocks import DOCS, GENERATED, Reader
+from page_blocks import DOCS, Reader, written_on
 
-PAGES = [
-    page.stem for page in sorted((DOCS / "explanation").glob("*.md")) if page.name not in GENERATED
-]
+PAGES = written_on("explanation")
 # What takes long on a page, and less of it.
 SHORTER = {}
 

@@ -3,9 +3,9 @@
 from pathlib import Path
 
 import pytest
-from page_blocks import DOCS, GENERATED, Reader
+from page_blocks import DOCS, Reader, written_on
 
-PAGES = [page.stem for page in sorted((DOCS / "how_to").glob("*.md")) if page.name not in GENERATED]
+PAGES = written_on("how_to")
 # What takes long on a page, and less of it.
 SHORTER = {}
 

@@ -1,11 +1,9 @@
 """The code of the pages in docs/reference runs as printed, and does what they say."""
 
 import pytest
-from page_blocks import DOCS, GENERATED, Reader
+from page_blocks import DOCS, Reader, written_on
 
-PAGES = [
-    page.stem for page in sorted((DOCS / "reference").glob("*.md")) if page.name not in GENERATED
-]
+PAGES = written_on("reference")
 # What takes long on a page, and less of it.
 SHORTER = {}
 

@@ -4,11 +4,9 @@ import re
 from pathlib import Path
 
 import pytest
-from page_blocks import DOCS, GENERATED, Reader
+from page_blocks import DOCS, Reader, written_on
 
-PAGES = [
-    page.stem for page in sorted((DOCS / "tutorials").glob("*.md")) if page.name not in GENERATED
-]
+PAGES = written_on("tutorials")
 # What takes long on a page, and less of it.
 SHORTER = {}
 
