@@ -10,6 +10,7 @@ import pytest
 from page_blocks import DOCS, Reader, blocks_of, commands_of, written_on
 
 from hybridkin import load_model
+from hybridkin.app.cli.main import main
 
 NEEDS_COMPILER = pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
 NEEDS_OCTAVE = pytest.mark.skipif(
@@ -60,10 +61,11 @@ def history(reader):
     assert np.abs(track.q - track.effective).max() > 1e-3
     assert track.q.min() >= 0.17
     assert track.q.max() <= 0.29
-    # Creep of a night brings what the actuators do nearer to the commands.
+    # The morning begins in the state that the night has left.
     tracker = reader.space["tracker"]
-    assert np.isfinite(tracker.state).all()
+    np.testing.assert_array_equal(tracker.state, reader.space["state"])
     np.testing.assert_array_equal(tracker.q, reader.space["q"])
+    np.testing.assert_array_equal(tracker.effective, tracker.state[-1])
 
 
 def slack_tendons(reader):
@@ -139,44 +141,31 @@ def test_blocks_of_a_page_run(page, lab):
     CHECKS.get(page, nothing)(reader)
 
 
-def exported(page, option, language):
-    """Run the export of a page whose line has an option, and return a block in a language."""
+def block_in(page, language):
+    """Return the block of a page in a language that it has once."""
     blocks = blocks_of(DOCS / "how_to" / f"{page}.md")
-    lines = [
-        line
-        for block in blocks
-        if block.language == "console"
-        for line in block.text.splitlines()
-        if line.startswith("hybridkin export") and option in line
-    ]
-    assert len(lines) == 1
-    Reader(DOCS / "how_to" / f"{page}.md")._console(lines[0], 0)
     (text,) = (block.text for block in blocks if block.language == language)
     return text
+
+
+def command_in(page, *words):
+    """Return the line of the console blocks of a page that holds these words."""
+    blocks = blocks_of(DOCS / "how_to" / f"{page}.md")
+    lines = "".join(block.text for block in blocks if block.language == "console").splitlines()
+    (line,) = (line for line in lines if all(word in line for word in words))
+    return line
 
 
 @pytest.mark.slow
 @NEEDS_COMPILER
 def test_c_of_the_control_loop_reaches_its_target(lab):
-    program = exported("realtime", "robot_c", "c")
+    assert main(commands_of(command_in("realtime", "hybridkin export"))[0][1:]) == 0
+    program = block_in("realtime", "c")
     name = re.match(r"/\* (\S+\.c) \*/", program)
     assert name
     Path(name[1]).write_text(program)
-    blocks = blocks_of(DOCS / "how_to" / "realtime.md")
-    (build,) = (
-        line
-        for block in blocks
-        if block.language == "console"
-        for line in block.text.splitlines()
-        if line.startswith("cc ")
-    )
-    assert commands_of(build)[0][-2:] == ["&&", "./main"]
-    done = subprocess.run(
-        ["sh", "-c", build.replace("-O2", "-O2 -Wall -Werror")],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    build = command_in("realtime", "cc ").replace("-O2", "-O2 -Wall -Werror")
+    done = subprocess.run(["sh", "-c", build], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout == "0.000 mm\n"
 
@@ -184,15 +173,15 @@ def test_c_of_the_control_loop_reaches_its_target(lab):
 @pytest.mark.slow
 @NEEDS_OCTAVE
 def test_matlab_of_other_systems_reaches_its_target(lab):
-    script = exported("systems", "--mex", "matlab")
+    assert main(commands_of(command_in("systems", "hybridkin export", "--mex"))[0][1:]) == 0
     subprocess.run(["mkoctfile", "--mex", "robot.c"], cwd="matlab", check=True)
     ending = 'printf("%.17g ", x, J, error);\n'
-    Path("matlab/page.m").write_text(f"1;\n{script}{ending}")
+    Path("matlab/page.m").write_text(f"1;\n{block_in('systems', 'matlab')}{ending}")
     command = ["octave-cli", "--no-gui", "--quiet", "page.m"]
     done = subprocess.run(command, cwd="matlab", capture_output=True, text=True, check=False)
     *numbers, error = map(float, done.stdout.split())
-    model = load_model("model/model.safetensors")
-    rows = np.zeros((1, 6))
-    np.testing.assert_allclose(numbers[:3], model.predict(rows)[0], rtol=1e-12, atol=1e-12)
     assert len(numbers) == 3 + 3 * 6
+    model = load_model("model/model.safetensors")
+    tip = model.predict(np.zeros((1, 6)))[0]
+    np.testing.assert_allclose(numbers[:3], tip, rtol=1e-12, atol=1e-12)
     assert error < 1e-5
