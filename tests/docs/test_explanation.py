@@ -2,6 +2,7 @@
 
 import importlib.util
 import os
+import runpy
 import shutil
 import subprocess
 import sys
@@ -70,7 +71,22 @@ def test_blocks_of_a_page_run(page, lab):
     CHECKS.get(page, nothing)(reader)
 
 
-# The kernel of the page "How it works inside".
+# The page "How it works inside": its folders, and its kernel.
+
+
+def test_page_and_picture_show_every_folder():
+    package = ROOT / "hybridkin"
+    names = {path.parent.name for path in package.glob("*/__init__.py")}
+    names |= {path.stem for path in package.glob("*.py") if not path.stem.startswith("__")}
+    parts = {path.parent.name for path in package.glob("app/*/__init__.py")}
+    drawn = runpy.run_path(str(DOCS / "_ext" / "how_it_works.py"))
+    columns = {name for column in drawn["FOLDERS"] for name in column}
+    assert columns | {*drawn["BESIDE"], *drawn["TOOLS"]} == names
+    assert {*drawn["APP"]} == parts
+    page = (DOCS / "explanation" / "how_it_works.md").read_text(encoding="utf-8")
+    table = page.partition("\n## The folders\n")[2].partition("\n## ")[0]
+    assert {name for name in names | parts if f"`{name}`" in table} == names | parts
+
 
 AS_TORCH = """
 from numpy.testing import assert_allclose
