@@ -125,8 +125,8 @@ for name, found in zip(("first", "best"), solved, strict=True):
 # the training is that of the simulated chambers, and was never shown. Right: the first place of the
 # circle and the best one, each with four postures of the trunk.
 
-figure = plt.figure(figsize=(12, 4), layout="constrained")
-left, middle, right = figure.subfigures(1, 3, width_ratios=(1, 1, 1.1))
+figure = plt.figure(figsize=(12, 4.4), layout="constrained")
+left, middle, right = figure.subfigures(1, 3, width_ratios=(1, 1, 0.9))
 ax = left.subplots()
 blue, orange = plots.model_color("hybrid"), plots.model_color("mechanical")
 ax.plot(losses, color=blue, label="Adam on the radii")
@@ -165,5 +165,7 @@ for place, found, color, label in zip(
 ax.set(xlabel="x [cm]", ylabel="y [cm]", zlabel="z [cm]", aspect="equal")
 ax.set_xticks([-10, 0, 10])
 ax.set_yticks([-10, 0, 10])
-ax.legend(frameon=False, loc="upper left")
+ax.view_init(elev=12)
+ax.set_box_aspect(None, zoom=0.85)
+right.legend(*ax.get_legend_handles_labels(), frameon=False, loc="upper left")
 plt.show()
