@@ -13,8 +13,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from csv_tables import add_csv
+from numpy.typing import NDArray
 from simulated_trunk import PAPER_ELM
 from threadpoolctl import threadpool_limits
 
