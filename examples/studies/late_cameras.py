@@ -1,6 +1,6 @@
 """Feedback of a camera that is late, noisy, or wrong: mean errors of a simulated trunk.
 
-The table of the docs page "Pitfalls" and ``docs/data/late_cameras.csv``::
+The table of the docs page "Results", section "Late cameras" and ``docs/data/late_cameras.csv``::
 
     python examples/studies/late_cameras.py --csv docs/data/late_cameras.csv
 
