@@ -106,6 +106,15 @@ def realtime(reader):
     assert not reader.space["tracker"].rejected
 
 
+def describing(reader):
+    assert "4 segments, 7 actuators" in reader.printed
+    counts = np.genfromtxt("track/track.csv", delimiter=",", names=True)
+    assert all((counts[f"m{k}"] % 1 == 0).all() for k in range(1, 7))
+    text = Path("bellows.toml").read_text()
+    assert "gain = 0.02\n" in text
+    assert "zeros = -5.0\n" in text
+
+
 def rigid_arms(reader):
     assert "q_max=1.5 to 2 of the model, dq_max=3 to 4 of the model" in reader.printed
     assert "<!-- measured in May -->" in Path("calibrated.urdf").read_text()
@@ -140,6 +149,15 @@ def systems(reader):
     assert {re.match(r"\w+", name)[0] for name in causal} == named
 
 
+def troubleshooting(reader):
+    assert "no errors and no warnings" in reader.printed
+    assert "1 CONVERGED" in reader.printed
+
+
+def view(reader):
+    assert "http://127.0.0.1:" in reader.printed
+
+
 # What a page says of what its blocks print or write.
 CHECKS = {
     "autograd": autograd,
@@ -152,6 +170,9 @@ CHECKS = {
     "realtime": realtime,
     "rigid_arms": rigid_arms,
     "systems": systems,
+    "describing": describing,
+    "troubleshooting": troubleshooting,
+    "view": view,
 }
 
 
