@@ -45,7 +45,7 @@ claims-quick: $(VENV)/.native
 gpu: $(VENV)/.native
 	env -u OMP_NUM_THREADS $(BIN)/python examples/studies/gpu.py --out $(OUT)/gpu
 
-# A shortened examination; docs/reference/reliability.md has the figures of the full one.
+# A shortened examination; docs/reference/reliability_report.md has the figures of the full one.
 examine: $(VENV)/.examine $(VENV)/.native
 	$(BIN)/python tests/examination --out $(OUT)/examination
 

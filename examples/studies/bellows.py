@@ -1,6 +1,6 @@
 """An arm of two bellows segments driven by six pressures: errors at rest on days held out.
 
-The table of the docs page "Motors from end to end", section "A recorded arm with pressures"::
+The table of the docs page "Results", section "Forces and pressures"::
 
     python examples/studies/bellows.py --jobs 2
 

@@ -1,6 +1,6 @@
 """Faults of encoders in logs: whether the check names them, and what they cost before a mend.
 
-The table of the docs page "Motors and pressures from end to end" and ``docs/data/encoders.csv``::
+The table of the docs page "Results", section "Motors and encoders" and ``docs/data/encoders.csv``::
 
     python examples/studies/encoders.py --csv docs/data/encoders.csv
 

@@ -1,6 +1,6 @@
 """Faults whose cause is known, and the cause that `verify_track` names.
 
-The table of the docs page "Motors from end to end", section "What went wrong"::
+The table of the docs page "Results", section "Mistakes in logs"::
 
     python examples/studies/faults.py --out results/faults
 

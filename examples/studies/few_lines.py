@@ -1,6 +1,6 @@
 """Logs of few lines in actuator space: where a learned correction increases the error.
 
-Figures of the docs page "Choosing coupling and error model"::
+Figures of the docs page "Results", section "Domain and radius"::
 
     python examples/studies/few_lines.py --first 40 --out results/few_lines
 

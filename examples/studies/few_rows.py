@@ -1,6 +1,6 @@
 """Few rows: whether models keep their promises, and what each part of the structural model brings.
 
-The figures of the docs page "Choosing coupling and error model", section "Few rows"::
+The figures of the docs page "Results", section "Few rows"::
 
     python examples/studies/few_rows.py --out results/few_rows
 

@@ -2,7 +2,7 @@
 
     python examples/studies/few_rows_tracking.py --out results/few_rows_tracking
 
-Five minutes on two cores. It needs `hybridkin[sim]` (MuJoCo).
+Five minutes on two cores. few_rows_tracking.csv has the table. It needs `hybridkin[sim]` (MuJoCo).
 """
 
 from __future__ import annotations
@@ -13,16 +13,19 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from csv_tables import add_csv
 from numpy.typing import NDArray
 from simulated_trunk import PAPER_ELM
 from threadpoolctl import threadpool_limits
 
 from hybridkin import ELMRegressor, HybridForwardModel, datasets, robots
 from hybridkin.app.workflow.report import Report
+from paper.tables import QUADRATIC
 from paper.tracks import Tracks, paper_paths, tracking
 
 SIZES = (25, 100, 1900)
 ELM = "hybrid on nominal, the paper's ELM"
+DATA = "data alone, quadratic"
 LOOPS = {"without feedback": "model", "with feedback": "measured"}
 """Column of the table by the `feedback` of `InverseKinematics.track`."""
 
@@ -42,7 +45,7 @@ def few_rows_tracking(
     Parameters
     ----------
     sizes : sequence of int
-        Numbers of rows; the paper's network has the largest.
+        Numbers of rows; the paper's network and the data alone have the largest.
     n_draws : int, default=3
         Number of random orders.
     n_points : int, default=151
@@ -85,6 +88,7 @@ def fitted_models(
     for n in sizes:
         models["auto", n] = HybridForwardModel(chain, "auto", random_state=0)
     models[ELM, max(sizes)] = HybridForwardModel(chain, network, guard=None)
+    models[DATA, max(sizes)] = HybridForwardModel(None, QUADRATIC, guard=None)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of few rows
         for (_, n), model in models.items():
@@ -119,6 +123,8 @@ def report_of(entries: list[dict[str, Any]]) -> Report:
         f"{sum(int(np.isnan(e['error']).sum()) for e in entries)}."
     )
     report.table(["model", "rows", *LOOPS], lines)
+    header = ["model", "rows", *(f"{loop} [mm]" for loop in LOOPS)]
+    add_csv(report, "few_rows_tracking.csv", header, lines)
     return report
 
 

@@ -1,6 +1,6 @@
 """Log files as programs write them: what reading them says, and the error of the fitted model.
 
-The table of the docs page "Your own robot" and ``docs/data/files.csv``::
+The table of the docs page "Results", section "Files" and ``docs/data/files.csv``::
 
     python examples/studies/files_as_they_are.py --csv docs/data/files.csv
 

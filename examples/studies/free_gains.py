@@ -1,6 +1,6 @@
 """What calibrated gains of the actuators do on held-out motions of two real robots.
 
-The table of the docs page "From your robot to a trajectory"::
+The table of the docs page "Results", section "Motors and encoders"::
 
     python examples/studies/free_gains.py --out results/free_gains
 

@@ -1,6 +1,6 @@
 """Averages of past commands as linear inputs, beside `hysteresis="auto"`: what they bring.
 
-The table of the docs page "When the past matters", section "What was tried"::
+The table of the docs page "Results", section "Hysteresis and creep"::
 
     python examples/studies/history.py
 

@@ -1,6 +1,6 @@
 """Hybrid models compared: few rows, outside the training range, held-out motions of a robot.
 
-The tables of the docs page "Choosing coupling and error model"::
+The tables of the docs page "Results", sections "Few rows" to "Outside the log"::
 
     python examples/studies/hybrids.py --out results/hybrids
 

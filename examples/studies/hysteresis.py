@@ -1,6 +1,6 @@
 """Hysteresis of actuators: one backlash, or what `hysteresis="auto"` finds.
 
-The tables and the figure of the docs page "When the past matters"::
+The tables and the figure of the docs page "Results", section "Hysteresis and creep"::
 
     python examples/studies/hysteresis.py --out results/hysteresis
 

@@ -1,6 +1,6 @@
 """Coverage of the estimated error radius, and the domain, where actuators have hysteresis.
 
-The tables of the docs page "When the past matters" about states and coverage::
+The tables of the docs page "Results", section "States and paces"::
 
     python examples/studies/hysteresis_promise.py
 

@@ -1,6 +1,6 @@
 """Feedback of a camera that is late, noisy, or wrong: mean errors of a simulated trunk.
 
-The table of the docs page "Pitfalls" and ``docs/data/late_cameras.csv``::
+The table of the docs page "Results", section "Late cameras" and ``docs/data/late_cameras.csv``::
 
     python examples/studies/late_cameras.py --csv docs/data/late_cameras.csv
 
@@ -109,19 +109,29 @@ def cases() -> list[tuple[Loop, Camera]]:
     return found
 
 
+def about(loop: Loop, camera: Camera) -> list[str | float]:
+    """Return what distinguishes a case, in the order of `HEADER`."""
+    gain = "default" if loop.gain is None else loop.gain
+    flaws = [camera.dropouts, camera.outliers]
+    return [gain, camera.delay, int(loop.given), 1e3 * camera.noise, *flaws]
+
+
+def mean_error(loop: Loop, camera: Camera) -> tuple[float, float]:
+    """Return the mean error over the seeds, and how far they lie apart [mm]."""
+    runs = []
+    for seed in range(camera.seeds):
+        runs.append(1e3 * errors(loop, camera, seed)[START:].mean())
+    return float(np.mean(runs)), float(np.ptp(runs))
+
+
 def main() -> None:
     """Print all figures, and write them as CSV."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--csv", type=Path, required=True)
     rows = []
     for loop, camera in cases():
-        runs = []
-        for seed in range(camera.seeds):
-            runs.append(1e3 * errors(loop, camera, seed)[START:].mean())
-        gain = "default" if loop.gain is None else loop.gain
-        about = [gain, camera.delay, int(loop.given), 1e3 * camera.noise]
-        about += [camera.dropouts, camera.outliers]
-        rows.append([*about, *(f"{f(runs):.3g}" for f in (np.mean, np.ptp))])
+        figures = (f"{figure:.3g}" for figure in mean_error(loop, camera))
+        rows.append([*about(loop, camera), *figures])
         print(*rows[-1], sep="  ")
     with open(parser.parse_args().csv, "w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")

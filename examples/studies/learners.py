@@ -1,6 +1,6 @@
 """ELMRegressor and ELMRegressorCV against other learners: errors on five folds, time per fit.
 
-The tables of the docs page "The learners"::
+The tables of the docs page "Results", section "Learners"::
 
     python examples/studies/learners.py --out results/learners
 

@@ -1,6 +1,6 @@
 """Mistakes in logs: which of them the check names, and which nothing finds.
 
-The figures of the docs page "Your own robot"::
+The figures of the docs page "Results", section "Mistakes in logs"::
 
     python examples/studies/log_mistakes.py --out results/log_mistakes
 

@@ -1,6 +1,6 @@
 """Long logs: what more rows give, where the past matters, and what they cost.
 
-The table of the docs page "When the past matters"::
+The table of the docs page "Results", section "Long logs"::
 
     python examples/studies/long_logs.py --out results/long_logs
 

@@ -1,6 +1,6 @@
 """Several markers on the robot: what they change about the error of the tip.
 
-The table of the docs page "Several markers"::
+The table of the docs page "Results", section "Several markers"::
 
     python examples/studies/markers.py --out results/markers
 

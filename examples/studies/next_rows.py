@@ -1,6 +1,6 @@
 """Chosen rows against random ones: how many random rows a chosen one is worth.
 
-The tables of the docs page "Which configurations to measure next"::
+The tables of the docs page "Results", section "Rows to measure"::
 
     python examples/studies/next_rows.py --out results/next_rows
 

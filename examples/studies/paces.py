@@ -1,6 +1,6 @@
 """Coverage of the error radius for the same motions at other speeds, with creep and with backlash.
 
-The table of the docs page "When the past matters"::
+The table of the docs page "Results", section "States and paces"::
 
     python examples/studies/paces.py --out results/paces
 

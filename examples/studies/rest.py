@@ -1,6 +1,6 @@
 """Targets out of reach, and singular starts: where trackers come to rest.
 
-The tables of the docs page "Reliability" and ``docs/data/rest.csv``::
+The tables of the docs page "Reliability report" and ``docs/data/rest.csv``::
 
     python examples/studies/rest.py --csv docs/data/rest.csv
 

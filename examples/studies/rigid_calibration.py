@@ -1,6 +1,6 @@
 """Kinematic calibration of a simulated rigid arm: errors at new postures, by what was calibrated.
 
-The table of the docs page "Rigid arms"::
+The table of the docs page "Results", section "Rigid arms"::
 
     python examples/studies/rigid_calibration.py --out results/rigid_calibration
 

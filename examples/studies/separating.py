@@ -1,8 +1,7 @@
 """Logs that cannot show which parameters of a robot are wrong, and the motion that can.
 
-The table of the docs page "Which configurations to measure next", section "Which motion shows what
-is wrong with the robot"; simulated robots and armlab_3cable, two
-minutes of processor time::
+The table of the docs page "Results", section "Rows to measure"; simulated robots and
+armlab_3cable, two minutes of processor time::
 
     python examples/studies/separating.py
 """

@@ -1,6 +1,6 @@
 """A tapered tentacle under gravity, pulled by two tendon forces: errors on loads held out.
 
-The table of the docs page "Tendons that go slack", section "Forces as inputs"::
+The table of the docs page "Results", section "Forces and pressures"::
 
     python examples/studies/tentacle.py --jobs 2
 

@@ -1,6 +1,6 @@
 """Calibration by touch points against a camera: errors of the tip at new configurations.
 
-The table of the docs page "Rigid arms", section "Touch points without a camera"::
+The table of the docs page "Results", section "Touch points"::
 
     python examples/studies/touch_points.py --seeds 10
 

@@ -1,6 +1,6 @@
 """Gradient boosting and random forests on the residual and alone: errors on groups held out.
 
-The table of the docs page "Choosing coupling and error model", section "Trees"::
+The table of the docs page "Results", section "Trees"::
 
     python examples/studies/trees.py
 

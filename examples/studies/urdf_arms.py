@@ -1,6 +1,6 @@
 """Leaf links of the URDFs of example-robot-data, read by `RigidChain` and by pinocchio.
 
-The numbers of the docs page "Rigid arms"::
+The numbers of the docs page "Results", section "Rigid arms"::
 
     pip install pin example-robot-data
     python examples/studies/urdf_arms.py --out results/urdf_arms

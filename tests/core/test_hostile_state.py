@@ -172,7 +172,8 @@ def learned(module, name, value):
     """Take the step of an optimizer from a state that requires a gradient."""
     part, last = owner(module, name)
     entry = getattr(part, last).requires_grad_()
-    entry.grad = entry.detach() - value
+    change = entry.detach() - value
+    entry.grad = torch.where(value.isfinite(), change, 0.0)  # no step makes a limit infinite
     torch.optim.SGD([entry], lr=1.0).step()
 
 

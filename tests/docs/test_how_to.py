@@ -20,7 +20,10 @@ NEEDS_OCTAVE = pytest.mark.skipif(
 MARKS = {"systems": [NEEDS_COMPILER]}
 PAGES = [pytest.param(page, marks=MARKS.get(page, [])) for page in written_on("how_to")]
 # What takes long on a page, and less of it.
-SHORTER = {"obstacles": [("--size 80,40", "--size 80,40 --duration 2")]}
+SHORTER = {
+    "scikit_learn": [("GroupKFold(4)", "GroupKFold(2)"), ("[1e-3, 0.1]", "[1e-3]")],
+    "obstacles": [("--size 80,40", "--size 80,40 --duration 2")],
+}
 
 
 def nothing(reader):
@@ -103,9 +106,36 @@ def realtime(reader):
     assert not reader.space["tracker"].rejected
 
 
+def describing(reader):
+    assert "4 segments, 7 actuators" in reader.printed
+    counts = np.genfromtxt("track/track.csv", delimiter=",", names=True)
+    assert all((counts[f"m{k}"] % 1 == 0).all() for k in range(1, 7))
+    text = Path("bellows.toml").read_text()
+    assert "gain = 0.02\n" in text
+    assert "zeros = -5.0\n" in text
+
+
 def rigid_arms(reader):
     assert "q_max=1.5 to 2 of the model, dq_max=3 to 4 of the model" in reader.printed
     assert "<!-- measured in May -->" in Path("calibrated.urdf").read_text()
+
+
+def autograd(reader):
+    said = reader.printed.splitlines()
+    assert said[0] == said[4] == "tensor(True)", said
+    assert said[1] == "1.79 mm tensor(True)"
+    network, true_lengths = (float(line.split()[-2]) for line in said[2:4])
+    assert network < true_lengths + 0.02
+    before, after = (int(number) for number in re.findall(r"\d+", said[5])[:2])
+    assert before > 3 * after
+
+
+def scikit_learn(reader):
+    rows, motions, *_, own = re.findall(r"^([\d.]+) mm", reader.printed, re.MULTILINE)
+    assert float(motions) < 0.8 * float(rows)
+    assert float(own) < 0.8 * float(motions)
+    assert "'error_model': 'elm'" in reader.printed
+    assert "\n0.0\n" in reader.printed
 
 
 def systems(reader):
@@ -119,8 +149,19 @@ def systems(reader):
     assert {re.match(r"\w+", name)[0] for name in causal} == named
 
 
+def troubleshooting(reader):
+    assert "no errors and no warnings" in reader.printed
+    assert "1 CONVERGED" in reader.printed
+
+
+def view(reader):
+    assert "http://127.0.0.1:" in reader.printed
+
+
 # What a page says of what its blocks print or write.
 CHECKS = {
+    "autograd": autograd,
+    "scikit_learn": scikit_learn,
     "next_rows": next_rows,
     "history": history,
     "slack_tendons": slack_tendons,
@@ -129,6 +170,9 @@ CHECKS = {
     "realtime": realtime,
     "rigid_arms": rigid_arms,
     "systems": systems,
+    "describing": describing,
+    "troubleshooting": troubleshooting,
+    "view": view,
 }
 
 

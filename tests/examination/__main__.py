@@ -2,47 +2,49 @@
 
     python tests/examination                   # every part, shortened: minutes
     python tests/examination files soak --full # some parts, as long as the published figures took
+    python tests/examination files --full --out docs/data/examination  # published figures anew
+    python tests/examination report            # the page of the published figures
 
 Each part is a module of this folder with ``examine(full)``, which yields a `Line` for each claim.
 Parts run one after another in processes of their own, so that none inherits another's memory or
-settings. Each writes OUT/PART.json; report.md holds the table of all parts. The exit code is 1 if
-a line does not hold, and 2 if all hold but some were not run.
+settings. Each writes OUT/PART.csv, and its line in OUT/runs.csv; report.md holds the tables of all
+parts. The exit code is 1 if a line does not hold, and 2 if all hold but some were not run.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
+import ast
 import os
-import platform
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import asdict
-from datetime import date
 from importlib import import_module
-from importlib.metadata import version
 from pathlib import Path
 
 from _line import Line
+from _report import COMMITTED, PAGE, page, sections, write_part
 
 HERE = Path(__file__).parent
 PARTS = sorted(path.stem for path in HERE.glob("*.py") if path.stem[0] != "_")
-PACKAGES = ("torch", "numpy", "scipy", "scikit-learn")
 TOOLS = ("cosmic_ray", "coverage", "dask", "psutil", "tqdm")  # a part without its tool is not run
 HOLDS, FAILS, NOT_RUN = 0, 1, 2  # exit codes
 PRINTED = {True: "holds", False: "FAILS", None: "not run"}
-IN_TABLE = {True: "yes", False: "NO", None: "not run"}
+REPORT = "report"
 
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python tests/examination", description=__doc__)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.add_argument("parts", nargs="*", metavar="PART", help=", ".join(PARTS))
+    parser.add_argument("parts", nargs="*", metavar="PART", help=", ".join((*PARTS, REPORT)))
     parser.add_argument("--full", action="store_true", help="as long as the published figures")
     parser.add_argument("--out", type=Path, default=Path("results/examination"))
     options = parser.parse_args(arguments)
+    if options.parts == [REPORT]:
+        PAGE.write_text(page(), encoding="utf-8")
+        print(f"{PAGE}, from {COMMITTED}")
+        return HOLDS
     unknown = {*options.parts} - {*PARTS}
     if unknown:
         parser.error(f"PART must be among {', '.join(PARTS)}, got {', '.join(unknown)}")
@@ -56,8 +58,8 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"\n{k}/{len(parts)} {part}", flush=True)
         command = [sys.executable, str(HERE), part, "--out", str(options.out)]
         codes[part] = subprocess.call([*command, "--full"] if options.full else command)
-    report = "\n".join(table(options.out / f"{part}.json") for part in parts)
-    (options.out / "report.md").write_text(report, encoding="utf-8")
+    report = sections(options.out, parts)
+    (options.out / "report.md").write_text(f"{report}\n", encoding="utf-8")
     not_run = [part for part in parts if codes[part] == NOT_RUN]
     failed = [part for part in parts if codes[part] not in (HOLDS, NOT_RUN)]
     print(f"\n{options.out / 'report.md'}; {len(failed)} of {len(parts)} parts fail", *failed)
@@ -73,22 +75,14 @@ def examined(part: str, full: bool, out: Path) -> int:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     sys.path.insert(1, str(HERE.parent / "saving"))  # one small model of every kind
     sys.path.append(str(HERE.parents[1] / "examples"))  # the simulated trunk
-    (out / f"{part}.json").unlink(missing_ok=True)
     lines, start = [], time.perf_counter()
     for line in lines_of(part, full):
-        lines.append(asdict(line))
+        lines.append(line)
         print(f"  {PRINTED[line.holds]}  {line.what}: {line.figure}", flush=True)
-    content = {
-        "part": part,
-        "command": f"python tests/examination {part}{' --full' if full else ''}",
-        "date": date.today().isoformat(),
-        "seconds": round(time.perf_counter() - start, 1),
-        "machine": f"{platform.machine()}, Python {platform.python_version()}",
-        "versions": {name: version(name) for name in PACKAGES},
-        "lines": lines,
-    }
-    (out / f"{part}.json").write_text(json.dumps(content, indent=1), encoding="utf-8")
-    outcomes = [line["holds"] for line in lines]
+    seconds = time.perf_counter() - start
+    command = f"python tests/examination {part}{' --full' if full else ''}"
+    write_part(out, part, command, about(part), seconds, lines)
+    outcomes = [line.holds for line in lines]
     if not outcomes or False in outcomes:
         return FAILS
     return NOT_RUN if None in outcomes else HOLDS
@@ -106,17 +100,10 @@ def lines_of(part: str, full: bool) -> Iterator[Line]:
         yield from module.examine(full)
 
 
-def table(path: Path) -> str:
-    """Return the lines of a part as a Markdown table."""
-    if not path.is_file():
-        return f"## {path.stem}\n\nThis part ended without a result.\n"
-    content = json.loads(path.read_text(encoding="utf-8"))
-    rows = [f"## {content['part']}", ""]
-    rows += [f"`{content['command']}`, {content['date']}, {content['seconds']:.0f} s", ""]
-    rows += ["| what | figure | holds |", "| --- | --- | --- |"]
-    for line in content["lines"]:
-        rows.append(f"| {line['what']} | {line['figure']} | {IN_TABLE[line['holds']]} |")
-    return "\n".join([*rows, ""])
+def about(part: str) -> str:
+    """Return what a part examines, the text at the head of its module, in one line."""
+    text = ast.get_docstring(ast.parse((HERE / f"{part}.py").read_text(encoding="utf-8")))
+    return " ".join(str(text).split())
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 A step is a continuous function of its state, and equal in all paths to rounding. With limits of
 acceleration, and targets that jump before the robot arrives, each step still multiplies a
 difference: the motions part as those of a chaotic system, and come together where a target stays.
+Run k has the seed k.
 """
 
 from __future__ import annotations

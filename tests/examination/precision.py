@@ -2,6 +2,7 @@
 
 Both are given the same numbers, rounded to float32, so that the differences are those of the
 computation. Estimators compute in double precision and round; modules compute as they are cast.
+Seed 0.
 """
 
 from __future__ import annotations

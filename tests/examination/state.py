@@ -1,7 +1,7 @@
 """Each entry of the state of each module, changed in each way: the module is what its state says.
 
 The test of tests/core/test_hostile_state.py, which takes one way for each entry of a kind in the
-suite, takes all of them here.
+suite, takes all of them here. Seed 0.
 """
 
 from __future__ import annotations
