@@ -28,7 +28,7 @@ EXAMPLES = sorted((ROOT / "examples").glob("plot_*.py"))
 
 def commands_on(page):
     """Return the commands of all console blocks of a page."""
-    blocks = [block for block in blocks_of(page) if block.language == "console"]
+    blocks = [block for block in blocks_of(page) if block.language in ("console", "bash")]
     return [command for block in blocks for command in commands_of(block.text)]
 
 
@@ -37,7 +37,7 @@ RESULTS = (DOCS / "reference" / "results.md").read_text(encoding="utf-8")
 RECORDING = re.findall(r"hybridkin fit train\.csv(?:[^`\n\\]|\\\n)*", RESULTS)
 INSTALLS = [
     command
-    for page in [README, *PAGES]
+    for page in [README, ROOT / "CONTRIBUTING.md", *PAGES]
     for command in commands_on(page)
     if command[0] in ("pip", "uv")
 ]
