@@ -1,6 +1,6 @@
 """Poses of three rigid arms, solved by hybridkin, pytorch_kinematics, mink and Pink.
 
-The tables of the docs page "Theory"::
+Figures of the docs page "Theory", section "Further starts", and ``docs/data/ik_poses.csv``::
 
     python examples/studies/ik_peers.py --out results/ik_peers
 

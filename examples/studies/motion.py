@@ -1,6 +1,6 @@
 """How far a track along a plane leaves it, and how far a jump passes its target.
 
-The figures of the docs page "Theory", for the trunk without noise::
+For limits of the tip and of acceleration in the docs page "Theory"; the trunk has no noise::
 
     python examples/studies/motion.py
 

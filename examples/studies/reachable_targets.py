@@ -1,6 +1,7 @@
 """How many reachable targets `InverseKinematics.solve` reaches, with further starts and without.
 
-The table of the docs page "Theory"::
+Figures of the docs page "Theory", section "Further starts", and
+``docs/data/reachable_targets.csv``::
 
     python examples/studies/reachable_targets.py --out results/reachable_targets
 

@@ -1,6 +1,6 @@
 """Streams: what a fit to a log of any length takes, which is read from parquet chunk by chunk.
 
-The table of "Many rows" of the docs page "The learners"::
+The table of the docs page "Benchmarks", section "Streams"::
 
     python examples/studies/streams.py --out results/streams
 
