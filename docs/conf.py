@@ -44,7 +44,7 @@ autodoc_class_signature = "mixed"
 autodoc_member_order = "bysource"
 numpydoc_show_class_members = False
 # Modules that the package opens as its attributes are documented under these names.
-for _name in ("robots", "tasks", "trajectories"):
+for _name in ("obstacles", "robots", "tasks", "trajectories"):
     sys.modules[f"hybridkin.{_name}"] = getattr(hybridkin, _name)
 
 nitpicky = True
