@@ -10,10 +10,9 @@ import sys
 from pathlib import Path
 
 import matplotlib.pyplot as plt
-import numpy as np
 import pytest
+from page_blocks import DOCS, PAGES, QUICK, Reader, blocks_of, commands_of
 
-from hybridkin.app.cli._parser import parser
 from hybridkin.app.cli.main import main
 
 if sys.version_info >= (3, 11):
@@ -22,66 +21,66 @@ else:
     import tomli as tomllib
 
 ROOT = Path(__file__).parent.parent
-README = (ROOT / "README.md").read_text(encoding="utf-8")
+README = ROOT / "README.md"
 EXAMPLES = sorted((ROOT / "examples").glob("plot_*.py"))
 
 
-def commands(text):
-    """Return the commands of the console blocks, continued lines joined, comments off."""
-    blocks = re.findall(r"```console\n(.*?)```", text, re.DOTALL)
-    lines = "".join(blocks).replace("\\\n", " ").splitlines()
-    return [shlex.split(line, comments=True) for line in lines if line.strip()]
+def commands_on(page):
+    """Return the commands of all console blocks of a page."""
+    blocks = [block for block in blocks_of(page) if block.language == "console"]
+    return [command for block in blocks for command in commands_of(block.text)]
 
 
-COMMANDS = commands(README)
-FIRST_USE = [c for c in COMMANDS if c[0] == "hybridkin" and c[1] in ("demo", "init", "view")]
-OWN_LOG = [c for c in COMMANDS if c[0] == "hybridkin" and c not in FIRST_USE]
-RECORDING = commands((ROOT / "docs" / "reference" / "results.md").read_text(encoding="utf-8"))
-
-
-def hybridkin(command):
-    """Run a command in this process."""
-    assert command[0] == "hybridkin"
-    assert main(command[1:]) == 0
+COMMANDS = commands_on(README)
+RESULTS = (DOCS / "reference" / "results.md").read_text(encoding="utf-8")
+RECORDING = re.findall(r"hybridkin fit train\.csv(?:[^`\n\\]|\\\n)*", RESULTS)
+INSTALLS = [
+    command
+    for page in [README, *PAGES]
+    for command in commands_on(page)
+    if command[0] in ("pip", "uv")
+]
 
 
 @pytest.mark.slow
-def test_python_runs_as_printed(capsys):
-    blocks = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
-    assert blocks
-    for block in blocks:
-        exec(compile(block, "README.md", "exec"), {})
-    printed = capsys.readouterr().out
+def test_readme_runs_as_printed(tmp_path, monkeypatch):
+    """In an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    printed = Reader(README).run().printed
     assert float(re.search(r"unseen rows: ([\d.]+) cm", printed)[1]) < 1.5
-    assert re.search(r"\(\d+, 9\)", printed)
+    assert "(201, 9)" in printed
+    assert "Reached: 501 of 501 points" in printed
+    assert Path("track/track.csv").is_file()
 
 
 def test_every_kind_of_command_is_tried_below():
-    assert {command[0] for command in COMMANDS} == {"pip", "make", "hybridkin"}
-    assert len(OWN_LOG) >= 2
-    assert all("train.csv" in command for command in RECORDING)
+    assert {command[0] for command in COMMANDS} == {"pip", "uv", "make", "hybridkin"}
 
 
-def test_commands_of_the_first_use_are_known(tmp_path, monkeypatch):
-    """They run in tests/app/cli and tests/app/viewer: one takes a minute, one asks, one waits."""
-    monkeypatch.chdir(tmp_path)
-    Path("log.csv").touch()
-    found = [parser().parse_args(command[1:]).command for command in FIRST_USE]
-    assert found == ["demo", "init", "view"]
+def test_readme_is_short():
+    assert len(README.read_text(encoding="utf-8").split()) <= 650
 
 
 def test_what_pip_installs_is_there():
-    """The installation itself is what `make` does."""
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    installs = [command for command in COMMANDS if command[0] == "pip"]
-    assert installs
-    for _, verb, *what in installs:
-        assert verb == "install"
-        for name in what:
-            extras = re.fullmatch(r"\.\[([\w,]+)\]", name)
-            if extras:
+    """The extras and groups exist; the installation itself is what `make` does."""
+    content = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    project = content["project"]
+    assert INSTALLS
+    for program, *command in INSTALLS:
+        if program == "uv":
+            assert command[0] in ("venv", "pip")
+            del command[0]
+        if not command:
+            continue
+        assert command.pop(0) == "install"
+        while command:
+            name = command.pop(0)
+            extras = re.fullmatch(r"(?:\.|hybridkin)\[([\w,]+)\]", name)
+            if name == "--group":
+                assert command.pop(0) in content["dependency-groups"]
+            elif extras:
                 assert {*extras[1].split(",")} <= {*project["optional-dependencies"]}
-            else:
+            elif name not in ("--editable", "."):
                 assert any(needed.startswith(name) for needed in project["dependencies"])
 
 
@@ -98,7 +97,8 @@ RUNS = {  # the last command of a target
     "check": "pyright --pythonpath .venv/bin/python",
 }
 EXTRAS = {"docs": "docs", "bench": "bench"}  # more than the extra "dev"
-TARGETS = {*re.findall(r"make\s([a-z-]+)", README), *re.findall(r"make ([a-z-]+) +#", CONTRIBUTING)}
+TARGETS = {command[1] for command in COMMANDS if command[0] == "make"}
+TARGETS |= {*re.findall(r"make ([a-z-]+) +#", CONTRIBUTING)}
 
 
 def planned(folder, target):
@@ -165,7 +165,7 @@ def test_make_runs_what_a_target_says(fresh, target):
 
 
 def test_every_target_that_the_readme_names_is_tried():
-    assert {"paper", "test", "docs"} <= TARGETS & {*RUNS}
+    assert {"paper", "test"} <= TARGETS & {*RUNS}
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     assert {*re.findall(r"^([a-z-]+):", makefile, re.MULTILINE)} >= TARGETS
     assert "not slow" in RUNS["quick"]
@@ -174,43 +174,16 @@ def test_every_target_that_the_readme_names_is_tried():
     assert {"slow", "browser"} <= {marker.partition(":")[0] for marker in markers}
 
 
-QUICK = ["--folds", "2", "--jobs", "1", "--max-rows", "200"]  # of `fit`: less work
-
-
-@pytest.mark.slow
-def test_commands_for_a_log_of_ones_own_run(tmp_path, monkeypatch, capsys):
-    """Those of the README and of the docs, on the robot and the simulated log of the docs."""
-    page = (ROOT / "docs" / "tutorials" / "your_robot.md").read_text(encoding="utf-8")
-    monkeypatch.chdir(tmp_path)
-    Path("robot.toml").write_text(re.search(r"```toml\n(.*?)```", page, re.DOTALL)[1])
-    exec(
-        compile(re.search(r"```python\n(.*?)```", page, re.DOTALL)[1], "your_robot.md", "exec"), {}
-    )
-    more = [command for command in commands(page) if command[1] not in ("fit", "track")]
-    kinds = {"init", "describe", "evaluate", "animate", "next", "verify"}
-    assert {command[1] for command in more} == kinds
-    for command in [*OWN_LOG, *more]:
-        if command[1] == "verify":  # a robot that does as the model
-            shutil.copy("track/track.csv", "measured.csv")
-        hybridkin(command + (QUICK if command[1] == "fit" else []))
-        assert capsys.readouterr().out
-        if "--out" in command:
-            assert Path(command[command.index("--out") + 1]).exists()
-    assert Path("model/model.safetensors").is_file()
-    track = np.genfromtxt("track/track.csv", delimiter=",", names=True)
-    assert len(track) > 100
-    assert {"s1", "s6"} <= {*track.dtype.names}
-
-
 @pytest.mark.slow
 def test_commands_for_the_recording_run(tmp_path, data_home, monkeypatch, capsys):
     """On every sixth row, which leaves the motions whole, and without auto, which takes minutes."""
     lines = (data_home / "ftdcr_v4" / "train.csv").read_text(encoding="utf-8").splitlines()
     (tmp_path / "train.csv").write_text("\n".join([lines[0], *lines[1::6]]), encoding="utf-8")
     shutil.copytree(ROOT / "examples" / "robots", tmp_path / "examples" / "robots")
-    command = [word for word in RECORDING[-1] if word not in ("--hysteresis", "auto")]
+    (command,) = RECORDING
+    (words,) = commands_of(command)
     monkeypatch.chdir(tmp_path)
-    hybridkin([*command, *QUICK, "--no-auto"])
+    assert main([*words[1:], *QUICK]) == 0
     out = capsys.readouterr().out
     found = re.findall(r"^\W+(mechanical, calibrated|hybrid, ELM)[ |]+([\d.]+)", out, re.MULTILINE)
     assert {name: float(mean) < 12.0 for name, mean in found} == {
@@ -220,7 +193,7 @@ def test_commands_for_the_recording_run(tmp_path, data_home, monkeypatch, capsys
 
 
 def test_links_lead_to_files_that_are_there():
-    for link in re.findall(r"\]\(([^)#]+)\)", README):
+    for link in re.findall(r"\]\(([^)#]+)\)", README.read_text(encoding="utf-8")):
         assert (ROOT / link).is_file(), link
 
 

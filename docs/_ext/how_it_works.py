@@ -42,12 +42,14 @@ FOLDERS = (  # in one direction: each column imports from those left of it
     ("native",),
     ("chains", "learning", "ik"),
     ("calibration",),
+    ("hysteresis",),
     ("hybrid",),
     ("saving",),
-    ("workflow",),
-    ("cli",),
+    ("app",),
 )
-BESIDE = ("datasets", "plots")
+BESIDE = ("datasets", "plots")  # they import from _core; plots from chains, too
+TOOLS = ("arguments", "formats", "rotations")  # public modules of what is inside
+APP = ("checks", "workflow", "viewer", "cli")  # each imports from those before it
 
 
 def box(ax, x, y, width, color, text, height=0.95):
@@ -83,36 +85,39 @@ def draw_models(ax):
 
 def draw_folders(ax):
     """Draw the folders of the package; imports point to the left."""
-    ax.set_title(
-        "The folders; a folder imports only from those left of it",
-        loc="left",
-        fontsize=12,
-    )
-    width, step = 1.12, 1.31
+    title = "The folders; a folder imports only from those left of it"
+    ax.set_title(title, loc="left", fontsize=12)
+    width, step = 1.18, 1.46
     for k, names in enumerate(FOLDERS):
-        low = 2.0 - 0.35 * len(names)
+        middle = 2.9 - 0.35 * len(names)
         for i, name in enumerate(reversed(names)):
-            box(ax, 0.1 + step * k, low + 0.7 * i, width, BLUE, name, 0.58)
+            box(ax, 0.1 + step * k, middle + 0.7 * i, width, BLUE, name, 0.58)
         if k:
-            arrow(ax, (0.1 + step * k, 1.95), (0.1 + step * (k - 1) + width, 1.95))
-    for k, name in enumerate(BESIDE):
-        box(ax, 0.1 + step * (k + 1), 0.1, width, GREY, name, 0.58)
-    beside = "beside them: for workflow and cli (plots imports chains)"
-    ax.text(0.1 + 3 * step, 0.39, beside, va="center", fontsize=9.5)
-    ax.set(xlim=(0.0, 11.8), ylim=(0.0, 3.15))
+            arrow(ax, (0.1 + step * k, 2.85), (0.1 + step * (k - 1) + width, 2.85))
+    rows = (
+        (BESIDE, GREY, "use _core alone (plots: chains, too)"),
+        (TOOLS, GREY, "public modules for tools such as app"),
+        (APP, GREEN, "within app; each imports from those left of it"),
+    )
+    for row, (names, color, text) in enumerate(rows):
+        low = 1.25 - 0.7 * row
+        for k, name in enumerate(names):
+            box(ax, 0.1 + step * k, low, width, color, name, 0.58)
+        ax.text(0.1 + step * len(names), low + 0.29, text, va="center", fontsize=9.5)
+    ax.set(xlim=(0.0, 11.8), ylim=(-0.25, 4.0))
 
 
 def main():
     """Write the picture."""
     figure, (top, bottom) = plt.subplots(
-        2, 1, figsize=(10.0, 6.9), height_ratios=(4.5, 3.15), layout="constrained"
+        2, 1, figsize=(10.0, 7.8), height_ratios=(4.5, 4.25), layout="constrained"
     )
     draw_models(top)
     draw_folders(bottom)
     for ax in (top, bottom):
         ax.set_axis_off()
     path = Path(__file__).parents[1] / "images" / "how_it_works.png"
-    figure.savefig(path, dpi=150)
+    figure.savefig(path, dpi=130)
 
 
 if __name__ == "__main__":

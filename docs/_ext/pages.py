@@ -22,6 +22,7 @@ EXAMPLES = (
     "payload",
     "new_day",
     "rigid_arm",
+    "autograd",
     "elm_dask",
 )
 """The gallery's order."""

@@ -32,7 +32,7 @@ class SeparatingMotion:
     Attributes
     ----------
     chosen, rival : str
-        Names of the two sets, see `GeometryChoice.errors`.
+        Names of the two sets, see `errors` of `GeometryChoice`.
     motion : str
         What to do, in words.
     q : ndarray of shape (T, n_actuators)
@@ -85,13 +85,13 @@ def separating_motions(
 ) -> tuple[SeparatingMotion, ...]:
     """Return for each rival of a choice the motion that best shows which of the two is right.
 
-    A log can leave open which parameters of the robot are wrong: `GeometryChoice.rivals` have
-    nearly the errors of the chosen set. All are calibrated on the log. Motions within the limits
-    are compared: each segment bends to one side, goes around a circle, or changes its length, while
-    the others stay straight; all segments bend together; one goes around a circle while another is
-    bent. Of chains without one arc for each segment single actuators and pairs of them move. Of the
-    motions with the largest differences the one is taken of which most remains after a calibration
-    on the log and this motion.
+    A log can leave open which parameters of the robot are wrong: the `rivals` of a `GeometryChoice`
+    have nearly the errors of the chosen set. All are calibrated on the log. Motions within the
+    limits are compared: each segment bends to one side, goes around a circle, or changes its
+    length, while the others stay straight; all segments bend together; one goes around a circle
+    while another is bent. Of chains without one arc for each segment single actuators and pairs of
+    them move. Of the motions with the largest differences the one is taken of which most remains
+    after a calibration on the log and this motion.
 
     Parameters
     ----------

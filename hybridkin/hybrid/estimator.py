@@ -257,10 +257,11 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.random_state = random_state
 
     def set_params(self, **params: Any) -> HybridForwardModel:
-        """Set parameters; ``error_model__*`` reach the default ELM as well."""
-        nested = any(name.startswith("error_model__") for name in params)
-        if nested and self.error_model is None and params.get("error_model") is None:
-            self.error_model = ELMRegressor()
+        """Set parameters; ``error_model__*`` reach the default ELM as well, also by its name."""
+        nested = [name for name in params if name.startswith("error_model__")]
+        if nested:
+            error_model = params.get("error_model", self.error_model)
+            params["error_model"] = _estimator_with(nested[0], error_model)
         return super().set_params(**params)
 
     def fit(
@@ -987,6 +988,18 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
 def _geometry(mechanical: object) -> dict[str, Tensor]:
     """Return the geometry of a mechanical model; empty if there is none."""
     return {} if mechanical is None else as_forward_model(mechanical).geometry()
+
+
+def _estimator_with(parameter: str, error_model: object) -> object:
+    """Return the estimator of which a nested parameter, ``error_model__*``, is."""
+    if error_model is None or error_model == "elm":
+        return ELMRegressor()
+    if isinstance(error_model, str):
+        raise ValueError(
+            f"`{parameter}` needs an estimator as `error_model`, got {error_model!r}, a name "
+            "without parameters; set error_model=ELMRegressor(), for example, or leave it out."
+        )
+    return error_model
 
 
 def _check_positive(name: str, value: object, high: float) -> None:

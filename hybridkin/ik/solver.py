@@ -113,8 +113,8 @@ class InverseKinematics:
         position tasks only. A box ``low <= x <= high`` is
         ``(np.vstack([np.eye(3), -np.eye(3)]), np.concatenate([high, -low]))``.
     obstacles : sequence of Obstacle, default=()
-        What the whole body keeps clear of, in the frame of x: `obstacles.Sphere`, `HalfSpace`,
-        `Capsule`, `Box`.
+        What the whole body keeps clear of, in the frame of x: `obstacles.Sphere`,
+        `obstacles.HalfSpace`, `obstacles.Capsule`, `obstacles.Box`.
     clearance : float, default=0.0
         Least distance between the body and obstacles [m]. The expected error of the model comes on
         top where its estimator knows it (`radius_`).

@@ -15,7 +15,6 @@ from sklearn.linear_model import ElasticNet, LinearRegression, Ridge, RidgeCV
 from sklearn.pipeline import Pipeline
 from sklearn.preprocessing import MinMaxScaler, StandardScaler
 from torch import Tensor, nn
-from torch.autograd.function import once_differentiable
 
 from hybridkin._core.arrays import copied
 from hybridkin._core.blocks import in_blocks
@@ -384,7 +383,7 @@ class RegressorModule(ForwardModel):
 
     def forward(self, q: Tensor) -> Tensor:
         """Return the regressor's prediction, shape (..., m)."""
-        return _Differenced.apply(q, self)
+        return _Prediction.apply(q, self)
 
     def forward_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return the prediction (..., m) and dx/dq (..., m, n)."""
@@ -413,15 +412,65 @@ class RegressorModule(ForwardModel):
         return x.to(q).reshape(*q.shape[:-1], -1)
 
 
-class _Differenced(torch.autograd.Function):
+class _ByRows(torch.autograd.Function):
+    """A function of rows that scikit-learn computes, for every torch transform.
+
+    The dimension of a `vmap` becomes one more leading dimension of the rows.
+    """
+
     @staticmethod
-    def forward(ctx: Any, q: Tensor, module: RegressorModule) -> Tensor:
+    def setup_context(ctx: Any, inputs: tuple[Tensor, RegressorModule], output: Tensor) -> None:
+        q, ctx.module = inputs
         ctx.save_for_backward(q)
-        ctx.module = module
+        ctx.save_for_forward(q)
+
+
+class _Prediction(_ByRows):
+    @staticmethod
+    def forward(q: Tensor, module: RegressorModule) -> Tensor:
         return module.evaluate(q)
 
     @staticmethod
-    @once_differentiable
+    def vmap(info: object, in_dims: tuple[int, None], *args: Any) -> tuple[Tensor, int]:
+        q, module = args
+        return _Prediction.apply(q.movedim(in_dims[0], 0), module), 0
+
+    @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:  # pyright: ignore
         (q,) = ctx.saved_tensors
-        return (grad[..., None, :] @ ctx.module.differences(q))[..., 0, :], None
+        J = _Slopes.apply(q, ctx.module)
+        return (grad[..., None, :] @ J)[..., 0, :], None
+
+    @staticmethod
+    def jvp(ctx: Any, tangent: Tensor, _: None) -> Tensor:  # pyright: ignore
+        (q,) = ctx.saved_tensors
+        J = _Slopes.apply(q, ctx.module)
+        return (J @ tangent[..., None])[..., 0]
+
+
+class _Slopes(_ByRows):
+    @staticmethod
+    def forward(q: Tensor, module: RegressorModule) -> Tensor:
+        return module.differences(q)
+
+    @staticmethod
+    def vmap(info: object, in_dims: tuple[int, None], *args: Any) -> tuple[Tensor, int]:
+        q, module = args
+        return _Slopes.apply(q.movedim(in_dims[0], 0), module), 0
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:  # pyright: ignore
+        raise RuntimeError(_only_once(ctx.module))
+
+    @staticmethod
+    def jvp(ctx: Any, tangent: Tensor, _: None) -> Tensor:  # pyright: ignore
+        raise RuntimeError(_only_once(ctx.module))
+
+
+def _only_once(module: RegressorModule) -> str:
+    """Return why a regressor has no second derivatives, and what has them."""
+    return (
+        f"`error_model` must be twice differentiable by torch for second derivatives, got "
+        f"{type(module.regressor).__name__}, whose Jacobian is made of differences; take a linear "
+        "model, a KernelRidge with an RBF kernel, an ELMRegressor or a named error model."
+    )

@@ -15,19 +15,37 @@ def nothing(reader):
     """Check no more than that the blocks run."""
 
 
-def your_robot(reader):
-    errors = dict(re.findall(r"(\w+): mean ([\d.]+) mm", reader.printed))
-    assert float(errors["hybrid"]) < 0.6 * float(errors["mechanical"])
-    assert len(Path("commands.csv").read_text().splitlines()) == len(reader.space["path"].x)
+def getting_started(reader):
+    error, inside = re.search(r"([\d.]+) cm, (\d+) % within the radius", reader.printed).groups()
+    assert abs(float(error) - 1.0) < 0.1
+    assert abs(int(inside) - 76) < 5
+    assert "(201, 9)" in reader.printed
 
 
 def two_minutes(reader):
     assert "25 rows" in reader.printed
-    assert Path("model/model.safetensors").is_file()
+    assert "The promise is kept." in reader.printed
+    assert "76 of 76 points" in reader.printed
+    for file in ("plan/next.csv", "model/model.safetensors", "track/commands.png", "more/next.csv"):
+        assert Path(file).is_file()
+
+
+def your_robot(reader):
+    errors = dict(re.findall(r"(\w+): mean ([\d.]+) mm", reader.printed))
+    assert float(errors["hybrid"]) < 0.6 * float(errors["mechanical"])
+    assert "The promise is kept." in reader.printed
+    assert Path("track/track.png").is_file()
+    for radius, ruler in zip(reader.space["result"].values["radii"], (0.008, 0.008), strict=True):
+        assert abs(radius / ruler - 1.0) < 0.1
+    assert len(Path("commands.csv").read_text().splitlines()) == len(reader.space["path"].x)
 
 
 # What a page says of what its blocks print or write.
-CHECKS = {"your_robot": your_robot, "two_minutes": two_minutes}
+CHECKS = {
+    "getting_started": getting_started,
+    "two_minutes": two_minutes,
+    "your_robot": your_robot,
+}
 
 
 @pytest.mark.slow

@@ -148,11 +148,20 @@ def test_networks_without_a_seed_have_that_of_the_hybrid(log, coupling):
     assert_array_equal(tips(ELMRegressor(20)), expected)
     assert_array_equal(tips(error_model__n_hidden=20), expected)
     assert_array_equal(tips(seed=3, error_model__n_hidden=20, random_state=0), expected)
+    assert_array_equal(tips(error_model="elm", error_model__n_hidden=20), expected)
     assert np.abs(tips(seed=1, error_model__n_hidden=20) - expected).max() > 1e-6
     assert_array_equal(tips(ELMRegressor(20, random_state=0), seed=1), expected)
     given = ELMRegressorCV(8, cv=2, relevance_rounds=0, max_hidden=0)
     assert_array_equal(tips(given), tips(given))
     assert given.random_state is None
+
+
+def test_names_of_error_models_have_no_nested_parameters():
+    for model in (HybridForwardModel(bha(), "quadratic"), HybridForwardModel(bha())):
+        with pytest.raises(ValueError, match=r"`error_model__alpha` needs an estimator.*quadratic"):
+            model.set_params(error_model="quadratic", error_model__alpha=0.1)
+    with pytest.raises(ValueError, match=r"`error_model__alpha` needs an estimator.*'auto'"):
+        HybridForwardModel(bha(), "auto").set_params(error_model__alpha=0.1)
 
 
 @pytest.mark.parametrize("size", [1e30, 1e74, -1e74, 1e154, 1e300])

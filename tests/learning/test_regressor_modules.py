@@ -9,12 +9,15 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF
 from sklearn.kernel_ridge import KernelRidge
 from sklearn.linear_model import ElasticNet, Lasso, LinearRegression, Ridge, RidgeCV
+from sklearn.multioutput import MultiOutputRegressor
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import MinMaxScaler, PolynomialFeatures, StandardScaler
-from sklearn.svm import LinearSVR
+from sklearn.svm import SVR, LinearSVR
 from torch.autograd import gradcheck
+from torch.func import jacfwd, jacrev, vmap
 from torch.testing import assert_close
 
+from hybridkin._core.model import slopes
 from hybridkin.learning.regressor_modules import (
     AffineModule,
     KernelModule,
@@ -95,6 +98,34 @@ def test_others_are_differenced(regressor):
         expected = differences(regressor.predict, inside)
         kinks = np.abs(J - expected) > 1e-4 * np.abs(J).max()
         assert kinks.mean() < 0.02
+
+
+def test_differences_pass_through_the_transforms_of_torch():
+    X, y = data(2)
+    q = torch.from_numpy(X[:4])
+    module = error_module(MultiOutputRegressor(SVR()).fit(X, y), torch.from_numpy(X))
+    assert type(module) is RegressorModule
+    J = module.jacobian(q)
+    assert J.abs().max() > 1.0
+    assert_close(vmap(module)(q), module(q))
+    assert_close(vmap(module, in_dims=1)(q.mT), module(q))
+    assert_close(vmap(jacrev(module))(q), J)
+    assert_close(vmap(jacfwd(module))(q), J)
+    assert_close(jacrev(module)(q[0]), J[0])
+    rows = q.clone().requires_grad_()
+    assert_close(slopes(module(rows), rows), J)
+
+
+@pytest.mark.parametrize("transform", [jacrev, jacfwd])
+def test_differences_are_not_differentiated_again(transform):
+    X, y = data(1)
+    module = error_module(SVR().fit(X, y), torch.from_numpy(X))
+    with pytest.raises(RuntimeError, match=r"twice differentiable by torch.*got SVR, whose"):
+        transform(jacrev(module))(torch.from_numpy(X[0]))
+    q = torch.from_numpy(X[:1]).requires_grad_()
+    (slope,) = torch.autograd.grad(module(q).sum(), q, create_graph=True)
+    with pytest.raises(RuntimeError, match="take a linear model, a KernelRidge"):
+        slope.sum().backward()
 
 
 @pytest.mark.parametrize("unit", [1e-4, 1e4])
