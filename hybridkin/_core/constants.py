@@ -38,13 +38,22 @@ def constant(numbers: Any, like: Tensor, dtype: torch.dtype | None = None) -> Te
 
 @lru_cache(_MOST)
 def _kept(numbers: Any, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Return the constant; raise it in a `_NotKept` if it belongs to a graph that is traced."""
+    """Return the constant; raise it in a `_NotKept` if it belongs to a graph or a transform."""
     # Later derivatives cannot use tensors of the inference mode.
     with torch.inference_mode(False):
         tensor = torch.tensor(numbers, dtype=dtype, device=device)
-    if isinstance(tensor, FakeTensor):
+    if isinstance(tensor, FakeTensor) or not outlives_transforms(tensor):
         raise _NotKept(tensor)
     return tensor
+
+
+def outlives_transforms(tensor: Tensor) -> bool:
+    """Return whether a tensor has memory, also after the transform of torch it was made in."""
+    try:
+        tensor.data_ptr()
+    except RuntimeError:
+        return False
+    return True
 
 
 class _NotKept(Exception):

@@ -10,6 +10,8 @@ import torch
 from torch import Tensor, nn
 from torch.autograd import forward_ad
 
+from hybridkin._core.constants import outlives_transforms
+
 Tensors = TypeVar("Tensors", bound=tuple[Tensor, ...])
 KEPT = "_derived"
 """The attribute of a module with what it keeps; pickles do without it."""
@@ -127,14 +129,9 @@ class _Kept(Generic[Tensors]):
         return settings == self.settings and forward_ad._current_level < 0
 
     def keeps(self, values: Tensors) -> bool:
-        """Keep a result; return whether it has memory, also after the transform it is made in."""
+        """Keep a result; return whether it may be used later."""
         self.values = values
-        try:
-            for value in values:
-                value.data_ptr()
-        except RuntimeError:
-            return False
-        return True
+        return all(outlives_transforms(value) for value in values)
 
 
 def _version(entry: Tensor) -> int:

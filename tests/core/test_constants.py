@@ -1,7 +1,12 @@
 """Constants that are kept on each device."""
 
+import subprocess
+import sys
+
+import pytest
 import torch
 from torch._subclasses.fake_tensor import FakeTensorMode
+from torch.func import hessian, jacfwd, jacrev
 
 from hybridkin import ConstantCurvatureChain
 from hybridkin._core.constants import constant, moved
@@ -33,6 +38,31 @@ def test_constants_of_a_traced_graph_or_of_inference_are_not_left_behind():
     leaf = q.clone().requires_grad_()
     (slope,) = torch.autograd.grad(ConstantCurvatureChain([0.05])(leaf).sum(), leaf)
     assert slope.abs().max() > 0.0
+
+
+@pytest.mark.parametrize(("first", "factor"), [(jacrev, 5.25), (jacfwd, 5.5), (hessian, 5.75)])
+def test_constants_of_transforms_are_not_left_behind(first, factor):
+    def curve(q):
+        return constant((factor,), q) * q**2
+
+    q = torch.full((1,), 3.0, dtype=torch.float64)
+    jacrev(first(curve))(q)  # no call before has kept this factor
+    assert jacrev(curve)(q).item() == 6.0 * factor
+    assert constant((factor,), q).tolist() == [factor]
+
+
+def test_a_hessian_may_come_first():
+    """No constant may stay in its transforms; in a process of its own, where none is kept."""
+    code = (
+        "import torch\n"
+        "from hybridkin import ConstantCurvatureChain\n"
+        "chain = ConstantCurvatureChain([0.05])\n"
+        "q = torch.tensor([0.2, 0.21, 0.22], dtype=torch.float64)\n"
+        "second = torch.func.hessian(chain)(q)\n"
+        "torch.testing.assert_close(torch.func.hessian(chain)(q), second)\n"
+        "torch.testing.assert_close(torch.func.jacrev(chain)(q), chain.jacobian(q))\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_a_copy_elsewhere_follows_writes():
