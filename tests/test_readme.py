@@ -57,7 +57,8 @@ def test_python_runs_as_printed(capsys):
 
 
 def test_every_kind_of_command_is_tried_below():
-    assert {command[0] for command in COMMANDS} == {"pip", "make", "hybridkin"}
+    assert {"pip", "make", "hybridkin"} <= {command[0] for command in COMMANDS}
+    assert {command[0] for command in COMMANDS} <= {"pip", "uv", "make", "hybridkin"}
     assert len(OWN_LOG) >= 2
     assert all("train.csv" in command for command in RECORDING)
 
@@ -72,16 +73,23 @@ def test_commands_of_the_first_use_are_known(tmp_path, monkeypatch):
 
 def test_what_pip_installs_is_there():
     """The installation itself is what `make` does."""
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    installs = [command for command in COMMANDS if command[0] == "pip"]
-    assert installs
-    for _, verb, *what in installs:
-        assert verb == "install"
-        for name in what:
+    pyproject = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    project = pyproject["project"]
+    pages = ["README.md", "CONTRIBUTING.md"]
+    lines = "\n".join((ROOT / page).read_text(encoding="utf-8") for page in pages)
+    installs = re.findall(r"^(?:uv )?pip install (.*)$", lines, re.MULTILINE)
+    assert len(installs) >= 2
+    for line in installs:
+        words = shlex.split(line, comments=True)
+        while "--group" in words:
+            group = words.pop(words.index("--group") + 1)
+            words.remove("--group")
+            assert group in pyproject["dependency-groups"]
+        for name in words:
             extras = re.fullmatch(r"\.\[([\w,]+)\]", name)
             if extras:
                 assert {*extras[1].split(",")} <= {*project["optional-dependencies"]}
-            else:
+            elif name not in (".", "--editable"):
                 assert any(needed.startswith(name) for needed in project["dependencies"])
 
 
@@ -97,7 +105,7 @@ RUNS = {  # the last command of a target
     "view-test": "python -m pytest -q tests/app/viewer -m browser",
     "check": "pyright --pythonpath .venv/bin/python",
 }
-EXTRAS = {"docs": "docs", "bench": "bench"}  # more than the extra "dev"
+GROUPS = {"docs": "docs", "bench": "bench", "examine": "examine"}  # more than the group "full"
 TARGETS = {*re.findall(r"make\s([a-z-]+)", README), *re.findall(r"make ([a-z-]+) +#", CONTRIBUTING)}
 
 
@@ -141,9 +149,9 @@ def test_make_runs_what_a_target_says(fresh, target):
         assert (ROOT / script).exists()
     if last[0].startswith(".venv"):  # others make an environment of their own
         assert clean[0] == ["python3", "-m", "venv", ".venv"]
-        assert [*before, "--editable", ".[dev]"] in clean[: clean.index(last)]
-    if target in EXTRAS:
-        assert [*before, "--editable", f".[{EXTRAS[target]}]"] in clean[: clean.index(last)]
+        assert [*before, "--editable", ".[full]", "--group", "full"] in clean[: clean.index(last)]
+    if target in GROUPS:
+        assert [*before, "--group", GROUPS[target]] in clean[: clean.index(last)]
     for name in ("installed", "native", "docs", "bench", "examine", "browser", "wheels"):
         (fresh / ".venv").mkdir(exist_ok=True)
         (fresh / ".venv" / f".{name}").touch()
