@@ -9,6 +9,7 @@ import sys
 import warnings
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 _SOURCES = Path(__file__).parents[2]
 
@@ -31,8 +32,8 @@ def compiling_command() -> str:
     return shlex.join([*command, "--force-reinstall", "--no-deps", "--no-cache-dir", origin])
 
 
-def _origin(direct_url: dict) -> str:
-    """Return what to install again, of the record of a package that came from no index (PEP 610)."""
+def _origin(direct_url: dict[str, Any]) -> str:
+    """Return what to install again, from the record of where a package came from (PEP 610)."""
     url = direct_url.get("url", "hybridkin")
     if url.endswith(".whl"):  # it holds no kernels; the index has wheels that do
         return "hybridkin"

@@ -130,7 +130,7 @@ def test_without_a_library_torch_computes(reopened, tmp_path):
     reopened.delenv("HYBRIDKIN_NATIVE", raising=False)
     reopened.setattr(library, "_FOLDER", tmp_path)
     assert backend(chain()).startswith("torch: hybridkin was installed without compiled kernels")
-    with pytest.raises(RuntimeError, match="install a C compiler, then run `.*hatch_build.py`"):
+    with pytest.raises(RuntimeError, match=r"install a C compiler, then run `.*hatch_build.py`"):
         library.Program(None)
 
 
