@@ -141,6 +141,7 @@ def test_code_of_the_learners_page_runs_as_printed(capsys):
 
 @pytest.mark.slow
 def test_the_stream_of_the_learners_page_learns_a_folder_of_parquet(tmp_path, monkeypatch):
+    pytest.importorskip("pyarrow")
     monkeypatch.chdir(tmp_path)
     Path("night").mkdir()
     rng = np.random.default_rng(0)
