@@ -684,10 +684,10 @@ def _add_commands(
     display = hybridkin.plots.ActuatorDisplay(
         commands, counts, t, names=log_format.q, limits=np.stack([low, high])
     )
-    display.plot(axes[:, 0], unit=log_format.q_unit, per_unit=log_format.q_factor)
     caption = "Commands and their limits, with the names, unit and sign of the robot's logs."
     if n_lead:
         for ax in axes[:, 0]:
-            ax.axvline(t[n_lead], color="0.6", linewidth=1.0)
+            ax.axvline(t[n_lead], color="0.6", linewidth=1.0, label="start of the path")
         caption += " The path begins at the grey line."
+    display.plot(axes[:, 0], unit=log_format.q_unit, per_unit=log_format.q_factor)
     report.figure("commands", figure, caption)

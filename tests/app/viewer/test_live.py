@@ -57,7 +57,7 @@ def test_the_tip_follows_the_target_and_the_page_says_so(shown):
     assert np.linalg.norm(shown.robot.x - target) < 1e-3
     assert shown._aim.position == pytest.approx(target)
     sliders = np.array([slider.value for slider in shown._sliders])
-    assert sliders == pytest.approx(shown.robot.q, abs=5e-4)
+    assert sliders == pytest.approx(shown.robot.q, abs=0.6 * shown._scales[0].step)
     assert shown._body._backbone.points[-1] == pytest.approx(shown.robot.x, abs=0.01)
 
 
