@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -66,8 +67,12 @@ def _recorded(
         _Stroke(server.scene, line.label, line, longest).show(0)
     _add_obstacles(server.scene, scene, longest)
     strokes = []
-    for k, line in enumerate(scene.moving):
-        name = _node(f"{k + 1} {line.label}".rstrip())
+    seen_names = Counter[str]()
+    for line in scene.moving:
+        name = _node(line.label or "part")
+        seen_names[name] += 1
+        if seen_names[name] > 1:
+            name += f" {seen_names[name]}"
         strokes.append(_Stroke(server.scene, name, line, longest))
     caption = server.scene.add_label("/caption", "", position=above)
     recording = server.get_scene_serializer()

@@ -293,7 +293,8 @@ class LogCloud:
         if len(error):
             largest = float(np.percentile(error, 95))
         self._size = 0.005 * robot.size
-        self.name = f"measured (dots), red: error of {1e3 * largest:.2g} mm or more"
+        worst = float(f"{1e3 * largest:.2g}")
+        self.name = f"measured (dots), red: error of {worst:g} mm or more"
         self.dots = scene.add_point_cloud(
             "/log",
             self.tips,

@@ -34,6 +34,7 @@ from hybridkin.app.viewer.drawing import (
     Ghost,
     LogCloud,
 )
+from hybridkin.app.viewer.first_look import FirstLook, first_camera
 from hybridkin.app.viewer.motions import (
     Loop,
     Motion,
@@ -49,11 +50,10 @@ from hybridkin.app.workflow.domain import path_limits
 from hybridkin.app.workflow.model import expected_errors, has_body, is_fitted
 from hybridkin.datasets import Log
 from hybridkin.formats import METRES, csv_table, markdown, visible
-from hybridkin.plots.page_server import fitted_camera, page_server, stop
+from hybridkin.plots.page_server import page_server, stop
 
 __all__ = ["LiveView", "view"]
 
-_EYE = (0.9, -1.1, 0.4)  # where the eye stands, from the robot
 _ARROWS = 0.15  # length of the arrows of the target, relative to the robot's size
 _BESIDE = 0.25  # how far from robot and log obstacles are seen, relative to these
 _SHORT = 0.1  # lengths that sliders show in millimetres [m]
@@ -119,7 +119,7 @@ def view(
 
     Examples
     --------
-    >>> import hybridkin
+    >>> import hybridkin.app
     >>> chain = hybridkin.robots.bionic_handling_assistant()
     >>> with hybridkin.app.view(chain, q_min=0.1, q_max=0.4) as shown:  # doctest: +SKIP
     ...     print(shown.address)
@@ -253,7 +253,7 @@ class LiveView:
         if self._expected() > 0.0:
             self._switched["expected error (ball)"] = self._radius
         self._seen = self._everything(reachable)
-        fitted_camera(self._seen, _EYE).aim(self._server.initial_camera)
+        first_camera(self._seen).aim(self._server.initial_camera)
         self._server.on_client_connect(self._fit)
 
     def _everything(self, reachable: NDArray) -> NDArray:
@@ -278,12 +278,11 @@ class LiveView:
         return self.robot.target + _ARROWS * self.robot.size * np.eye(3)
 
     def _fit(self, client: Any) -> None:
-        """Show everything on the page of a client, whatever its shape is."""
-        camera = client.camera
-        aspect = camera.image_width / max(camera.image_height, 1)
-        with client.atomic():
-            camera.min_orbit_distance = 1e-3 * self.robot.size
-            fitted_camera(self._seen, _EYE, max(aspect, 0.1)).aim(camera)
+        """Show everything on the page of a client, until its user turns the robot."""
+        client.camera.min_orbit_distance = 1e-3 * self.robot.size
+        look = FirstLook(client, self._seen)
+        look.fit(client.camera)
+        client.camera.on_update(look.fit)
 
     def __enter__(self) -> Self:
         return self
