@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from hybridkin import Commands, ForwardModel, obstacles
+from hybridkin import ForwardModel, obstacles
 from hybridkin.app.viewer.steered import SteeredRobot
 from hybridkin.app.workflow.model import is_fitted, tips_at
 from hybridkin.datasets import Log
@@ -46,10 +46,9 @@ class Body:
         Its points at the start [m].
     """
 
-    def __init__(self, scene: Any, model: Any, robot: SteeredRobot) -> None:
-        self._model = model
+    def __init__(self, scene: Any, robot: SteeredRobot) -> None:
         self._chain = robot.model.module_.robot
-        body = _body_of(model, robot)
+        body = _steered_body(robot)
         self.points = _points_of(body)
         self._thick = 0.015 * robot.size
         least = robot.model.module_.tip_model.robot.least_radius
@@ -87,7 +86,7 @@ class Body:
 
     def move(self, robot: SteeredRobot) -> None:
         """Draw the robot where it is."""
-        body = _body_of(self._model, robot)
+        body = _steered_body(robot)
         if not np.isfinite(body.points).all():
             return
         self._backbone.points = body.points[0]
@@ -108,7 +107,8 @@ class Body:
 
     def _marked(self, robot: SteeredRobot) -> NDArray:
         """Return the markers (K, 3) as the model predicts them."""
-        return robot.model.predict(Commands(robot.q[None])).reshape(-1, 3)
+        with torch.no_grad():
+            return robot.model.module_(torch.from_numpy(robot.q)).reshape(-1, 3).numpy()
 
     def _tensions(self, robot: SteeredRobot) -> tuple[NDArray, NDArray]:
         """Return colours (n, 3) of the actuators, and which are slack (n,)."""
@@ -130,9 +130,19 @@ def _points_of(body: BackboneDisplay) -> NDArray:
     return points[np.isfinite(points).all(axis=1)]
 
 
-def _body_of(model: Any, robot: SteeredRobot) -> BackboneDisplay:
-    """Return the body of a model at the configuration of a robot."""
-    return BackboneDisplay.from_estimator(model, robot.q, n_points=_POINTS)
+def _body_of(chain: ForwardModel, robot: SteeredRobot) -> BackboneDisplay:
+    """Return the body of a chain at the configuration of a robot."""
+    return BackboneDisplay.from_estimator(chain, robot.q, n_points=_POINTS)
+
+
+def _steered_body(robot: SteeredRobot) -> BackboneDisplay:
+    """Return the body of a robot, which ends at its tip if the model corrects it inside."""
+    model = robot.model
+    chain = model.module_.robot
+    if not model.fitted_module_.corrects_inside:
+        return _body_of(chain, robot)
+    tips = robot.x[None]
+    return BackboneDisplay.from_estimator(chain, robot.q, n_points=_POINTS, tips=tips)
 
 
 class DraggedObstacle:

@@ -47,7 +47,7 @@ from hybridkin.app.viewer.placed import with_fitted_base
 from hybridkin.app.viewer.sliders import Scale
 from hybridkin.app.viewer.steered import RATE, SteeredRobot
 from hybridkin.app.workflow.domain import path_limits
-from hybridkin.app.workflow.model import expected_errors, has_body, is_fitted
+from hybridkin.app.workflow.model import check_columns, expected_errors, has_body, is_fitted
 from hybridkin.datasets import Log
 from hybridkin.formats import METRES, csv_table, markdown, visible
 from hybridkin.plots.page_server import page_server, stop
@@ -133,6 +133,7 @@ def view(
             f"got a model without a mechanical part, {model.description_.name}."
         )
     if log is not None:
+        check_columns(model, log.q)
         model = with_fitted_base(model, log)
     if log is not None and not _has_range(model):
         q_min = np.where(np.isfinite(q_min), q_min, np.nanmin(log.q, axis=0))
@@ -182,9 +183,13 @@ class LiveView:
         self._failure: Exception | None = None
         self._motion: Motion | None = None
         self._last_words = 0.0
-        self._draw_scene(log)
-        self._add_panel(log, path)
-        self._show()
+        try:
+            self._draw_scene(log)
+            self._add_panel(log, path)
+            self._show()
+        except BaseException:
+            stop(self._server)
+            raise
         self._thread = Thread(target=self._run, daemon=True)
         self._thread.start()
 
@@ -210,7 +215,7 @@ class LiveView:
             wxyz=(w, x, y, z),
             position=robot.base[:3, 3],
         )
-        self._body = Body(scene, robot.model, robot)
+        self._body = Body(scene, robot)
         self._aim = scene.add_transform_controls(
             "/target",
             scale=_ARROWS * robot.size,
@@ -494,6 +499,8 @@ class LiveView:
         if self._measured.visible:
             away = np.linalg.norm(self._measured.position - robot.x)
             lines.append(f"measured tip (cube): {1e3 * away:.3g} mm from that of the model")
+        if robot.is_contradictory:
+            lines.append("tendons pull against each other: a real robot is compressed")
         lines += self._about_obstacles()
         lines.append("at limits: " + (", ".join(at_limits) or "none"))
         lines.append(f"{self.ticks_per_second:.0f} steps per second")

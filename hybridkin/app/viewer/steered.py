@@ -9,6 +9,7 @@ from threading import Lock
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike, NDArray
 
 from hybridkin import HybridForwardModel, IKStatus, InverseKinematics, obstacles
@@ -205,6 +206,12 @@ class SteeredRobot:
             if not inside:
                 words += ", outside the domain of the model"
             return Situation(f"{words}.", reached, out_of_reach, inside, error)
+
+    @property
+    def is_contradictory(self) -> bool:
+        """Whether tendons pull against each other, so that the model's shape is not a robot's."""
+        q = torch.from_numpy(self.q)[None]
+        return bool(self.model.module_.robot.contradictions(q))
 
     @property
     def distances(self) -> NDArray[np.float64]:
