@@ -22,6 +22,7 @@ from hybridkin.plots.page_server import page_server, stop
 _EYE = (0.433, -0.75, 0.5)
 _WIDTH = 0.003  # of a line of width 1, in the same unit
 _DOT = 0.016  # size of a marker
+_SHAPES = {"x": "sparkle"}  # of markers, a target among them; circles else
 _MOST_DASHES = 24  # of a line
 
 
@@ -124,7 +125,7 @@ class _Stroke:
                 np.zeros((1, 3)),
                 color,
                 point_size=_DOT,
-                point_shape="circle",
+                point_shape=_SHAPES.get(line.marker, "circle"),
                 precision="float32",
             )
             self._parts.append((dots, lambda points: points))
