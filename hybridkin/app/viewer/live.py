@@ -132,6 +132,7 @@ def view(
             "`model` must be a chain, or a hybrid fitted on one, so that its body can be drawn; "
             f"got a model without a mechanical part, {model.description_.name}."
         )
+    described = model
     if log is not None:
         check_columns(model, log.q)
         model = with_fitted_base(model, log)
@@ -140,7 +141,7 @@ def view(
         q_max = np.where(np.isfinite(q_max), q_max, np.nanmax(log.q, axis=0))
     limits = path_limits(model, q_min=q_min, q_max=q_max, dq_max=dq_max, ddq_max=ddq_max)
     robot = SteeredRobot(model, limits, obstacles, clearance)
-    return LiveView(robot, log, path, host, port)
+    return LiveView(robot, log, path, host, port, base_is_fitted=model is not described)
 
 
 def _has_range(model: HybridForwardModel) -> bool:
@@ -157,6 +158,8 @@ class LiveView:
         The robot that is shown.
     address : str
         Address of the page.
+    base_is_fitted : bool
+        Whether the base of a description was fitted to the log that is shown.
     ticks_per_second : float
         Rate while the robot moved, averaged over some ticks.
     """
@@ -168,6 +171,8 @@ class LiveView:
         path: trajectories.Trajectory | None,
         host: str,
         port: int,
+        *,
+        base_is_fitted: bool = False,
     ) -> None:
         try:
             self._server = page_server(
@@ -176,6 +181,7 @@ class LiveView:
         except ImportError as error:
             raise ImportError('a live view needs viser: pip install "hybridkin[view]".') from error
         self.robot = robot
+        self.base_is_fitted = base_is_fitted
         self.ticks_per_second = RATE
         self.address = f"http://{host}:{self._server.get_port()}"
         self._wake = Event()

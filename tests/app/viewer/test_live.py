@@ -212,6 +212,7 @@ def test_a_base_that_is_not_known_is_fitted_before_it_is_drawn(tmp_path, calibra
     path = tmp_path / "robot.toml"
     path.write_text('routing = "base"' + ROBOT.format(calibrate=calibrate))
     with hybridkin.app.view(open_model(path), log, port=9360) as shown:
+        assert shown.base_is_fitted == is_fitted
         expected = base if is_fitted else np.eye(4)
         np.testing.assert_allclose(shown.robot.base, expected, atol=1e-6)
         np.testing.assert_allclose(shown._body.points[0], expected[:3, 3], atol=1e-6)
