@@ -1,6 +1,6 @@
 """The live view in Chromium: what a user sees and does with the mouse.
 
-The pictures of docs/view.md come from here: `make view-test PICTURES=docs/images`.
+The pictures of docs/how_to/view.md come from here: `make view-test PICTURES=docs/images`.
 """
 
 import io
