@@ -55,6 +55,10 @@ _CONVERT = (
     "set `spool_radius` (of motors) or `gain` (of pressures or steps: metres per unit) in every "
     "[[segment]] of the robot description (`gains` of a chain)"
 )
+_TURNS = (
+    "If these are encoders, read with `unwrap` or not, `zeros` can be whole turns off: add or "
+    "subtract turns there."
+)
 _NAMES = {"m": "metres", "cm": "centimetres", "mm": "millimetres"}
 _REACH = 5.0  # impossible range of the tip over the reach of the robot
 _USUAL_REACH = 0.7
@@ -298,7 +302,7 @@ def _no_lengths(comparison: _Comparison) -> Iterator[LogFinding]:
     elif pulled.any() and (low > 0.1 * high)[pulled].all():
         needed = "tendons, whose q are changes of length"
         columns = pulled
-        advice = _ADVICE["whole"]
+        advice = _ADVICE["whole"] + _about_turns(log.file_units["q"])
     else:
         return
     span = f"{1e3 * low[columns].min():.4g} and {1e3 * high[columns].max():.4g} mm"
@@ -401,7 +405,14 @@ def _unit_finding(name: str, what: str, unit: str, factor: float) -> LogFinding:
             remedy = f'set {name}_unit = "{other}" {where} {other}'
     message = f"columns of {name} are declared as {unit}, but {what}; {looks}."
     advice = f"{remedy}; or correct the radii and lengths of the description, in metres."
+    if name == "q":
+        advice += _about_turns(unit)
     return LogFinding("units", "error", message, advice)
+
+
+def _about_turns(unit: str) -> str:
+    """Return what else can be wrong if q is in the unit of an encoder; of lengths nothing."""
+    return "" if unit in METRES else f" {_TURNS}"
 
 
 def _only_lengthened(comparison: _Comparison) -> Iterator[LogFinding]:
@@ -580,7 +591,10 @@ def _changed_values(comparison: _Comparison) -> Iterator[LogFinding]:
     message = (
         f"the error of the nominal model falls to {100 * ratio:.0f} % if {words(comparison, best)}."
     )
-    yield LogFinding(kind, "warning", message, _ADVICE[kind])
+    advice = _ADVICE[kind]
+    if kind in ("offset", "zeros"):
+        advice += _about_turns(comparison.log.file_units["q"])
+    yield LogFinding(kind, "warning", message, advice)
 
 
 def _in_words(comparison: _Comparison, best: Explanation) -> str:
