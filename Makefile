@@ -30,7 +30,9 @@ everything: $(VENV)/.bench $(VENV)/.browser $(VENV)/.native
 	$(BIN)/python -m pytest $(TESTS) -m "not browser"
 	$(BIN)/python -m pytest -q tests/app/viewer -m browser
 
-# The live view in a real browser; needs Chromium of the system.
+# The live view in a real browser; needs Chromium of the system. PICTURES=docs/images also writes the
+# pictures of docs/view.md anew, that of the recording with HYBRIDKIN_DATA.
+view-test: export HYBRIDKIN_PICTURES := $(PICTURES)
 view-test: $(VENV)/.browser $(VENV)/.native
 	$(BIN)/python -m pytest -q tests/app/viewer -m browser
 

@@ -239,6 +239,12 @@ def _view(arguments: argparse.Namespace, stages: Stages) -> _Result:
         address = shown_robot.address
         words = f"{visible(model.description_.name)} is at {address}. Ctrl-C ends it."
         stages.note(words, important=True)
+        if shown_robot.base_is_fitted:
+            stages.note(
+                "The base is fitted to the log, as the description leaves it open: the robot "
+                "stands where its tips were measured.",
+                important=True,
+            )
         if not arguments.no_browser and "SSH_CONNECTION" not in os.environ:
             webbrowser.open(address)
         with contextlib.suppress(KeyboardInterrupt):

@@ -233,7 +233,9 @@ def test_counts_of_the_log_are_written_as_integers(home, playful, tmp_path, caps
     """One count is a millimetre here, and all that the robot can do is within the rounding."""
     command = ["track", home, *EIGHT, "--round", "--out", tmp_path / "t"]
     code, record = document(capsys, *command)
-    assert (code, record["missed"]) == (0, 0)
+    assert record["missed"] == 0
+    assert code == 1  # commands so coarse leave the log
+    assert record["in_domain"] < 0.8
     assert record["rounded"]["n"] > 30
     assert record["rounded"]["largest"] > 1e-3
     assert record["expected"]["mean"] > record["rounded"]["after"]
