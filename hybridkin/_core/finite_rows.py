@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 from numpy.typing import NDArray
 
 LEAVE_OUT = (
@@ -10,9 +11,10 @@ LEAVE_OUT = (
 )
 
 
-def refuse_rows(bad: NDArray, name: str, advice: str = LEAVE_OUT) -> None:
-    """Raise if any of the rows (N,) of an argument is bad: not finite."""
-    if bad.any():
+def check_entries(finite: NDArray, name: str, advice: str = LEAVE_OUT) -> None:
+    """Raise if not all entries (N, k) of an argument are finite."""
+    if not finite.all():
+        bad = np.logical_not(finite).any(axis=1)
         raise ValueError(
             f"`{name}` must be finite, got NaN or infinity in {bad.sum()} of {len(bad)} rows "
             f"(first: row {bad.argmax()}); {advice}."

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybridkin._core.arrays import countable
 from hybridkin._core.directions import moved_directions
-from hybridkin._core.finite_rows import LEAVE_OUT, refuse_rows
+from hybridkin._core.finite_rows import LEAVE_OUT, check_entries
 from hybridkin._core.groups import Groups
 
 # fractions of rows by distance: end of the inner, start of the outer
@@ -27,8 +27,7 @@ def check_finite(advice: str = LEAVE_OUT, /, **arrays: ArrayLike) -> None:
         rows = np.asarray(values)
         if rows.ndim not in (1, 2) or rows.dtype.kind != "f":
             continue
-        bad = ~countable(rows.reshape(len(rows), -1)).all(axis=1)
-        refuse_rows(bad, name, advice)
+        check_entries(countable(rows.reshape(len(rows), -1)), name, advice)
 
 
 def points(x: NDArray) -> NDArray:

@@ -30,7 +30,7 @@ from hybridkin._core.clock import check_seconds
 from hybridkin._core.commands import Commands
 from hybridkin._core.digests import row_digests
 from hybridkin._core.distinct import targets_that_count
-from hybridkin._core.finite_rows import LEAVE_OUT, refuse_rows
+from hybridkin._core.finite_rows import LEAVE_OUT, check_entries
 from hybridkin._core.html import html_table
 from hybridkin._core.model import ForwardModel, as_forward_model
 from hybridkin._core.other_units import check_commands, check_tips
@@ -580,7 +580,7 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 f"`y` must have shape {x.shape}, as what `predict` returns, got {measured.shape}."
             )
         measured = measured.reshape(len(x), -1)
-        refuse_rows(np.isinf(measured).any(axis=1), "y")
+        check_entries(~np.isinf(measured), "y")
         predicted = x.reshape(measured.shape)
         weights = np.ones(len(x))
         if sample_weight is not None:

@@ -9,7 +9,7 @@ from sklearn.utils.validation import _check_sample_weight, validate_data
 
 from hybridkin._core.arrays import real_array, table
 from hybridkin._core.distinct import targets_that_count
-from hybridkin._core.finite_rows import refuse_rows
+from hybridkin._core.finite_rows import check_entries
 from hybridkin.learning.network import ELM
 
 DTYPES = (np.float64, np.float32)
@@ -97,7 +97,7 @@ def _check_finite(X):
         return
     rows = real_array(X, "X")
     if rows.ndim == 2 and rows.dtype.kind == "f":
-        refuse_rows(~np.isfinite(rows).all(axis=1), "X")
+        check_entries(np.isfinite(rows), "X")
 
 
 def _validated(estimator, X, *y, good=True, **checks):

@@ -43,7 +43,7 @@ _DECIMALS = (".", ",")
 
 
 class _File(NamedTuple):
-    """An argument that names a file to read: its name in the help, and whether it can be a folder."""
+    """An argument that names a file to read: its name in the help; whether it can be a folder."""
 
     shown: str
     or_folder: bool
@@ -139,9 +139,10 @@ def _init(command: argparse.ArgumentParser) -> None:
     """Write a robot description.
 
     The file has the geometry of the robot and the columns and units of its logs, each with a
-    comment. `fit` can read it at once. If an option without a default is missing, the command asks on
-    a terminal for this and for all others that are not given. With --log it proposes the columns by their names and the zeros of tendons by the first
-    rows of the motions, and checks the log against the description, as `fit` does.
+    comment. `fit` can read it at once. If an option without a default is missing, the command asks
+    on a terminal for it and for all others that are not given. With --log it proposes the columns
+    by their names and the zeros of tendons by the first rows of the motions, and checks the log
+    against the description, as `fit` does.
 
     Some examples:
       hybridkin init robot.toml --log log.csv
@@ -414,8 +415,9 @@ def _track(command: argparse.ArgumentParser) -> None:
     within the training range of the model. If more than a tenth of the path leaves the reach of the
     robot, the command ends with exit code 2 and names the largest scale that does not. With
     --out-of-reach the tip goes as near as it can. The last line says how many points are reached
-    and missed, by how much, and the error to expect over all of them. The exit code is 1 if a fifth
-    of the points are missed or outside the log, with --fail-missed if one is missed.
+    and missed, by how much, and the error to expect over all of them; a point that only --round
+    misses counts as reached. The exit code is 1 if a fifth of the points are missed or outside the
+    log, with --fail-missed if one is missed.
 
     With --obstacles the whole body keeps clear of what a file describes:
 
