@@ -76,7 +76,7 @@ $(VENV)/.installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	$(BIN)/python -m pip install --quiet torch==2.13.0
-	$(BIN)/python -m pip install --quiet --editable ".[dev]"
+	$(BIN)/python -m pip install --quiet --editable ".[full]" --group full
 	touch $@
 
 # Compiles what has changed since the installation. Without a C compiler torch computes everything.
@@ -90,7 +90,7 @@ $(VENV)/.wheels: $(VENV)/.installed
 	touch $@
 
 $(VENV)/.bench: $(VENV)/.installed
-	$(BIN)/python -m pip install --quiet --editable ".[bench]"
+	$(BIN)/python -m pip install --quiet --group bench
 	touch $@
 
 $(VENV)/.examine: $(VENV)/.installed
@@ -102,7 +102,7 @@ $(VENV)/.browser: $(VENV)/.installed
 	touch $@
 
 $(VENV)/.docs: $(VENV)/.installed
-	$(BIN)/python -m pip install --quiet --editable ".[docs]"
+	$(BIN)/python -m pip install --quiet --group docs
 	touch $@
 
 clean:

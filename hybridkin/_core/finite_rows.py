@@ -14,8 +14,8 @@ LEAVE_OUT = (
 def check_entries(finite: NDArray, name: str, advice: str = LEAVE_OUT) -> None:
     """Raise if not all entries (N, k) of an argument are finite."""
     if not finite.all():
-        bad = np.logical_not(finite).any(axis=1)
+        bad = np.flatnonzero(~finite.all(axis=1))
         raise ValueError(
-            f"`{name}` must be finite, got NaN or infinity in {bad.sum()} of {len(bad)} rows "
-            f"(first: row {bad.argmax()}); {advice}."
+            f"`{name}` must be finite, got NaN or infinity in {len(bad)} of {len(finite)} rows "
+            f"(first: row {bad[0]}); {advice}."
         )

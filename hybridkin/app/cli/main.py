@@ -63,21 +63,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     stages = Stages(arguments.quiet)
     try:
         check_files(arguments)
-        # Loads the libraries whose threads are limited.
-        if arguments.command in _LIGHT:
-            _ = hybridkin.robots
-        else:
-            _ = hybridkin.HybridForwardModel
-        # Several threads cost many times the CPU time: the matrices are small.
-        with (
-            contextlib.closing(stages),
-            warnings.catch_warnings(),
-            _interruptible(),
-            threadpool_limits(limits=1),
-        ):
+        with contextlib.closing(stages), warnings.catch_warnings():
             warnings.filterwarnings("default", category=UserWarning)
             warnings.showwarning = stages.warn
-            report, code = _RUN[arguments.command](arguments, stages)
+            # Loads the libraries whose threads are limited.
+            if arguments.command in _LIGHT:
+                _ = hybridkin.robots
+            else:
+                _ = hybridkin.HybridForwardModel
+            # Several threads cost many times the CPU time: the matrices are small.
+            with _interruptible(), threadpool_limits(limits=1):
+                report, code = _RUN[arguments.command](arguments, stages)
     except _Terminated:
         return failed("interrupted", 143, arguments.json)
     except (KeyboardInterrupt, EOFError):  # EOFError: no answer to a question
