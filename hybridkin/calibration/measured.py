@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybridkin._core.arrays import countable
 from hybridkin._core.directions import moved_directions
+from hybridkin._core.finite_rows import LEAVE_OUT, check_entries
 from hybridkin._core.groups import Groups
 
 # fractions of rows by distance: end of the inner, start of the outer
@@ -14,10 +15,6 @@ _INNER = 0.4
 _BEYOND = 0.65
 
 
-LEAVE_OUT = (
-    "leave these rows out (np.isfinite finds them), or read the log with "
-    "datasets.load_log(..., drop_invalid=True)"
-)
 WEIGH_ZERO = (
     "give these rows the weight 0 in `sample_weight` (np.isfinite finds them): their commands "
     "still move the actuators, which they would not if the rows were left out"
@@ -30,13 +27,7 @@ def check_finite(advice: str = LEAVE_OUT, /, **arrays: ArrayLike) -> None:
         rows = np.asarray(values)
         if rows.ndim not in (1, 2) or rows.dtype.kind != "f":
             continue
-        bad = ~countable(rows.reshape(len(rows), -1)).all(axis=1)
-        if not bad.any():
-            continue
-        raise ValueError(
-            f"`{name}` must be finite, got NaN or infinity in {bad.sum()} of {len(rows)} rows "
-            f"(first: row {bad.argmax()}); {advice}."
-        )
+        check_entries(countable(rows.reshape(len(rows), -1)), name, advice)
 
 
 def points(x: NDArray) -> NDArray:

@@ -30,6 +30,7 @@ from hybridkin._core.clock import check_seconds
 from hybridkin._core.commands import Commands
 from hybridkin._core.digests import row_digests
 from hybridkin._core.distinct import targets_that_count
+from hybridkin._core.finite_rows import LEAVE_OUT, check_entries
 from hybridkin._core.html import html_table
 from hybridkin._core.model import ForwardModel, as_forward_model
 from hybridkin._core.other_units import check_commands, check_tips
@@ -37,7 +38,6 @@ from hybridkin._core.plausible import PlausibleRows, UnknownRows
 from hybridkin.calibration.calibrate import CalibrationResult
 from hybridkin.calibration.choice import NOT_CHOSEN, GeometryChoice
 from hybridkin.calibration.measured import (
-    LEAVE_OUT,
     WEIGH_ZERO,
     check_finite,
     check_unscaled,
@@ -574,7 +574,13 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """
         x = self.predict(X)
         y = targets_that_count(y, sample_weight, "y")
-        measured = np.asarray(y, dtype=float).reshape(len(x), -1)
+        measured = np.asarray(y, dtype=float)
+        if measured.size != x.size:
+            raise ValueError(
+                f"`y` must have shape {x.shape}, as what `predict` returns, got {measured.shape}."
+            )
+        measured = measured.reshape(len(x), -1)
+        check_entries(~np.isinf(measured), "y")
         predicted = x.reshape(measured.shape)
         weights = np.ones(len(x))
         if sample_weight is not None:

@@ -9,6 +9,7 @@ from sklearn.utils.validation import _check_sample_weight, validate_data
 
 from hybridkin._core.arrays import real_array, table
 from hybridkin._core.distinct import targets_that_count
+from hybridkin._core.finite_rows import check_entries
 from hybridkin.learning.network import ELM
 
 DTYPES = (np.float64, np.float32)
@@ -90,12 +91,23 @@ def _is_finite(a, ndim):
         return bool(np.isfinite(a.sum()))
 
 
+def _check_finite(X):
+    """Raise if rows hold NaN or infinity; other faults are for the checks of scikit-learn."""
+    if X is None:
+        return
+    rows = real_array(X, "X")
+    if rows.ndim == 2 and rows.dtype.kind == "f":
+        check_entries(np.isfinite(rows), "X")
+
+
 def _validated(estimator, X, *y, good=True, **checks):
     """Return X and y, checked by scikit-learn.
 
     Its array checks change the warning filters of all threads, so they are skipped for arrays that
     are known to be valid.
     """
+    if not _is_finite(X, 2):
+        _check_finite(X)
     good = good and _is_finite(X, 2) and all(len(X) == len(a) for a in y)
     checks |= {"dtype": DTYPES, "order": "C", "skip_check_array": good}
     with np.errstate(invalid="ignore"):  # a sum of both infinities

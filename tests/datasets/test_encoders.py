@@ -216,3 +216,27 @@ def test_unwrap_from_the_command_line_and_the_description(tmp_path, capsys):
         "`unwrap` in [log] must be true or false"
         in run(capsys, "describe", log, "--robot", robot)[2]
     )
+
+
+def test_zeros_that_are_a_turn_off_after_unwrap_are_named(tmp_path, capsys):
+    """A motor stood at 4200 in the straight robot, which the wrapped readings call 104."""
+    rng = np.random.default_rng(1)
+    q = np.round(300.0 * np.sin(np.outer(np.arange(400), rng.uniform(0.02, 0.05, 3))))
+    chain = ConstantCurvatureChain([0.01], lengths=[0.1], gains=3e-5)
+    x = 1e3 * (chain(torch.from_numpy(q)).numpy() + 1e-4 * rng.standard_normal((400, 3)))
+    log = written(tmp_path, np.mod(q + 4200.0, 4096.0), x)
+    robot = tmp_path / "r.toml"
+    text = (
+        "[[segment]]\nradius = 0.01\nlength = 0.1\ngain = 3e-5\nzeros = [{0}, 104, 104]\n"
+        '[log]\nq = ["m0", "m1", "m2"]\nx = ["x", "y", "z"]\nq_unit = "counts"\nx_unit = "mm"\n'
+    )
+    robot.write_text(text.format(4200))
+    out = " ".join(run(capsys, "describe", log, "--robot", robot)[1].split())
+    assert "`zeros` can then be whole turns off" in out
+    unwrapped_log = ["describe", log, "--robot", robot, "--unwrap", "4096"]
+    out = run(capsys, *unwrapped_log)[1]
+    assert "add or subtract turns there" in " ".join(out.split())
+    robot.write_text(text.format(4200 - 4096))
+    code, out, _ = run(capsys, *unwrapped_log)
+    assert code == 0
+    assert "turns" not in out

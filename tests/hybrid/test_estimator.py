@@ -256,3 +256,30 @@ def test_the_plain_chain_tells_of_slack_once_per_call(slack_log):
     fitted.predict_error(q)
     parts = q.reshape(-1, 2, 3)
     fitted.predict((parts - parts.mean(2, keepdims=True)).reshape(q.shape))
+
+
+@pytest.mark.parametrize("as_table", [np.asarray, np.ndarray.tolist])
+@pytest.mark.parametrize("method", ["predict", "jacobian", "in_domain", "effective"])
+def test_missing_values_of_new_rows_are_named_by_row(log, method, as_table):
+    q, x, _ = log
+    model = HybridForwardModel(bha(), "linear").fit(q, x)
+    rows = q[:8].copy()
+    rows[3, 2] = np.nan
+    rows[5, 0] = np.inf
+    with pytest.raises(
+        ValueError, match=r"`X` must be finite, .* in 2 of 8 rows .*: row 3"
+    ) as said:
+        getattr(model, method)(as_table(rows))
+    assert "leave these rows out" in str(said.value)
+    assert "HistGradientBoosting" not in str(said.value)
+
+
+def test_a_score_names_rows_of_y_that_are_infinite_or_lacking(log):
+    q, x, _ = log
+    model = HybridForwardModel(bha(), "linear").fit(q, x)
+    tips = x[:8].copy()
+    tips[6, 1] = -np.inf
+    with pytest.raises(ValueError, match=r"`y` must be finite, .* in 1 of 8 rows .*: row 6"):
+        model.score(q[:8], tips)
+    with pytest.raises(ValueError, match=r"`y` must have shape \(8, 3\), .* got \(7, 3\)"):
+        model.score(q[:8], tips[:7])

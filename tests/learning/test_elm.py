@@ -406,3 +406,13 @@ def test_sums_that_overflow_are_refused_and_leave_the_model():
         model.predict(both)
     wide = ELMRegressor(3, direct_link=True, random_state=0).fit(X, 1e30 * y)
     assert np.isinf(wide.predict(np.full((1, 2), 1e30, dtype=np.float32))).all()
+
+
+def test_missing_values_are_named_by_row():
+    X = np.random.default_rng(0).uniform(-1.0, 1.0, (30, 2))
+    model = ELMRegressor(n_hidden=5, random_state=0).fit(X, X[:, 0])
+    spoilt = X.copy()
+    spoilt[7] = np.nan
+    for call in (model.predict, lambda rows: model.fit(rows, X[:, 0])):
+        with pytest.raises(ValueError, match=r"`X` must be finite, .* in 1 of 30 rows .*: row 7"):
+            call(spoilt)

@@ -13,7 +13,8 @@ from hybridkin.datasets import EncoderFault
 
 _ADVICE = (
     "read the log with --unwrap {period:.10g} (unwrap={period:.10g}, or unwrap = {period:.10g} in "
-    "[log] of the robot description) if that is a turn of the encoder, else with its period."
+    "[log] of the robot description) if that is a turn of the encoder, else with its period; "
+    "`zeros` can then be whole turns off."
 )
 
 

@@ -13,7 +13,7 @@ import math
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import hybridkin
 from hybridkin.app.cli._init import QUESTIONS
@@ -42,6 +42,13 @@ reached, errors above --fail-above or a promise, or `describe` and `init` found 
 _DECIMALS = (".", ",")
 
 
+class _File(NamedTuple):
+    """An argument that names a file to read: its name in the help; whether it can be a folder."""
+
+    shown: str
+    or_folder: bool
+
+
 def parser() -> argparse.ArgumentParser:
     """Hybrid mechanical and data-driven kinematics of soft robots.
 
@@ -66,6 +73,7 @@ def parser() -> argparse.ArgumentParser:
         text = _help(add_options)
         line = text["description"].partition("\n")[0].rstrip(".")
         command = commands.add_parser(add_options.__name__[1:], help=line, **text)
+        command.set_defaults(files={})
         add_options(command)
         add = command.add_argument
         add(
@@ -131,9 +139,10 @@ def _init(command: argparse.ArgumentParser) -> None:
     """Write a robot description.
 
     The file has the geometry of the robot and the columns and units of its logs, each with a
-    comment. `fit` can read it at once. On a terminal the command asks for what the options do not
-    say. With --log it proposes the columns by their names and the zeros of tendons by the first
-    rows of the motions, and checks the log against the description, as `fit` does.
+    comment. `fit` can read it at once. If an option without a default is missing, the command asks
+    on a terminal for it and for all others that are not given. With --log it proposes the columns
+    by their names and the zeros of tendons by the first rows of the motions, and checks the log
+    against the description, as `fit` does.
 
     Some examples:
       hybridkin init robot.toml --log log.csv
@@ -179,8 +188,8 @@ def _merge(command: argparse.ArgumentParser) -> None:
     Names, units and signs of the columns stay as they are in the files.
     """
     add = command.add_argument
-    add("motors", type=Path, metavar="MOTORS", help="file of the motors")
-    add("camera", type=Path, metavar="CAMERA", help="file of the camera")
+    _add_file(command, "motors", "MOTORS", "file of the motors")
+    _add_file(command, "camera", "CAMERA", "file of the camera")
     add("--out", type=Path, required=True, metavar="LOG.csv", help="log to write")
     text = "columns of the actuators"
     add("--q", type=names, required=True, metavar="A,B,...", help=text)
@@ -228,13 +237,7 @@ def _next(command: argparse.ArgumentParser) -> None:
     _add_model(command)
     _add_out(command, "folder for next.csv", required=True)
     add("-n", type=count, default=50, help="number of configurations (50)")
-    add(
-        "--measured",
-        type=Path,
-        dest="log",
-        metavar="LOG",
-        help="log of what is measured so far",
-    )
+    _add_file(command, "--measured", "LOG", "log of what is measured so far", dest="log")
     _add_path(command, "where the error matters (everywhere)")
     _add_limits(command)
     _add_log(command)
@@ -279,14 +282,8 @@ def _fit(command: argparse.ArgumentParser) -> None:
     --hysteresis 0: none of these.
     """
     add = command.add_argument
-    add("log", type=Path, metavar="LOG", help="CSV, npz or parquet file")
-    add(
-        "--robot",
-        type=Path,
-        required=True,
-        metavar="ROBOT.toml",
-        help="robot description",
-    )
+    _add_file(command, "log", "LOG", "CSV, npz or parquet file")
+    _add_file(command, "--robot", "ROBOT.toml", "robot description", required=True)
     _add_out(command, "folder for model and report", required=True)
     _add_log(command)
     add(
@@ -339,7 +336,7 @@ def _evaluate(command: argparse.ArgumentParser) -> None:
     """
     add = command.add_argument
     _add_model(command)
-    add("log", type=Path, metavar="LOG", help="CSV, npz or parquet file")
+    _add_file(command, "log", "LOG", "CSV, npz or parquet file")
     _add_out(command, "folder for report and figures (none)")
     add(
         "--fail-above",
@@ -374,7 +371,7 @@ def _view(command: argparse.ArgumentParser) -> None:
     """
     add = command.add_argument
     _add_model(command)
-    add("log", type=Path, nargs="?", metavar="LOG", help="measured rows to show")
+    _add_file(command, "log", "LOG", "measured rows to show", nargs="?")
     _add_path(command, "path of the tip to follow in a loop")
     add(
         "--host",
@@ -418,8 +415,9 @@ def _track(command: argparse.ArgumentParser) -> None:
     within the training range of the model. If more than a tenth of the path leaves the reach of the
     robot, the command ends with exit code 2 and names the largest scale that does not. With
     --out-of-reach the tip goes as near as it can. The last line says how many points are reached
-    and missed, by how much, and the error to expect over all of them. The exit code is 1 if a fifth
-    of the points are missed or outside the log, with --fail-missed if one is missed.
+    and missed, by how much, and the error to expect over all of them; a point that only --round
+    misses counts as reached. The exit code is 1 if a fifth of the points are missed or outside the
+    log, with --fail-missed if one is missed.
 
     With --obstacles the whole body keeps clear of what a file describes:
 
@@ -439,7 +437,7 @@ def _track(command: argparse.ArgumentParser) -> None:
     """
     add = command.add_argument
     _add_model(command)
-    add("path", type=Path, nargs="?", metavar="PATH.csv", help="file of points")
+    _add_file(command, "path", "PATH.csv", "file of points", nargs="?")
     _add_out(command, "folder for commands and figure", required=True)
     add(
         "--shape",
@@ -530,15 +528,9 @@ def _verify(command: argparse.ArgumentParser) -> None:
     first row of the track. Where the tips agree clearly better with earlier commands, the report
     says how late the camera is.
     """
-    add = command.add_argument
     _add_model(command)
-    add("track", type=Path, metavar="TRACK", help="track.csv or its folder")
-    add(
-        "log",
-        type=Path,
-        metavar="MEASURED",
-        help="measured tips, with commands or without",
-    )
+    _add_file(command, "track", "TRACK", "track.csv or its folder", or_folder=True)
+    _add_file(command, "log", "MEASURED", "measured tips, with commands or without")
     _add_delay(command, "each is compared with the command of its time (that of the track)")
     _add_out(command, "folder for the report (none)")
     _add_log(command)
@@ -557,7 +549,7 @@ def _animate(command: argparse.ArgumentParser) -> None:
     """
     add = command.add_argument
     _add_model(command)
-    add("track", type=Path, metavar="TRACK", help="track.csv, its folder, or a log")
+    _add_file(command, "track", "TRACK", "track.csv, its folder, or a log", or_folder=True)
     add(
         "--out",
         type=Path,
@@ -580,8 +572,7 @@ def _animate(command: argparse.ArgumentParser) -> None:
         metavar="N",
         help="largest number of frames (150)",
     )
-    text = "obstacles to show (none)"
-    add("--obstacles", type=Path, metavar="SCENE.toml", help=text)
+    _add_file(command, "--obstacles", "SCENE.toml", "obstacles to show (none)")
     add("--force", action="store_true", help=_REPLACE_OTHERS)
 
 
@@ -639,6 +630,35 @@ def _describe(command: argparse.ArgumentParser) -> None:
     _add_log(command)
 
 
+def _add_file(
+    command: argparse.ArgumentParser,
+    name: str,
+    metavar: str,
+    text: str,
+    *,
+    or_folder: bool = False,
+    **options: Any,
+) -> None:
+    """Add an argument that names a file to read, which `check_files` looks for."""
+    action = command.add_argument(name, type=Path, metavar=metavar, help=text, **options)
+    shown = name if name.startswith("-") else metavar
+    files = {**command.get_default("files"), action.dest: _File(shown, or_folder)}
+    command.set_defaults(files=files)
+
+
+def check_files(arguments: argparse.Namespace) -> None:
+    """Raise if a file to read does not exist, by the name of its argument in the help."""
+    for name, file in arguments.files.items():
+        path = getattr(arguments, name)
+        if path is None:
+            continue
+        need = "file or a folder" if file.or_folder else "file"
+        if not path.exists():
+            raise FileNotFoundError(f"{file.shown} must be a {need}, there is none at {path}.")
+        if path.is_dir() and not file.or_folder:
+            raise IsADirectoryError(f"{file.shown} must be a file, got the folder {path}.")
+
+
 def _add_out(command: argparse.ArgumentParser, text: str, required: bool = False) -> None:
     add = command.add_argument
     add("--out", type=Path, required=required, metavar="DIR", help=text)
@@ -646,7 +666,7 @@ def _add_out(command: argparse.ArgumentParser, text: str, required: bool = False
 
 def _add_path(command: argparse.ArgumentParser, text: str) -> None:
     add = command.add_argument
-    add("--path", type=Path, metavar="PATH.csv", help=text)
+    _add_file(command, "--path", "PATH.csv", text)
     add("--dt", type=positive, metavar="S", help="time between points of the path [s]")
     add("--unit", choices=METRES, help="unit of the path (that of x in the log)")
 
@@ -673,7 +693,7 @@ def _add_obstacles(command: argparse.ArgumentParser) -> None:
     """Add the scene around the robot, and the distance to it."""
     add = command.add_argument
     text = "obstacles that the whole body keeps clear of (none)"
-    add("--obstacles", type=Path, metavar="SCENE.toml", help=text)
+    _add_file(command, "--obstacles", "SCENE.toml", text)
     text = "least distance between body and obstacles, such as 5mm (0)"
     add("--clearance", type=length, default=0.0, metavar="LENGTH", help=text)
 
@@ -684,9 +704,9 @@ def _add_model(
     metavar: str = "MODEL",
     text: str = "model file, its folder, or a robot description",
 ) -> None:
-    command.add_argument(name, type=Path, metavar=metavar, help=text)
+    _add_file(command, name, metavar, text, or_folder=True)
     default = "robot description with [log] and [limits] (the one beside the model)"
-    command.add_argument("--robot", type=Path, metavar="ROBOT.toml", help=default)
+    _add_file(command, "--robot", "ROBOT.toml", default)
 
 
 _REPLACE_OTHERS = "replace files that another command or program wrote"

@@ -25,7 +25,7 @@ from threadpoolctl import threadpool_limits
 import hybridkin  # its folders are opened when used: help comes at once
 from hybridkin.app.cli import _demo as demo
 from hybridkin.app.cli._init import answered, description, with_zeros
-from hybridkin.app.cli._parser import failed, parser
+from hybridkin.app.cli._parser import check_files, failed, parser
 from hybridkin.app.cli._terminal import Stages, write
 from hybridkin.formats import FRAMES, METRES, check_outputs, visible, write_file
 
@@ -62,6 +62,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser().parse_args(argv)
     stages = Stages(arguments.quiet)
     try:
+        check_files(arguments)
         with contextlib.closing(stages), warnings.catch_warnings():
             warnings.filterwarnings("default", category=UserWarning)
             warnings.showwarning = stages.warn

@@ -12,6 +12,10 @@ import scipy  # its folders are imported when they are used
 from numpy.typing import NDArray
 from typing_extensions import Self
 
+_LEAST = 1e-3  # of the mean error: least mean error for which a row is weighted
+_MOST_FITS = 100
+_SETTLED = 1e-6  # relative change of a line that is fitted
+
 
 def marker_distances(predicted: NDArray, measured: NDArray) -> NDArray:
     """Return the distances (N, K) of predicted and measured markers (N, 3 K) [m]."""
@@ -135,17 +139,37 @@ class Promise:
     @classmethod
     def of(cls, errors: NDArray, distances: NDArray) -> Promise:
         """Return the promise from errors (N,) of held-out rows and their distances (N,)."""
-        columns = np.column_stack([np.ones_like(errors), distances])
-        at_rows, per_distance = scipy.optimize.nnls(columns, errors)[0]
-        if at_rows == 0.0:  # a robot without error at the rows of its log is not credible
-            at_rows = errors.mean()
-            per_distance = 0.0
-        if at_rows == 0.0:  # no errors at all
+        if not errors.any():
             return cls(0.0, 0.0, 1.0)
-        ratios = errors / (columns @ (at_rows, per_distance))
+        at_rows, per_distance = _line(errors, distances)
+        if at_rows == 0.0:  # a robot without error at the rows of its log is not credible
+            at_rows = float(errors.mean())
+            per_distance = 0.0
+        ratios = errors / (at_rows + per_distance * distances)
         return cls(at_rows, per_distance, float(np.quantile(ratios, 0.95)))
 
     def at(self, distances: NDArray) -> ExpectedErrors:
         """Return the errors (N,) to expect at these distances [m]."""
         mean = self.at_rows + self.per_distance * distances
         return ExpectedErrors(mean, self.p95 * mean)
+
+
+def _line(errors: NDArray, distances: NDArray) -> tuple[float, float]:
+    """Return intercept and slope, not negative, of mean errors by their distance [m].
+
+    The spread of errors is proportional to their mean, whose inverse square weights the rows:
+    iteratively reweighted least squares, after which the mean ratio of error and line is 1. Without
+    weights the large errors far from the log decide, and near it the line can be a small part of
+    the errors there.
+    """
+    columns = np.column_stack([np.ones_like(errors), distances])
+    mean = np.full_like(errors, errors.mean())
+    least = _LEAST * errors.mean()
+    coefficients = np.zeros(2)
+    for _ in range(_MOST_FITS):
+        before = coefficients
+        coefficients = scipy.optimize.nnls(columns / mean[:, None], errors / mean)[0]
+        mean = np.maximum(columns @ coefficients, least)
+        if np.allclose(coefficients, before, rtol=_SETTLED, atol=0.0):
+            break
+    return float(coefficients[0]), float(coefficients[1])

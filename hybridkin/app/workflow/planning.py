@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from hybridkin import (
+    ForwardModel,
     HybridForwardModel,
     SeparatingMotion,
     choose_geometry,
@@ -17,7 +18,7 @@ from hybridkin import (
 )
 from hybridkin.app.workflow.domain import Domain, PathLimits, path_limits
 from hybridkin.app.workflow.log import MeasuredLog
-from hybridkin.app.workflow.model import commands_for, tips_at
+from hybridkin.app.workflow.model import commands_for, is_fitted, tips_at
 from hybridkin.app.workflow.report import (
     Progress,
     Report,
@@ -106,7 +107,9 @@ def next_rows(
     if measured is not None:
         measured_q = model.effective(measured.commands)
     progress("choosing configurations", 0, 1)
-    rows, errors = choose_rows(model, candidates, n, measured=measured_q, target=target)
+    rows, errors = choose_rows(
+        _to_improve(model), candidates, n, measured=measured_q, target=target
+    )
     n_measured = 0
     separating: tuple[SeparatingMotion, ...] = ()
     if measured is not None:
@@ -152,6 +155,16 @@ def next_rows(
         report.table_file("separating.csv", ["motion", *log.q], lines)
     report.write(out)
     return report
+
+
+def _to_improve(model: HybridForwardModel) -> HybridForwardModel | ForwardModel:
+    """Return the model to choose rows for: of a description its mechanical model.
+
+    Nobody chose yet that it learns nothing; a later fit chooses its error model.
+    """
+    if is_fitted(model):
+        return model
+    return model.module_.robot
 
 
 def _by_motion(separating: Sequence[SeparatingMotion]) -> list[list[SeparatingMotion]]:

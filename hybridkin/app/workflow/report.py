@@ -42,6 +42,7 @@ Progress = Callable[[str, int, int], None]
 Record = TypeVar("Record")
 
 _WIDTH = 98
+_COMMAND = "$ "  # how a line that is a command begins
 
 
 class _Picture(Protocol):
@@ -216,6 +217,9 @@ class _Text(NamedTuple):
         lines: list[str] = []
         wrapper = textwrap.TextWrapper(_WIDTH, break_on_hyphens=False)
         for line in self.template.replace("**", "").splitlines():
+            if line.startswith(_COMMAND):  # a line to copy
+                lines.append(self._filled(line, visible))
+                continue
             wrapper.subsequent_indent = "  " if line.startswith("- ") else ""
             lines += wrapper.wrap(self._filled(line.lstrip("# "), visible))
         return "\n".join(lines)

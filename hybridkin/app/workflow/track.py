@@ -60,6 +60,7 @@ _MOST_OUTSIDE = 0.05  # share of the points outside the domain that is not worth
 _SLOW = 0.1  # share of the range per second, without known limits
 _DT = 0.02  # period of a path of one point [s]
 _ANY_NUMBER = Counts()
+_HALF_A_STEP = 0.5 + 1e-6  # of the nearest number, with the rounding of floats
 _FINER = (1, 4)  # times as many steps, in each attempt
 _SHOWN = 100  # times that a track reports its progress
 
@@ -75,7 +76,8 @@ class TrackRecord:
     n : int
         Number of points of the path.
     reached, missed : int
-        Number of points that are reached within `tol`, and of the others.
+        Number of points that are reached within `tol`, or within the rounding of commands, and of
+        the others.
     missed_by : float
         Largest error of the solver at a missed point [m], 0 if none is missed.
     errors : Errors
@@ -91,6 +93,8 @@ class TrackRecord:
         The same at the points that are reached in the domain.
     rounded : dict of str to float or None
         "before" and "after": mean error of the solver before and after commands were rounded [m].
+        "n": number of points that are reached within the rounding, not within `tol`; "largest":
+        largest error at these [m].
     backend : str
         What computed the steps: "compiled", or "torch: " and the reason.
     hysteresis : list of float or None
@@ -185,10 +189,17 @@ def _about_counts(record: TrackRecord, counts: Counts) -> list[str]:
     if record.rounded is not None:
         before = millimetres(record.rounded["before"])
         after = millimetres(record.rounded["after"])
-        return [
+        words = (
             f"Commands are rounded to whole steps of the actuators. Mean error of the solver: "
             f"{before} before, {after} after."
-        ]
+        )
+        if record.rounded["n"]:
+            largest = millimetres(record.rounded["largest"], ".2g")
+            words += (
+                f" {record.rounded['n']:.0f} points are reached within this rounding alone, which "
+                f"moves the tip by up to {largest} there."
+            )
+        return [words]
     if counts and counts.whole.all():
         return [
             "The columns of the log hold whole numbers; these commands are not rounded: --round."
@@ -321,9 +332,13 @@ def track_path(
             tol,
             _state_after(lead_in, track, domain),
         )
+        by_rounding = _missed_by_rounding(track, exact, counts, domain)
+        track = _with_reached(track, by_rounding, domain)
         rounded = {
             "before": float(exact.error.mean()),
             "after": float(track.error.mean()),
+            "n": int(by_rounding.sum()),
+            "largest": float(track.error[by_rounding].max(initial=0.0)),
         }
     whole = _with_lead_in(track, lead_in[:-1], model)
     statuses = [IKStatus(int(code)).name for code in track.status]
@@ -589,6 +604,23 @@ def _rounded(q: NDArray, counts: Counts, domain: Domain) -> NDArray:
     log = domain.model.description_.log
     low, high = np.sort(log.to_log(np.stack(domain.limits.commands)), axis=0)
     return log.from_log(counts.rounded(log.to_log(q), low, high))
+
+
+def _missed_by_rounding(
+    track: Track, exact: Track, counts: Counts, domain: Domain
+) -> NDArray[np.bool_]:
+    """Return which points (N,) are missed because commands are the nearest whole numbers."""
+    log = domain.model.description_.log
+    moved = np.abs(log.to_log(track.q) - log.to_log(exact.q))
+    nearest = (moved <= _HALF_A_STEP * np.array(counts.steps)).all(axis=1)
+    missed = np.isin(track.status, _REACHED, invert=True)
+    return missed & nearest & np.isin(exact.status, _REACHED)
+
+
+def _with_reached(track: Track, rows: NDArray[np.bool_], domain: Domain) -> Track:
+    """Return a track in which any error counts as reached at some rows (N,)."""
+    reached = domain.solver().judged(track, tol=np.inf)
+    return replace(track, status=np.where(rows, reached.status, track.status))
 
 
 def _state_after(lead_in: NDArray, track: Track, domain: Domain) -> Any:

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from hybridkin import ConstantCurvatureChain, app, robots
-from hybridkin.datasets import Log, load_armlab, load_ftdcr
+from hybridkin import ConstantCurvatureChain, app, choose_rows, robots
+from hybridkin.datasets import Log, load_armlab, load_ftdcr, load_trunk
 
 CHAIN = ConstantCurvatureChain([0.0055, 0.005, 0.006], lengths=[0.06, 0.065, 0.06], routing="base")
 NAMES = tuple("abcdefghi")
@@ -368,3 +368,20 @@ def test_a_report_is_json_and_can_accept_a_finding():
 def test_the_chain_must_have_as_many_actuators():
     with pytest.raises(ValueError, match="9 actuators"):
         app.check_log(Log(np.ones((3, 3)), np.ones((3, 3))), chain=CHAIN)
+
+
+def test_few_rows_of_a_plan_name_no_wrong_zero():
+    """25 rows where the nominal model errs most looked like a chamber that is 2 cm off."""
+    data = load_trunk()
+    chain = robots.bionic_handling_assistant()
+    pool = np.random.default_rng(11).choice(len(data.q), 400, replace=False)
+    rows = pool[choose_rows(chain, data.q[pool], 25)[0]]
+    report = app.check_log(Log(data.q[rows], data.x[rows]), chain=chain, base_is_free=True)
+    assert not {f.kind for f in report.findings} & {"offset", "drift", "zeros"}
+
+
+def test_few_rows_show_a_zero_that_is_far_off():
+    few = slice(None, None, 8)
+    clear = measured(Q + SHIFT, x=X).rows(few)
+    (finding,) = [f for f in findings(clear) if f.kind == "offset"]
+    assert "'h' is off by about 3 mm" in finding.message

@@ -49,7 +49,7 @@ def test_wrong_options_end_with_2(arguments, capsys):
 def test_errors_are_json_where_asked(tmp_path, capsys, monkeypatch):
     code, record = document(capsys, "describe", tmp_path / "none")
     assert code == record["exit_code"] == 2
-    assert "no file" in record["error"]
+    assert "there is none at" in record["error"]
     monkeypatch.setattr(sys, "argv", ["hybridkin", "fly", "--json"])
     with pytest.raises(SystemExit):
         main(["fly", "--json"])
@@ -80,6 +80,50 @@ def test_a_slip_of_a_newcomer_has_an_answer(
     assert code == 2
     assert message in errors
     assert not (tmp_path / "out").exists()
+
+
+FILES = {
+    "LOG": [
+        ["fit", "none", "--robot", "robot.toml"],
+        ["evaluate", "robot.toml", "none"],
+        ["view", "robot.toml", "none"],
+    ],
+    "--measured": [["next", "robot.toml", "--measured", "none"]],
+    "MEASURED": [["verify", "robot.toml", "log.csv", "none"]],
+    "TRACK": [
+        ["verify", "robot.toml", "none", "log.csv"],
+        ["animate", "robot.toml", "none"],
+    ],
+    "PATH.csv": [["track", "robot.toml", "none"]],
+    "--path": [["next", "robot.toml", "--path", "none"]],
+    "MOTORS": [["merge", "none", "log.csv", "--q", "q1", "--x", "x,y,z", "--time", "t"]],
+    "CAMERA": [["merge", "log.csv", "none", "--q", "q1", "--x", "x,y,z", "--time", "t"]],
+    "MODEL": [["export", "none"], ["evaluate", "none", "log.csv"]],
+    "MODEL|ROBOT.toml|LOG": [["describe", "none"]],
+    "--robot": [["track", "robot.toml", "log.csv", "--robot", "none"]],
+    "--obstacles": [["animate", "robot.toml", "log.csv", "--obstacles", "none"]],
+}
+
+
+@pytest.mark.parametrize(
+    ("shown", "arguments"),
+    [(shown, arguments) for shown, commands in FILES.items() for arguments in commands],
+)
+def test_a_missing_file_is_named_as_in_the_help(
+    robot, log, tmp_path, monkeypatch, capsys, shown, arguments
+):
+    monkeypatch.chdir(tmp_path)
+    out = [] if arguments[0] in ("view", "describe") else ["--out", "out.gif"]
+    code, printed, errors = run(capsys, *arguments, *out)
+    assert (code, printed) == (2, "")
+    assert errors.startswith(f"hybridkin: error: {shown} must be a file")
+    assert errors.endswith("there is none at none.\n")
+
+
+def test_a_folder_is_no_log(robot, tmp_path, capsys):
+    code, _, errors = run(capsys, "evaluate", robot, tmp_path)
+    assert code == 2
+    assert f"LOG must be a file, got the folder {tmp_path}." in errors
 
 
 def by_terminate(*_, **__):

@@ -133,8 +133,8 @@ def test_spoilt_logs_stop_the_fit_with_advice(robot, tmp_path, capsys, spoil, me
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"log": "none.csv"}, "there is none at"),
-        ({"robot": "none.toml"}, "no such file"),
+        ({"log": "none.csv"}, "LOG must be a file, there is none at"),
+        ({"robot": "none.toml"}, "--robot must be a file, there is none at"),
         ({"--groups": "motions"}, "did you mean 'motion'"),
         ({"--exclude": "*"}, "at least 2 motions"),
         ({"--q": "t1,t2"}, "must have 6 actuators"),

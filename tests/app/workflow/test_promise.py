@@ -29,11 +29,34 @@ def test_errors_that_grow_with_the_distance_are_found():
 
 def test_no_promise_is_nothing_at_the_rows_of_the_log():
     """Where a line through the errors starts at 0, the ratio of error and promise was infinite."""
-    far = np.repeat([0.0, 1.0, 2.0], 40)
-    errors = np.where(far > 0.0, 3e-3 * far - 1e-3, 1e-5)
+    far = np.repeat([1.0, 2.0, 3.0], 40)
+    errors = 3e-3 * far - 2.9e-3
     promise = Promise.of(errors, far)
     assert promise.at(far).mean == pytest.approx(np.full(120, errors.mean()))
-    assert promise.p95 == pytest.approx(5e-3 / errors.mean())
+    assert promise.p95 == pytest.approx(6.1e-3 / errors.mean())
+
+
+def test_errors_that_grow_faster_than_the_distance_are_promised_near_the_log_as_well():
+    """A line that the far rows decide started at 6 % of the errors at commands of the log."""
+    rows = np.random.default_rng(0)
+    far = np.where(np.arange(4000) % 5 > 0, rows.uniform(0.0, 1.3, 4000), 0.0)
+    errors = (3e-4 + 1e-3 * far**4) * rows.gamma(8.0, 0.125, 4000)
+    promise = Promise.of(errors, far)
+    ratios = errors / promise.at(far).mean
+    assert ratios.mean() == pytest.approx(1.0, abs=1e-5)
+    assert promise.at(np.zeros(1)).mean == pytest.approx(3e-4, rel=0.3)
+    assert promise.p95 < 2.5
+    near = far < 0.3
+    assert np.mean(errors[near] < promise.at(far[near]).p95) > 0.9
+
+
+def test_rows_of_the_log_without_errors_are_no_line_from_zero():
+    """An exact straight robot weighs without limit; a promise of 0 there is not credible."""
+    far = np.repeat([0.0, 1.0, 2.0], 40)
+    errors = 2e-3 * far
+    promise = Promise.of(errors, far)
+    assert promise.at(far).mean == pytest.approx(np.full(120, errors.mean()))
+    assert Promise.of(np.zeros(9), np.arange(9.0)) == Promise(0.0, 0.0, 1.0)
 
 
 @pytest.fixture(scope="module")
