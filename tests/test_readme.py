@@ -1,5 +1,6 @@
 """The README does what it says: each code block, each command, each link, and the examples."""
 
+import csv
 import os
 import re
 import runpy
@@ -27,7 +28,7 @@ EXAMPLES = sorted((ROOT / "examples").glob("plot_*.py"))
 
 def commands_on(page):
     """Return the commands of all console blocks of a page."""
-    blocks = [block for block in blocks_of(page) if block.language == "console"]
+    blocks = [block for block in blocks_of(page) if block.language in ("console", "bash")]
     return [command for block in blocks for command in commands_of(block.text)]
 
 
@@ -36,7 +37,7 @@ RESULTS = (DOCS / "reference" / "results.md").read_text(encoding="utf-8")
 RECORDING = re.findall(r"hybridkin fit train\.csv(?:[^`\n\\]|\\\n)*", RESULTS)
 INSTALLS = [
     command
-    for page in [README, *PAGES]
+    for page in [README, ROOT / "CONTRIBUTING.md", *PAGES]
     for command in commands_on(page)
     if command[0] in ("pip", "uv")
 ]
@@ -82,6 +83,53 @@ def test_what_pip_installs_is_there():
                 assert {*extras[1].split(",")} <= {*project["optional-dependencies"]}
             elif name not in ("--editable", "."):
                 assert any(needed.startswith(name) for needed in project["dependencies"])
+
+
+# Rows of the README, and those of the tables of results with the same model.
+ROWS = {
+    "nominal model": (
+        "mechanical, nominal (published radii)",
+        "mechanical, nominal",
+        "mechanical, nominal (rings 40° apart), base fitted",
+    ),
+    "calibrated model": (
+        "mechanical, calibrated (radii, base)",
+        "mechanical, calibrated",
+        "mechanical, as the fit chose and calibrated it: elastic tendons",
+    ),
+    "data alone, quadratic": ("data-driven, quadratic", "", "data-driven, quadratic"),
+    "hybrid: network on calibrated model": (
+        "hybrid on calibrated, ELM",
+        "hybrid on calibrated",
+        "hybrid, ELM, with backlash",
+    ),
+}
+
+
+def table(name):
+    """Return the rows of a CSV file of docs/data."""
+    with open(DOCS / "data" / name, newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def test_rows_of_results_are_those_of_one_model():
+    trunk = {"": "not tried"}
+    for row in table("trunk_test_rows.csv"):
+        name = row["model"] if row["learner"] == "none" else f"{row['model']}, {row['learner']}"
+        trunk[name] = row["test [cm]"].partition(" (")[0]
+    tracking = {"": "not tried"}
+    for row in table("trunk_tracking.csv"):
+        tracking[row["model"]] = row["error [cm]"]
+    tendons = {}
+    for row in table("nine_tendons.csv"):
+        error = row["standard error over motions [mm]"]
+        tendons[row["model"]] = f"{row['mean [mm]']} ± {error}"
+    lines = re.findall(r"^\| (.+?) \| (.+) \| (.+) \| (.+) \|$", README.read_text("utf-8"), re.M)
+    printed = {name: figures for name, *figures in lines if "±" in figures[0]}
+    expected = {}
+    for name, (test, track, held_out) in ROWS.items():
+        expected[name] = [trunk[test], tracking[track], tendons[held_out]]
+    assert printed == expected
 
 
 CONTRIBUTING = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
