@@ -1,6 +1,6 @@
 """How the compiled core agrees with torch, and how long a tick can take.
 
-The table and the figure of the docs pages "Theory" and "Control loops"::
+The table and the figure of ticks of the docs page "Benchmarks"::
 
     python examples/studies/compiled.py --out results/compiled
     python examples/studies/compiled.py --out results/compiled --parts ticks --image ticks.png

@@ -252,5 +252,7 @@ def test_repr_of_a_choice_is_one_line():
     choice = choose_geometry(bent(), q, measured(bent(), q))
     n_sets = len(choice.errors)
     assert n_sets > 1
-    expected = f"GeometryChoice(ConstantCurvatureChain, {choice.parameters}, {n_sets} sets compared)"
+    expected = (
+        f"GeometryChoice(ConstantCurvatureChain, {choice.parameters}, {n_sets} sets compared)"
+    )
     assert repr(choice) == expected

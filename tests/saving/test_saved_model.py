@@ -64,7 +64,7 @@ def test_what_needs_code_is_refused_and_nothing_is_written(tmp_path, log):
 
 
 def test_folder_of_a_fit_stands_for_the_model_in_it(tmp_path):
-    with pytest.raises(FileNotFoundError, match="folder with a model.safetensors, .* is no file"):
+    with pytest.raises(FileNotFoundError, match=r"folder with a model\.safetensors, .* is no file"):
         load_model(tmp_path)
     save_model(tendon_chain(), tmp_path / "model.safetensors")
     assert repr(load_model(tmp_path)) == repr(tendon_chain())
