@@ -394,12 +394,22 @@ def _step_code(plan: Plan, task: _Task, n_spaces: int) -> Entries:
     if leads(plan):
         entries["LEADS"] = filled("lead.md", entries)
         entries["WITHOUT"] = ", and without hysteresis there"
-    names = ("Q_MIN", "Q_MAX", "DQ_MAX", "DDQ_MAX")
-    for name, limit in zip(names, limits.tolist(), strict=True):
-        entries[name] = ", ".join(f"{value:.6g}" for value in limit)
-    sentence = "limits.md" if np.isfinite(limits).any() else "no_limits.md"
+    kept = []
+    for name, values in zip(("q_min", "q_max", "dq_max", "ddq_max"), limits, strict=True):
+        if np.isfinite(values).any():
+            kept.append(f"{name} = {_in_words(values)}")
+    entries["KEPT"] = ", ".join(kept)
+    sentence = "limits.md" if kept else "no_limits.md"
     entries["LIMITS"] = filled(sentence, entries)
     return entries
+
+
+def _in_words(values: NDArray) -> str:
+    """Return the numbers of all actuators (n,) as text, equal ones once."""
+    words = [f"{value:.6g}" for value in values.tolist()]
+    if len({*words}) == 1:
+        return words[0]
+    return f"({', '.join(words)})"
 
 
 def leads(plan: Plan) -> bool:
