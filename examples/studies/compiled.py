@@ -1,6 +1,7 @@
 """How the compiled core agrees with torch, and how long a tick can take.
 
-The first table of the docs page "Benchmarks", section "Control steps", and how the results agree::
+The first table and the figure of the docs page "Benchmarks", section "Control steps", and how the
+results agree::
 
     python examples/studies/compiled.py --out results/compiled
     python examples/studies/compiled.py --out results/compiled --parts ticks --image ticks.png

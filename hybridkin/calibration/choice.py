@@ -114,6 +114,11 @@ class GeometryChoice:
     usual: tuple[GeometryChoice, ...] = ()
     corrected: Mapping[str, SetErrors] = field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        """Return a one-line summary."""
+        kind = type(self.chain).__name__
+        return f"GeometryChoice({kind}, {self.parameters}, {len(self.errors)} sets compared)"
+
     def __bool__(self) -> bool:
         """Return whether there was a choice, maybe of nothing to calibrate."""
         return self.chain.n_actuators > 0

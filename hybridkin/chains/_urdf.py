@@ -161,10 +161,15 @@ def _robot(text_or_path: str | PathLike[str]) -> etree._Element:
         robot = etree.fromstring(data, parser)
     except etree.XMLSyntaxError as error:
         raise ValueError(f"`text_or_path` must be a valid URDF: {error}.") from error
-    if robot.tag != "robot" or robot.getroottree().docinfo.doctype:
+    if robot.tag != "robot":
         raise ValueError(
-            "`text_or_path` must be a URDF, with the outermost tag <robot> and without DOCTYPE, "
-            f"got <{robot.tag}>."
+            f"`text_or_path` must be a URDF, with the outermost tag <robot>, got <{robot.tag}>."
+        )
+    doctype = robot.getroottree().docinfo.doctype
+    if doctype:
+        raise ValueError(
+            "`text_or_path` must be a URDF without DOCTYPE, whose entities can fill the memory, "
+            f"got {doctype!r:.80}; remove it."
         )
     return robot
 

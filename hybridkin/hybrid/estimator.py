@@ -397,7 +397,9 @@ class HybridForwardModel(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
         On another day the base may have moved and the actuator zeros may have shifted. Five rows
         spread over the workspace identify both: ``x = T f_hyb(q + shift)``, with a rigid motion T.
-        The learned residual is kept. If the robot has not changed, the model does not change.
+        The learned residual is kept. The model does not change (`change_` is then an identity and
+        zeros) if the robot has not changed, or by less than the new rows can show: few rows do not
+        show a motion of the base that is smaller than the held-out error of the fit.
 
         The change always counts from the fit: `adapt` replaces an earlier `adapt` and all that
         `partial_fit` has learned. A payload or softer segments are another kind of change; record

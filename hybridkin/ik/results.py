@@ -226,8 +226,8 @@ class Track(Generic[ArrayT]):
     limit_margin : array of shape (T,)
         Smallest distance of an actuator to its limits, in the unit of q; inf without limits.
     rejected : bool array of shape (T,) or None
-        Readings that were not used because they cannot be, see `Tracker.rejected`; None without
-        feedback="measured".
+        Readings that were not used because they are not plausible, see `Tracker.rejected`; None
+        without feedback="measured".
     clearance : array of shape (T,)
         Smallest gap between the body, with its clearance, and obstacles or itself [m]; inf without
         obstacles.

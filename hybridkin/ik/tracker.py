@@ -43,11 +43,11 @@ class Tracker(Portable):
     present tip moved by the resulting offset is what goes to the target. With the default gain the
     offset takes a fifth of what each reading shows beyond it, which is stable for readings up to
     four periods late that nobody knows of, and averages noise. With a `gain` it takes all: give
-    `delay`, or the time of each reading (`at`), if they are late. Readings that cannot be are not
-    used (`rejected`): those farther off than 3 % of the reach (or two error radii of a model with
-    `coverage`), 0.2 rad, and the motion of the last eight periods. Five in a row that agree are
-    believed, unless they are more than twice the reach away. (Without a chain the tips within the
-    limits of q give the reach; where q has none either, all readings are used.)
+    `delay`, or the time of each reading (`at`), if they are late. Readings that are not plausible
+    are not used (`rejected`): those farther off than 3 % of the reach (or two error radii of a
+    model with `coverage`), 0.2 rad, and the motion of the last eight periods. Five in a row that
+    agree are believed, unless they are more than twice the reach away. (Without a chain the tips
+    within the limits of q give the reach; where q has none either, all readings are used.)
 
     With a `hysteresis` of the model commands lead what the actuators do. All
     limits are those of commands. After a reversal the command crosses the width of the hysteresis,
@@ -72,7 +72,7 @@ class Tracker(Portable):
     time : float
         Time of the present command since `reset` [s]: the clock of `at`.
     rejected : bool
-        Whether the measured tip of the last step was not used, because it cannot be.
+        Whether the measured tip of the last step was not used, because it is not plausible.
     saturated : bool array of shape (n,)
         Actuators that the last step held at a limit of position, speed or acceleration.
     sigma_min : float
@@ -166,7 +166,7 @@ class Tracker(Portable):
 
     @property
     def rejected(self) -> bool:
-        """Whether the last step did not use its measured tip, because it cannot be."""
+        """Whether the last step did not use its measured tip, as it is not plausible."""
         return self._last().rejected
 
     @property

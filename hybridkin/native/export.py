@@ -327,7 +327,7 @@ def _code(plan: Plan, controller: _Controller | None, dtype: str) -> Entries:
     model = plan.root
     poses = False
     n_spaces = 0
-    step: Entries = {"CALL": "forward(q, x)"}
+    step: Entries = {"CALL": "forward(q, x)", "TIMER": "10ms"}
     if controller is not None:
         task = controller.settings.task
         model = plan.entry(plan.root, IK_MODEL)
@@ -376,6 +376,7 @@ def _step_code(plan: Plan, task: _Task, n_spaces: int) -> Entries:
     n_points, n_pairs, n_obstacles = sizes_of_body(plan)
     entries: Entries = {
         "CALL": "step(&state, target, NULL, NULL)",
+        "TIMER": f"std::chrono::duration<double>({dt})",
         "DT": dt,
         "TASK": m,
         "WIDTH": math.prod(task.shape),

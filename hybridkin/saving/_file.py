@@ -24,12 +24,14 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from hybridkin._core.arrays import LARGEST, countable
+from hybridkin._core.arrays import LARGEST, as_path, countable
 from hybridkin._core.files import write_file
 from hybridkin._core.stored import Stored
 
 FORMAT = "hybridkin-model"
 VERSION = 3
+MODEL = "model.safetensors"
+"""Name of the model in the folder of a fit."""
 _HEADER = "hybridkin"
 _CHECKSUM = "sha256"
 _KINDS = {"kind": str, "settings": dict, "arrays": dict, "parts": dict}
@@ -130,10 +132,19 @@ def write(path: Path, header: Header, arrays: Arrays) -> None:
     write_file(path, write_parts)
 
 
+def model_path(value: object, name: str = "path") -> Path:
+    """Return a caller's path of a model; for a folder that of the model in it."""
+    path = as_path(value, name)
+    return path / MODEL if path.is_dir() else path
+
+
 def read(path: Path) -> tuple[Header, Arrays]:
     """Return header and arrays of a file; raise if it is damaged or of another version."""
     if not path.is_file():
-        raise FileNotFoundError(f"`path` must name a saved model, got {path}, which is no file.")
+        raise FileNotFoundError(
+            f"`path` must name a saved model, or a folder with a {MODEL}, got {path}, which is no "
+            "file."
+        )
     try:
         with safe_open(path, framework="numpy") as file:
             metadata = file.metadata() or {}

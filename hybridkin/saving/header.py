@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from hybridkin._core.arrays import as_path
-from hybridkin.saving._file import Header, read
+from hybridkin.saving._file import Header, model_path, read
 
 
 def model_header(path: str | Path) -> Header:
@@ -14,7 +13,7 @@ def model_header(path: str | Path) -> Header:
     Parameters
     ----------
     path : str or Path
-        File that `save_model` wrote.
+        File that `save_model` wrote, or the folder of a fit.
 
     Returns
     -------
@@ -43,4 +42,4 @@ def model_header(path: str | Path) -> Header:
     >>> model_header(path)["units"]
     {'q': 'm', 'x': 'm'}
     """
-    return read(as_path(path))[0]
+    return read(model_path(path))[0]

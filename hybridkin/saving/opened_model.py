@@ -5,19 +5,18 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from hybridkin._core.arrays import as_path
 from hybridkin._core.model import ForwardModel, as_forward_model
 from hybridkin.chains.robots import RobotDescription, read_description
 from hybridkin.datasets.table_files import LOG_SUFFIXES
 from hybridkin.hybrid.description import nominal_hybrid
 from hybridkin.hybrid.estimator import HybridForwardModel
 from hybridkin.hybrid.model_description import ModelDescription
+from hybridkin.saving._file import MODEL, model_path
 from hybridkin.saving.header import model_header
 from hybridkin.saving.saved_model import load_model
 
 __all__ = ["open_model"]
 
-_MODEL = "model.safetensors"
 _ROBOT = "robot.toml"
 
 
@@ -59,11 +58,9 @@ def open_model(
     """
     if isinstance(model, ForwardModel):
         return nominal_hybrid(model)
-    path = as_path(model, "model")
+    path = model_path(model, "model")
     if path.suffix.lower() == ".toml":
         return _described(path)
-    if path.is_dir():
-        path = path / _MODEL
     return _saved(path, robot)
 
 
@@ -92,7 +89,7 @@ def _saved(path: Path, robot: str | Path | None) -> HybridForwardModel:
     if not isinstance(opened, HybridForwardModel):
         opened = nominal_hybrid(as_forward_model(opened))
     beside = path.with_name(_ROBOT)
-    if robot is None and path.name == _MODEL and beside.is_file():
+    if robot is None and path.name == MODEL and beside.is_file():
         robot = beside
     description = _of_file(path, opened.description_)
     if robot is not None:

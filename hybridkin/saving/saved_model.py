@@ -24,7 +24,7 @@ from hybridkin.hybrid.estimator import HybridForwardModel
 from hybridkin.learning.elm import ELMRegressor
 from hybridkin.learning.elm_cv import ELMRegressorCV
 from hybridkin.learning.hidden_layer import device_named
-from hybridkin.saving._file import Header, packed, read, unpacked, write
+from hybridkin.saving._file import Header, model_path, packed, read, unpacked, write
 from hybridkin.saving._prediction import check_prediction, prediction_of
 
 _DAMAGE = (
@@ -123,7 +123,7 @@ def load_model(path: str | Path, *, device: str | torch.device | None = None) ->
     Parameters
     ----------
     path : str or Path
-        File to read, from any machine.
+        File to read, from any machine, or the folder of a fit, which has a ``model.safetensors``.
     device : str or torch.device, optional
         Device for the model's tensors, for example ``"cuda"``; it does not depend on the device of
         the saved model. Default: the CPU. Dtypes are those of the saved model.
@@ -144,7 +144,7 @@ def load_model(path: str | Path, *, device: str | torch.device | None = None) ->
     RuntimeError
         If this machine does not have the device.
     """
-    path = as_path(path)
+    path = model_path(path)
     at = device_named(device)
     header, arrays = read(path)
     try:

@@ -245,3 +245,14 @@ def test_unknown_parameters_are_named():
     q = np.random.default_rng(0).uniform(0.2, 0.3, (10, 3))
     with pytest.raises(ValueError, match="`parameters` must name different entries"):
         choose_geometry(PLANAR, q, np.zeros((10, 3)), parameters=["tool_"])
+
+
+def test_repr_of_a_choice_is_one_line():
+    q = chambers(60)
+    choice = choose_geometry(bent(), q, measured(bent(), q))
+    n_sets = len(choice.errors)
+    assert n_sets > 1
+    expected = (
+        f"GeometryChoice(ConstantCurvatureChain, {choice.parameters}, {n_sets} sets compared)"
+    )
+    assert repr(choice) == expected

@@ -205,7 +205,7 @@ SECOND = JOINT.replace('"j"', '"k"').format("fixed", "")
         (lambda: RigidChain.from_urdf("<sdf/>", "a"), "got <sdf>"),
         (
             lambda: RigidChain.from_urdf(f'<!DOCTYPE robot [<!ENTITY a "b">]>{URDF[39:]}', "l1"),
-            "DOCTYPE",
+            r"without DOCTYPE, .* got '<!DOCTYPE robot>'; remove it",
         ),
         (lambda: RigidChain.from_urdf(URDF, "flang"), "`end_link` .* did you mean 'flange'"),
         (lambda: arm(root_link="?"), "`root_link` '[?]' is not in the robot; it has"),

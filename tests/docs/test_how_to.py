@@ -148,8 +148,8 @@ def systems(reader):
     causal = [v.name for v in variables if v.causality in ("input", "output", "parameter")]
     present = {re.match(r"\w+", name)[0] for name in causal}
     assert present <= named
-    # This robot has no hysteresis, and its description no limit of acceleration.
-    assert named - present <= {"effective", "ddq_max"}
+    # This robot has no hysteresis and no obstacles, and its description no limit of acceleration.
+    assert named - present <= {"effective", "ddq_max", "obstacles", "blocked"}
 
 
 def troubleshooting(reader):

@@ -319,6 +319,13 @@ def test_code_for_motors_moves_the_robot_as_in_metres(tmp_path):
     assert np.abs(np.diff(expected, axis=0)).max() / 0.02 > 0.04  # the limits were met
 
 
+def test_the_readme_has_the_period(tmp_path):
+    ik = InverseKinematics(trunk(), q_min=0.1, q_max=0.4, dt=0.02)
+    export_c(ik, tmp_path, name="robot")
+    readme = (tmp_path / "README.md").read_text()
+    assert "create_wall_timer(std::chrono::duration<double>(0.02), [this]" in readme
+
+
 @needs_cc
 @pytest.mark.slow
 @pytest.mark.parametrize("among", [False, True])

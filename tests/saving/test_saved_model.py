@@ -63,6 +63,14 @@ def test_what_needs_code_is_refused_and_nothing_is_written(tmp_path, log):
         save_model(tendon_chain(), tmp_path / "none" / "model")
 
 
+def test_folder_of_a_fit_stands_for_the_model_in_it(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"folder with a model\.safetensors, .* is no file"):
+        load_model(tmp_path)
+    save_model(tendon_chain(), tmp_path / "model.safetensors")
+    assert repr(load_model(tmp_path)) == repr(tendon_chain())
+    assert model_header(str(tmp_path)) == model_header(tmp_path / "model.safetensors")
+
+
 def test_foreign_and_damaged_files(tmp_path, log):
     path = tmp_path / "model"
     with pytest.raises(FileNotFoundError, match="is no file"):

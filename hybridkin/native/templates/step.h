@@ -16,7 +16,7 @@ typedef struct {
     @REAL@ memory;  /* time constant [s] of the offset without measurements; INFINITY: it stays */
     @REAL@ delay;   /* age [s] of measurements when they come, of at most 63 periods; with time
                        stamps, that of the next one */
-    unsigned char rejected;  /* whether the last measurement was not used, as it cannot be */
+    unsigned char rejected;  /* whether the last measurement was not used, as it is not plausible */
     @REAL@ seen[@SEEN@]; /* of measurements, and of x in the last 64 periods */
 @LEAD_FIELD@@CLEAR_FIELD@} @NAME@_state;
 
