@@ -30,7 +30,9 @@ everything: $(VENV)/.bench $(VENV)/.browser $(VENV)/.native
 	$(BIN)/python -m pytest $(TESTS) -m "not browser"
 	$(BIN)/python -m pytest -q tests/app/viewer -m browser
 
-# The live view in a real browser; needs Chromium of the system.
+# The live view in a real browser; needs Chromium of the system. PICTURES=docs/images also writes the
+# pictures of docs/view.md anew, that of the recording with HYBRIDKIN_DATA.
+view-test: export HYBRIDKIN_PICTURES := $(PICTURES)
 view-test: $(VENV)/.browser $(VENV)/.native
 	$(BIN)/python -m pytest -q tests/app/viewer -m browser
 
@@ -74,7 +76,7 @@ $(VENV)/.installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	$(BIN)/python -m pip install --quiet torch==2.13.0
-	$(BIN)/python -m pip install --quiet --editable ".[dev]"
+	$(BIN)/python -m pip install --quiet --editable ".[full]" --group full
 	touch $@
 
 # Compiles what has changed since the installation. Without a C compiler torch computes everything.
@@ -88,7 +90,7 @@ $(VENV)/.wheels: $(VENV)/.installed
 	touch $@
 
 $(VENV)/.bench: $(VENV)/.installed
-	$(BIN)/python -m pip install --quiet --editable ".[bench]"
+	$(BIN)/python -m pip install --quiet --group bench
 	touch $@
 
 $(VENV)/.examine: $(VENV)/.installed
@@ -100,7 +102,7 @@ $(VENV)/.browser: $(VENV)/.installed
 	touch $@
 
 $(VENV)/.docs: $(VENV)/.installed
-	$(BIN)/python -m pip install --quiet --editable ".[docs]"
+	$(BIN)/python -m pip install --quiet --group docs
 	touch $@
 
 clean:

@@ -1,7 +1,8 @@
 """Compile the kernels of hybridkin.native, where there is a C compiler.
 
-hatchling calls `KernelsHook` for wheels and editable installations. `python hatch_build.py`
-compiles in place; names of variants, such as v3, compile these alone.
+hatchling calls `KernelsHook` for wheels and editable installations, and `ReadmeHook` for the page
+of the package index. `python hatch_build.py` compiles in place; names of variants, such as v3,
+compile these alone.
 
 The variable CC names the compiler with its options. HYBRIDKIN_PLATFORM is the platform tag of the
 wheel where the compiler is one for another machine.
@@ -11,6 +12,7 @@ from __future__ import annotations
 
 import os
 import platform
+import re
 import runpy
 import shlex
 import shutil
@@ -23,10 +25,12 @@ from typing import Any
 
 try:
     from hatchling.builders.hooks.plugin.interface import BuildHookInterface
+    from hatchling.metadata.plugin.interface import MetadataHookInterface
 except ImportError:  # compiling in place needs no hatchling
-    BuildHookInterface = object
+    BuildHookInterface = MetadataHookInterface = object
 
-PACKAGE = Path(__file__).parent / "hybridkin"
+ROOT = Path(__file__).parent
+PACKAGE = ROOT / "hybridkin"
 NATIVE = PACKAGE / "native"
 FLAGS = (
     "-std=c99 -O3 -Wall -Wextra -pedantic -fno-math-errno -fno-trapping-math -ffp-contract=fast "
@@ -158,6 +162,37 @@ class KernelsHook(BuildHookInterface):  # pyright: ignore[reportGeneralTypeIssue
     def finalize(self, version: str, build_data: dict[str, Any], artifact_path: str) -> None:
         """Remove what was compiled for the wheel alone."""
         shutil.rmtree(self.work)
+
+
+class ReadmeHook(MetadataHookInterface):  # pyright: ignore[reportGeneralTypeIssues]
+    """Gives README.md to the package index, where only absolute links lead somewhere."""
+
+    def update(self, metadata: dict[str, Any]) -> None:
+        """Set the readme: its links lead to the files of this version in the repository."""
+        readme = (ROOT / "README.md").read_text(encoding="utf-8")
+        version = runpy.run_path(str(PACKAGE / "_core" / "version.py"))["__version__"]
+        text = with_absolute_links(readme, metadata["urls"]["Repository"], f"v{version}")
+        metadata["readme"] = {"content-type": "text/markdown", "text": text}
+
+
+def with_absolute_links(markdown: str, repository: str, tag: str) -> str:
+    """Return a Markdown text of the repository whose links to files are addresses.
+
+    Links in Markdown and in attributes of HTML count; code is left as it is. A picture is linked as
+    the file itself, other files as their page.
+    """
+
+    def absolute(link: re.Match[str]) -> str:
+        is_picture = Path(link["path"]).suffix in (".gif", ".jpg", ".png", ".svg")
+        kind = "raw" if is_picture else "blob"
+        return f"{link['before']}{repository}/{kind}/{tag}/{link['path']}"
+
+    parts = re.split(r"(```.*?```|`[^`]*`)", markdown, flags=re.DOTALL)
+    before = r"(?P<before>\]\(|\b(?:href|src)=\")"
+    path = r"(?![a-z]+:|#|/)(?P<path>[^\s)\"#]+)"
+    for i in range(0, len(parts), 2):  # the others are code
+        parts[i] = re.sub(before + path, absolute, parts[i])
+    return "".join(parts)
 
 
 if __name__ == "__main__":

@@ -66,7 +66,12 @@ else:
     for name, track in tracks.items():
         color = plots.model_color(name)
         axes[0].plot(path.t, 100 * track.error, color=color, label=name)
-        lines = axes[1].plot(path.t, 100 * track.q[:, :3], color=color)
+        for chamber, style in enumerate(("-", "--", ":")):
+            q = 100 * track.q[:, chamber]
+            axes[1].plot(path.t, q, color=color, linestyle=style)
+    for chamber, line in enumerate(axes[1].lines[:3], start=1):
+        line.set_label(f"chamber {chamber}")
+    axes[1].legend(frameon=False, fontsize="small")
     axes[0].set(ylabel="tip error [cm]", ylim=(0, None))
     axes[1].set(ylabel="chambers, segment 1 [cm]", xlabel="time [s]")
     plt.show()

@@ -152,7 +152,7 @@ RUNS = {  # the last command of a target
     "view-test": "python -m pytest -q tests/app/viewer -m browser",
     "check": "pyright --pythonpath .venv/bin/python",
 }
-EXTRAS = {"docs": "docs", "bench": "bench"}  # more than the extra "dev"
+GROUPS = {"docs": "docs", "bench": "bench", "examine": "examine"}  # more than the group "full"
 TARGETS = {command[1] for command in COMMANDS if command[0] == "make"}
 TARGETS |= {*re.findall(r"make ([a-z-]+) +#", CONTRIBUTING)}
 
@@ -197,9 +197,9 @@ def test_make_runs_what_a_target_says(fresh, target):
         assert (ROOT / script).exists()
     if last[0].startswith(".venv"):  # others make an environment of their own
         assert clean[0] == ["python3", "-m", "venv", ".venv"]
-        assert [*before, "--editable", ".[dev]"] in clean[: clean.index(last)]
-    if target in EXTRAS:
-        assert [*before, "--editable", f".[{EXTRAS[target]}]"] in clean[: clean.index(last)]
+        assert [*before, "--editable", ".[full]", "--group", "full"] in clean[: clean.index(last)]
+    if target in GROUPS:
+        assert [*before, "--group", GROUPS[target]] in clean[: clean.index(last)]
     for name in ("installed", "native", "docs", "bench", "examine", "browser", "wheels"):
         (fresh / ".venv").mkdir(exist_ok=True)
         (fresh / ".venv" / f".{name}").touch()

@@ -75,6 +75,11 @@ def html_text(text: object) -> str:
     return html.escape(visible_lines(text))
 
 
+def script_text(text: object) -> str:
+    """Return a text as a literal in JavaScript, also inside HTML."""
+    return json.dumps(visible(text)).replace("<", r"\u003c")
+
+
 def markdown(text: object) -> str:
     """Return a text in Markdown; words that could be markup, as ``*x*``, become code."""
     words = visible(text).split()

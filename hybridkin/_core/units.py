@@ -33,6 +33,12 @@ class LogUnit(NamedTuple):
         """Return a change of q in this unit."""
         return f"{change / self.size:.3g} {self.name}"
 
+    def named_in(self, text: str) -> str:
+        """Return a text with the name of this unit for "unit of q", where q has no other unit."""
+        if self.size != 1.0 or self.name.startswith("("):
+            return text
+        return text.replace("unit of q", self.name)
+
 
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 """Seconds per unit, for the units of time that logs accept beside frames."""

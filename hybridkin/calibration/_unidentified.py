@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from hybridkin._core.directions import few_terms, leading_part
 from hybridkin.calibration._least_squares import Fit
 from hybridkin.calibration._parameters import Problem
+from hybridkin.chains.chain import Chain
 
 _N_TERMS = 6  # parameters in a sentence
 _DIGITS = 9  # of changes, in steps
@@ -17,6 +19,8 @@ _SMALL = 0.05  # of a step, or of the motion of the tips: not mentioned
 _SLIGHT = 0.01  # of the largest motion of the tips by one parameter alone
 _ALIKE = 0.02
 _STILL = 1e-6  # [mm]
+_SHOWN = 1e-3  # least motion of the tips that is given in digits [mm]
+_TINY = 1e-12  # standard error of a ratio that is not less
 _DETERMINED = 0.05  # largest standard error of the logarithm
 # Steps in which changes are given, and their names, for each kind of unit.
 _STEPS = {"m": 1e-3, "rad": np.pi / 180.0, "-": 0.01, "q": 1.0}
@@ -53,7 +57,8 @@ def sentences(fit: Fit, directions: NDArray, covariance: NDArray, n_rows: float)
         tips = float(np.linalg.norm(columns @ direction))
         effect = f"does not move {fit.rows.moved}"
         if tips >= _STILL:
-            effect = f"moves {fit.rows.moved} by {tips:.2g} mm rms"
+            amount = f"{tips:.2g} mm" if tips >= _SHOWN else f"less than {_SHOWN:g} mm"
+            effect = f"moves {fit.rows.moved} by {amount} rms"
         terms = _terms(problem, change, lead)
         shown = [term for term in terms if abs(term.size) > _SMALL][:_N_TERMS]
         alone = np.abs(direction) * np.linalg.norm(columns, axis=0)
@@ -124,10 +129,26 @@ def _determined(fit: Fit, covariance: NDArray, first: _Term, second: _Term) -> s
         value = part.value(geometry[part.entry]).flatten()
         values[place] = value[: part.size]
     product = values[i] * values[j] ** power
+    std_error = abs(product) * error
+    decimals = max(0, 1 - math.floor(math.log10(max(std_error, _TINY))))  # two digits of the error
+    unit = _unit_of_both(fit.chain(), labels[i], operator, labels[j])
     return (
-        f" The data identify {labels[i]} {operator} {labels[j]} = {product:.4g} "
-        f"(std. error {abs(product) * error:.2g})."
+        f" The data identify {labels[i]} {operator} {labels[j]} = {product:.{decimals}f}{unit} "
+        f"(std. error {std_error:.{decimals}f})."
     )
+
+
+def _unit_of_both(chain: Chain, label: str, operator: str, other_label: str) -> str:
+    """Return the unit of a ratio or product of two parameters, after a space; "" of a number."""
+    unit = chain.unit_of(label.partition("[")[0])
+    other = chain.unit_of(other_label.partition("[")[0])
+    top, _, below = unit.partition("/")
+    if operator == "/" and top == other:
+        return f" per {below}" if below else ""
+    other_top, _, other_below = other.partition("/")
+    if operator == "/" and other_top == unit:
+        return f" {other_below}"
+    return f" [{unit} {operator} {other}]"
 
 
 def _terms(problem: Problem, change: NDArray, lead: int) -> list[_Term]:

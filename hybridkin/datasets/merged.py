@@ -332,8 +332,8 @@ def merge_logs(
     if is_estimated and explained < _EXPLAINED:
         raise ValueError(
             f"The lag between {motors.source} and {camera.source} is not clear: the commands "
-            f"explain at most {explained:.0%} of the motion of the tip, at {lag:.4f} s. Check that "
-            "both record the same motion, or give `lag` (0 if they share a clock)."
+            f"explain at most {100.0 * explained:.0f} % of the motion of the tip, at {lag:.3g} s. "
+            "Check that both record the same motion, or give `lag` (0 if they share a clock)."
         )
     n_left_out = len(camera.time) - int(is_covered.sum())
     return Merged(log, lag, explained, is_estimated, n_left_out)

@@ -68,7 +68,7 @@ def best_mechanics(spec: Spec, geometry: GeometryChoice, rows: Rows) -> Mechanic
 def _best(tables: Sequence[CrossFit], enough: NDArray[np.bool_], handicap: NDArray) -> int:
     """Return the place of the best of K tables, those of simpler mechanics first.
 
-    The score of each is multiplied by its `handicap` (K,).
+    With outer rows the score of each is multiplied by its `handicap` (K,).
 
     Mechanics for which the inner rows are not `enough` (K,) would have too large errors of outer
     rows: these count at most as large, relative to held-out errors, as those of the others. If they
@@ -79,7 +79,7 @@ def _best(tables: Sequence[CrossFit], enough: NDArray[np.bool_], handicap: NDArr
     known = enough & np.isfinite(cv) & np.isfinite(io)
     largest = (io[known] / cv[known]).min(initial=np.inf) * cv
     io = np.where(enough, io, np.minimum(io, largest))
-    scores = handicap * cv
+    scores = cv.copy()
     if len(tables[0].y) >= _FEW and enough.any():
         scores = handicap * np.cbrt(cv * io**2)
     least = tables[int(np.argmin(cv))]

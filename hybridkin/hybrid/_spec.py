@@ -176,7 +176,7 @@ class Refinement:
     suffix : str
         What it adds to the name of a set of calibrated parameters.
     handicap : float
-        Factor on its errors where it is compared with other mechanics.
+        Factor on its errors where it is compared with other mechanics by outer rows.
     """
 
     suffix = ""

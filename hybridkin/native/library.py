@@ -27,6 +27,7 @@ from hybridkin._core.kernel_numbers import (
 from hybridkin._core.model import ForwardModel
 from hybridkin._core.plan import NoKernel, Plan
 from hybridkin._core.portable import PortableModule
+from hybridkin.native._installation import compiling_command, warn_of_slow_models
 
 _FOLDER = Path(__file__).parent
 _SUFFIX = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
@@ -72,29 +73,53 @@ def backend(model: ForwardModel) -> str:
 @cache
 def _opened() -> tuple[ctypes.CDLL | None, str]:
     """Return the fastest library that this processor can run, or the reason why there is none."""
-    choice = os.environ.get("HYBRIDKIN_NATIVE", "")  # "off", or the name of a variant
-    if choice == "off":
+    if _is_off():
         return None, "HYBRIDKIN_NATIVE=off"
-    paths = sorted((_FOLDER / "lib").glob(f"hk_{choice or '*'}{_SUFFIX}"))
-    reason = "hybridkin was installed without compiled kernels; reinstall it with a C compiler"
+    paths = _compiled_files()
+    if not paths:
+        return None, _without_files()
+    reason = "no variant of the compiled library is for this processor"
     try:
-        level = ctypes.CDLL(str(paths[0])).hk_level() if paths else 0
+        level = ctypes.CDLL(str(paths[0])).hk_level()
         for path in reversed(paths):
             if _LEVELS.get(path.stem, 0) <= level:
                 opened = ctypes.CDLL(str(path))
-                reason = _fault(opened)
-                if not reason:
+                fault = _fault(opened)
+                if not fault:
                     return opened, ""
-                reason = f"{path.name} {reason}"
+                reason = f"{path.name} {fault}; compile it anew by `{compiling_command()}`"
     except (OSError, AttributeError) as error:
-        reason = f"the compiled library cannot be used ({error})"
+        reason = (
+            f"the compiled library cannot be used ({error}); compile it anew by "
+            f"`{compiling_command()}`"
+        )
+    warn_of_slow_models(reason)
     return None, reason
+
+
+def _is_off() -> bool:
+    """Return whether the user has turned the core off."""
+    return os.environ.get("HYBRIDKIN_NATIVE") == "off"
+
+
+def _compiled_files() -> list[Path]:
+    """Return the compiled libraries, the fastest last; HYBRIDKIN_NATIVE can name a variant."""
+    variant = os.environ.get("HYBRIDKIN_NATIVE") or "*"
+    return sorted((_FOLDER / "lib").glob(f"hk_{variant}{_SUFFIX}"))
+
+
+def _without_files() -> str:
+    """Return the reason where nothing was compiled, and what to do."""
+    return (
+        "hybridkin was installed without compiled kernels; install a C compiler, then run "
+        f"`{compiling_command()}`"
+    )
 
 
 def _fault(opened: ctypes.CDLL) -> str:
     """Return what is wrong with a library, or an empty string."""
     if opened.hk_sources() & 0xFFFFFFFF != checksum(_FOLDER / "src"):
-        return "was compiled from other sources; reinstall hybridkin, or run hatch_build.py"
+        return "was compiled from other sources"
     pointer = ctypes.c_void_p
     results = [pointer] * 3
     opened.hk_evaluate.argtypes = [
@@ -548,3 +573,7 @@ def evaluate(
         if distance:
             results.append(model.domain_distance(rows))
     return tuple(part.numpy() for part in results)
+
+
+if not (_is_off() or _compiled_files()):  # said as soon as the core is imported
+    warn_of_slow_models(_without_files())

@@ -5,13 +5,16 @@ from __future__ import annotations
 import itertools
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, TypeAlias
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
+from matplotlib.legend_handler import HandlerTuple
 from matplotlib.ticker import MaxNLocator
 from matplotlib.transforms import ScaledTranslation
 from mpl_toolkits.mplot3d.axes3d import Axes3D
@@ -34,7 +37,27 @@ COLORS = (
     "#000000",
     "#F0E442",
 )
+TARGET = COLORS[6]
+TIP = COLORS[0]
+ERROR = COLORS[3]
+"""Colours of what robots of all kinds have: a path to follow, what a tip reaches, and between."""
 STYLES = ("-", "--", "-.", ":")
+DASHED_TARGET = (0, (5.0, 3.0))  # drawn over a track, which is seen in its gaps
+# Of segments, dark and light in turn for prints without colour; not those of target, tip and error.
+_OF_SEGMENTS = (COLORS[1], COLORS[4], COLORS[2], COLORS[5])
+NAMED = (*_OF_SEGMENTS, COLORS[3], COLORS[0])
+"""Colours of actuators that a legend names."""
+# Of the actuators of a segment, the first solid: dashes and gaps in widths of the line.
+_OF_ACTUATORS = (
+    "-",
+    (0, (4.0, 1.6)),
+    (0, (1.0, 1.6)),
+    (0, (6.0, 1.6, 1.0, 1.6)),
+    (0, (6.0, 1.6, 1.0, 1.6, 1.0, 1.6)),
+    (0, (8.0, 4.0)),
+    (0, (1.0, 4.0)),
+    (0, (2.5, 2.5)),
+)
 # Words in the name of a model, its colour and line style; the first that fit count.
 _MODELS = (
     (r"^(?!mechanic).*\bauto\b", "#009E73", "-"),
@@ -45,6 +68,13 @@ _MODELS = (
     (r"\bmechanical\b|\bnominal\b", "#D55E00", "--"),
 )
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
+# Parts of the axes of space without ticks, below and above: for an eye at the usual place, x ends
+# where y begins, and y ends where z begins.
+_CORNERS = ((0.0, 0.12), (0.12, 0.12), (0.0, 0.0))
+_PAD = 6.0  # of the names of axes [pt]
+_PADS = (1.2, 1.8, 2.6)  # the same for each letter of the numbers of x, y and z [pt]
+_HANDLE = 2.4  # length of a line in a legend, in sizes of its letters
+_MOST_HANDLES = 4  # in one entry of a legend
 
 
 def new_figure(
@@ -154,9 +184,52 @@ def looks_of(names: Iterable[str]) -> list[dict[str, Any]]:
     return looks
 
 
+def actuator_looks(segments: Sequence[int]) -> list[tuple[str, Any]]:
+    """Return colour and line style of every actuator: colours by segment, styles within it.
+
+    Eight segments of four actuators all look different.
+    """
+    n_colors = len(_OF_SEGMENTS)
+    looks = []
+    counts = Counter[int]()
+    for segment in segments:
+        style = counts[segment] + 4 * (segment // n_colors)
+        counts[segment] += 1
+        color = _OF_SEGMENTS[segment % n_colors]
+        looks.append((color, _OF_ACTUATORS[style % len(_OF_ACTUATORS)]))
+    return looks
+
+
+def pale(color: str, strength: float = 0.5) -> str:
+    """Return a colour on the way to white, which is that of no strength."""
+    red, green, blue = to_rgb(color)
+    white = 1.0 - strength
+    return to_hex((white + strength * red, white + strength * green, white + strength * blue))
+
+
 def small_legend(ax: Axes, **place: Any) -> None:
-    """Add a small legend without a frame; `place` are arguments of ``Axes.legend``."""
-    ax.legend(frameon=False, fontsize="small", **place)
+    """Add a small legend without a frame; `place` are arguments of ``Axes.legend``.
+
+    What has the same label shares an entry, which shows the looks of all of it.
+    """
+    looks: dict[str, list[Artist]] = {}
+    for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
+        looks.setdefault(label, []).append(handle)
+    handles: list[Any] = []
+    most = 1
+    for of_label in looks.values():
+        together = of_label[:_MOST_HANDLES]
+        most = max(most, len(together))
+        handles.append(together[0] if len(together) == 1 else tuple(together))
+    ax.legend(
+        handles,
+        [*looks],
+        frameon=False,
+        fontsize="small",
+        handler_map={tuple: HandlerTuple(ndivide=None, pad=0.4)},
+        handlelength=_HANDLE * (1 + 0.5 * (most - 1)),
+        **place,
+    )
 
 
 def legend_below(ax: Axes, n_columns: int = 1) -> None:
@@ -194,6 +267,32 @@ def decimals(values: ArrayLike) -> int:
     return int(np.clip(1 - power, 2, 6))
 
 
+class _InnerLocator(MaxNLocator):
+    """Ticks that keep away from the ends of an axis, where its neighbour has ticks, too.
+
+    Parameters
+    ----------
+    n : int
+        Most ticks.
+    below, above : float
+        Parts of the axis without ticks.
+    """
+
+    def __init__(self, n: int, below: float, above: float) -> None:
+        super().__init__(n)
+        self._below = below
+        self._above = above
+
+    def tick_values(self, vmin: float, vmax: float) -> Any:
+        """Return the places of ticks."""
+        ticks = np.asarray(super().tick_values(vmin, vmax))
+        part = (ticks - vmin) / (vmax - vmin)
+        is_inner = (part >= self._below) & (part <= 1.0 - self._above)
+        if not is_inner.any():
+            is_inner[np.abs(part - 0.5).argmin()] = True
+        return ticks[is_inner]
+
+
 def label_space(ax: Space, unit: str) -> None:
     """Label the axes of space and scale them equally, none too short, on white panes."""
     ax.set(xlabel=f"x [{unit}]", ylabel=f"y [{unit}]", zlabel=f"z [{unit}]")
@@ -204,9 +303,15 @@ def label_space(ax: Space, unit: str) -> None:
     xlim, ylim, zlim = np.stack([middle - half, middle + half], axis=1)
     ax.set(xlim=xlim, ylim=ylim, zlim=zlim)
     n_ticks = np.maximum(2, np.rint(5.0 * half / half.max()).astype(int))
-    for axis, n in zip((ax.xaxis, ax.yaxis, ax.zaxis), n_ticks.tolist(), strict=True):
+    axes = (ax.xaxis, ax.yaxis, ax.zaxis)
+    ax.tick_params(labelsize="small")
+    for axis, n, ends, pad in zip(axes, n_ticks.tolist(), _CORNERS, _PADS, strict=True):
         axis.set_pane_color((1.0, 1.0, 1.0, 0.0))
-        axis.set_major_locator(MaxNLocator(n))
+        locator = _InnerLocator(n, *ends)
+        axis.set_major_locator(locator)
+        numbers = axis.get_major_formatter().format_ticks(locator())
+        axis.label.set_size("small")
+        axis.labelpad = _PAD + pad * max(map(len, numbers), default=0)
     ax.patch.set_visible(False)  # it would hide the labels of the axes beside it
     ax.set_aspect("equal")
-    ax.set_box_aspect(half, zoom=0.88)  # space for the z label, which layouts ignore
+    ax.set_box_aspect(half, zoom=0.8)  # space for the z label, which layouts ignore

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,25 +12,29 @@ from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 
 from hybridkin._core.texts import visible
-from hybridkin.plots._canvas import COLORS
+from hybridkin.plots._camera import fitted_camera
+from hybridkin.plots._canvas import DASHED_TARGET, TARGET, TIP
 from hybridkin.plots._obstacles import COLOR, OPACITY, surface_of
 from hybridkin.plots._scene import Line, Scene
 from hybridkin.plots.page_server import page_server, stop
 
-# From the middle to the eye, in longest sides of the scene; as the axes of matplotlib at the start.
-_EYE = 1.2 * np.array([0.433, -0.75, 0.5])
+# From the scene to the eye; as the axes of matplotlib at the start.
+_EYE = (0.433, -0.75, 0.5)
 _WIDTH = 0.003  # of a line of width 1, in the same unit
 _DOT = 0.016  # size of a marker
+_SHAPES = {"x": "sparkle"}  # of markers, a target among them; circles else
+_MOST_DASHES = 24  # of a line
 
 
 def page(
     scene: Scene,
+    title: str,
     fps: float,
     progress: Callable[[int, int], None],
 ) -> str:
     """Return the page as HTML that needs no other file."""
     try:
-        server = page_server("127.0.0.1", 0)
+        server = page_server("127.0.0.1", 0, title)
     except ImportError as error:
         raise ImportError(
             '`path` ends in .html, which needs viser: pip install "hybridkin[view]", or '
@@ -48,22 +54,27 @@ def _recorded(
 ) -> str:
     """Draw all frames on a server that nobody looks at, and return what it recorded."""
     longest = float((scene.high - scene.low).max())
-    middle = 0.5 * (scene.low + scene.high) / longest
+    above = 0.5 * (scene.low + scene.high) / longest
+    above[2] = scene.high[2] / longest + 0.08
+    seen = [above * longest, scene.low, scene.high]
+    seen += [line.points.reshape(-1, 3) for line in scene.moving]
     server.scene.set_up_direction("+z")
-    server.initial_camera.look_at = middle
-    server.initial_camera.position = middle + _EYE
+    fitted_camera(np.vstack(seen) / longest, _EYE).aim(server.initial_camera)
     server.scene.add_frame("/base", axes_length=0.15, axes_radius=0.004)
-    paths = [Line("path reached", scene.x[None], COLORS[0], 1.0)]
+    paths = [Line("path reached", scene.x[None], TIP, 1.6)]
     if len(scene.target):
-        paths.append(Line("target", scene.target[None], "black", 1.0))
+        paths.append(Line("target", scene.target[None], TARGET, 1.0, style=DASHED_TARGET))
     for line in paths:
         _Stroke(server.scene, line.label, line, longest).show(0)
     _add_obstacles(server.scene, scene, longest)
     strokes = []
-    for k, line in enumerate(scene.moving):
-        name = _node(line.label or f"part {k + 1}")
+    seen_names = Counter[str]()
+    for line in scene.moving:
+        name = _node(line.label or "part")
+        seen_names[name] += 1
+        if seen_names[name] > 1:
+            name += f" {seen_names[name]}"
         strokes.append(_Stroke(server.scene, name, line, longest))
-    above = np.append(middle[:2], scene.high[2] / longest + 0.08)
     caption = server.scene.add_label("/caption", "", position=above)
     recording = server.get_scene_serializer()
     for k, words in enumerate(scene.captions):
@@ -107,14 +118,14 @@ class _Stroke:
             strokes = scene.add_line_segments(
                 f"/{name}", np.zeros((1, 2, 3)), color, thickness=_WIDTH * line.width
             )
-            self._parts.append((strokes, _segments))
+            self._parts.append((strokes, partial(_dashes, line=line)))
         if line.marker:
             dots = scene.add_point_cloud(
                 f"/{name}/marks",
                 np.zeros((1, 3)),
                 color,
                 point_size=_DOT,
-                point_shape="circle",
+                point_shape=_SHAPES.get(line.marker, "circle"),
                 precision="float32",
             )
             self._parts.append((dots, lambda points: points))
@@ -129,6 +140,18 @@ class _Stroke:
                 handle.points = parts[known]
 
 
-def _segments(points: NDArray) -> NDArray:
-    """Return the pieces (P - 1, 2, 3) of a line through points (P, 3)."""
-    return np.stack([points[:-1], points[1:]], axis=1)
+def _dashes(points: NDArray, line: Line) -> NDArray:
+    """Return the pieces (K, 2, 3) of a line through points (P, 3), with the gaps of its style."""
+    if line.style == "-":
+        return np.stack([points[:-1], points[1:]], axis=1)
+    points = points[np.isfinite(points).all(axis=1)]
+    lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    along = np.concatenate([[0.0], np.cumsum(lengths)])
+    _, pattern = line.style
+    period = _WIDTH * line.width * sum(pattern)
+    n = int(np.clip(along[-1] / period, 1, _MOST_DASHES))
+    marks = along[-1] / n * np.cumsum([0.0, *pattern]) / sum(pattern)
+    starts = along[-1] / n * np.arange(n)
+    places = starts[:, None, None] + marks[:-1].reshape(-1, 2)  # dash after dash, gap after gap
+    ends = [np.interp(places, along, column) for column in points.T]
+    return np.stack(ends, axis=-1).reshape(-1, 2, 3)

@@ -11,7 +11,14 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from numpy.typing import NDArray
 
 from hybridkin._core.texts import plot_label
-from hybridkin.plots._canvas import COLORS, Space, label_space, small_legend
+from hybridkin.plots._canvas import (
+    DASHED_TARGET,
+    TARGET,
+    TIP,
+    Space,
+    label_space,
+    small_legend,
+)
 from hybridkin.plots._obstacles import COLOR, OPACITY, Solid, surface_of
 
 _TOP = (-0.1, -0.2, 1.0)  # where the name of an obstacle stands, for an eye at the usual place
@@ -25,7 +32,7 @@ class Line(NamedTuple):
     color: str
     width: float
     marker: str = ""
-    style: str = "-"
+    style: Any = "-"  # of matplotlib, or "none"
 
     def look(self) -> dict[str, Any]:
         """Return the look as arguments of matplotlib."""
@@ -67,8 +74,9 @@ class Stage:
         label_space(ax, scene.unit)
         add_obstacles(ax, scene.obstacles)
         if len(scene.target):
-            ax.plot(*scene.target.T, color="black", linewidth=1.0, label="target")
-        trail = ax.plot([], [], [], color=COLORS[0], linewidth=1.2, linestyle="--")
+            target = {"color": TARGET, "linewidth": 1.0, "linestyle": DASHED_TARGET}
+            ax.plot(*scene.target.T, label="target", **target)
+        trail = ax.plot([], [], [], color=TIP, linewidth=1.6, label="path reached")
         self.trail = trail[0]
         self.artists = []
         for line in scene.moving:
@@ -77,11 +85,11 @@ class Stage:
         small_legend(ax, loc="upper left", bbox_to_anchor=(-0.25, 1.0))
         self.cursor = None
         if error_ax is not None and len(scene.error):
-            error_ax.plot(scene.steps, scene.error, color=COLORS[0], linewidth=1.5)
+            error_ax.plot(scene.steps, scene.error, color=TIP, linewidth=1.5)
             error_ax.set(xlabel=scene.when, ylabel=scene.error_name)
             error_ax.set_ylim(bottom=0.0)
             line = error_ax.axvline(scene.steps[0], color="black", linewidth=1.0)
-            self.cursor = (line, error_ax.plot([], [], "o", color=COLORS[0])[0])
+            self.cursor = (line, error_ax.plot([], [], "o", color=TIP)[0])
 
     def show(self, k: int) -> None:
         """Move everything to frame k."""

@@ -25,7 +25,9 @@ from hybridkin.plots._arrays import (
     times,
 )
 from hybridkin.plots._canvas import (
-    COLORS,
+    ERROR,
+    TARGET,
+    TIP,
     Display,
     decimals,
     scale_of,
@@ -242,6 +244,7 @@ class TrackAnimation(Display):
         unit: str = "cm",
         speed: float = 1.0,
         dpi: float | None = None,
+        title: str = "",
         progress: Callable[[int, int], None] = quiet,
     ) -> Path:
         """Write a film or a page, and return where.
@@ -258,6 +261,8 @@ class TrackAnimation(Display):
             Speed of the film over that of the motion.
         dpi : float, optional
             Pixels per inch of a film of 9 x 4.5 inches. Default: 160, of a gif 80.
+        title : str, optional
+            Title of a page, in the tab of the browser. Default: the name of the file.
         progress : callable, optional
             Called with (done, total), in frames.
 
@@ -284,7 +289,8 @@ class TrackAnimation(Display):
         scene = self._scene(unit)
         fps = speed * self.fps
         if kind == ".html":
-            text = page(scene, fps, progress).encode() + b"\n<!-- %s -->\n" % MARK
+            html = page(scene, str(title) or path.stem, fps, progress)
+            text = html.encode() + b"\n<!-- %s -->\n" % MARK
             write_file(path, lambda staging: staging.write_bytes(text))
             return path
         writer = _writer(kind, fps)
@@ -316,9 +322,9 @@ class TrackAnimation(Display):
             lines += self.body.lines(tip=False)
         if len(self.target):
             way = np.stack([self.target[self.rows], x], axis=1)
-            lines.append(Line("tip error", way, "black", 2.0))
-            lines.append(Line("", way[:, :1], "black", 1.0, marker="x", style="none"))
-        tip = Line(self.name, x[:, None], COLORS[0], 1.0, marker="o", style="none")
+            lines.append(Line("tip error", way, ERROR, 2.5))
+            lines.append(Line("target now", way[:, :1], TARGET, 1.0, marker="x", style="none"))
+        tip = Line(self.name, x[:, None], TIP, 1.0, marker="o", style="none")
         return [*lines, tip]
 
     def limits(self) -> tuple[NDArray, NDArray]:

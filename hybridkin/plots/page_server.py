@@ -1,8 +1,10 @@
 """A viser server for a page of our own alone: no other page connects, no other message is heard.
 
+Its page has a title of its own, and `fitted_camera` places the eye.
+
 viser checks neither who connects nor what it is sent: any page that is open in the browser may
 connect to this machine, steer, store files, and have the view shared in the internet. All that
-this module needs of viser beyond its interface is in `_Gate`.
+this module needs of viser beyond its interface is in `_Gate` and `_set_title`.
 """
 
 from __future__ import annotations
@@ -17,14 +19,18 @@ from contextlib import redirect_stdout
 from typing import Any
 from urllib.parse import urlsplit
 
-__all__ = ["page_server", "stop"]
+from hybridkin._core.texts import script_text
+from hybridkin.plots._camera import Camera, fitted_camera
+
+__all__ = ["Camera", "fitted_camera", "page_server", "stop"]
+
 
 _FARTHEST = 1e9  # of a coordinate; no page sends more
 _REFUSED = 1008  # code of a closed connection: policy violation
 _Message = Mapping[str, Any]
 
 
-def page_server(host: str, port: int, **options: Any) -> Any:
+def page_server(host: str, port: int, title: str, **options: Any) -> Any:
     """Return a running viser server that listens to its own page only.
 
     Parameters
@@ -33,6 +39,8 @@ def page_server(host: str, port: int, **options: Any) -> Any:
         Address to listen to.
     port : int
         Port; the next free one if it is taken, and any free one for 0.
+    title : str
+        Title of the page, in the tab of the browser.
     **options
         Of ``viser.ViserServer``.
 
@@ -49,6 +57,7 @@ def page_server(host: str, port: int, **options: Any) -> Any:
         server = viser.ViserServer(host, port, verbose=False, **options)
     try:
         _Gate(host).guard(server)
+        _set_title(server, title)
     except AttributeError as error:
         stop(server)
         raise RuntimeError(
@@ -62,6 +71,14 @@ def stop(server: Any) -> None:
     """Stop a server; its port is free afterwards."""
     with redirect_stdout(io.StringIO()):
         server.stop()
+
+
+def _set_title(server: Any, title: str) -> None:
+    """Set the title of every page, also of a recorded one, whose file says "Viser"."""
+    from viser._messages import RunJavascriptMessage
+
+    script = f"document.title = {script_text(title)};"
+    server.gui._websock_interface.queue_message(RunJavascriptMessage(source=script))
 
 
 class _Gate:

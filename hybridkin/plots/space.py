@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -17,9 +16,10 @@ from hybridkin._core.arrays import whole
 from hybridkin._core.texts import plot_label
 from hybridkin.plots._arrays import distance, plain, shaped, shaped_or_empty
 from hybridkin.plots._canvas import (
-    COLORS,
+    ERROR,
     Display,
     Space,
+    actuator_looks,
     label_space,
     scale_of,
     small_legend,
@@ -30,8 +30,6 @@ from hybridkin.plots._scene import Line, add_obstacles
 from hybridkin.plots.models import Model, body_of
 
 _BODY = "#404040"
-# Of the actuators by segment; dark and light alternate, for prints without colour.
-_SEGMENTS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9")
 _AXES = ("#D55E00", "#009E73", "#0072B2")
 _AXIS_LENGTH = 0.1  # of the backbone
 _TOP = 0.99  # share of the errors within the colour scale, which outliers do not extend
@@ -173,9 +171,10 @@ class BackboneDisplay(Display):
     actuators : sequence of array-like of shape (K, P_i, 3), optional
         Points along every chamber or tendon [m].
     segments : sequence of int, optional
-        The segment that each actuator bends, from 0; it gives the colour. Default: all one.
+        The segment that each actuator bends, from 0; it gives the colour. Within a segment the
+        first actuator is solid, the others are dashed and dotted. Default: all one.
     names : sequence of str, optional
-        Names of the actuators: each has a colour of its own. Default: colours by segment.
+        Names of the actuators, for the legend. Default: it names the segments.
     disks : array-like of shape (K, D, C, 3), optional
         Rims of the disks, C points each [m].
     frames : array-like of shape (K, F, 4, 4), optional
@@ -277,7 +276,7 @@ class BackboneDisplay(Display):
             Where the body ends [m], in the nearest configuration of the mechanical part that
             reaches it. Default: see `model`.
         names : sequence of str, optional
-            Names of the actuators: each has a colour of its own. Default: colours by segment.
+            Names of the actuators, see `BackboneDisplay`.
         obstacles : sequence of Obstacle, default=()
             Obstacles around the robot, see `BackboneDisplay`.
 
@@ -347,25 +346,18 @@ class BackboneDisplay(Display):
             lines.append(Line("tip", self.tips[:, None], "black", 1.0, marker="o", style="none"))
         if len(self.predicted):
             way = np.stack([self.tips, self.predicted], axis=1)
-            lines.append(Line("learned correction", way, COLORS[0], 1.5, style=":", marker="."))
+            lines.append(Line("learned correction", way, ERROR, 1.5, style=":", marker="."))
         return lines
 
     def _actuator_lines(self) -> list[Line]:
-        """Return the actuators, each by its name or together by segment."""
+        """Return the actuators, with the label of their name or their segment."""
+        labels = self.names
+        if not labels:
+            labels = [f"actuators of segment {segment + 1}" for segment in self.segments]
+        looks = actuator_looks(self.segments)
         lines = []
-        if self.names:
-            colors = itertools.cycle(COLORS)
-            for name, path, color in zip(self.names, self.actuators, colors, strict=False):
-                lines.append(Line(name, path, color, 1.6))
-            return lines
-        for segment in sorted({*self.segments}):
-            paths = []
-            for path, of in zip(self.actuators, self.segments, strict=True):
-                if of == segment:
-                    paths.append(path)
-            label = f"actuators of segment {segment + 1}"
-            color = _SEGMENTS[segment % len(_SEGMENTS)]
-            lines.append(Line(label, _joined(paths), color, 1.6))
+        for label, path, (color, style) in zip(labels, self.actuators, looks, strict=True):
+            lines.append(Line(label, path, color, 1.6, style=style))
         return lines
 
     def _draw_outline(self, space: Space, k: int, scale: float) -> None:

@@ -22,20 +22,26 @@ from hybridkin.plots._arrays import (
     times,
 )
 from hybridkin.plots._canvas import (
-    COLORS,
+    DASHED_TARGET,
     LENGTHS,
+    NAMED,
     STYLES,
+    TARGET,
     Display,
+    actuator_looks,
     axes_or_new,
     decimals,
     legend_below,
     looks_of,
+    pale,
     scale_of,
     small_legend,
     steps_of,
 )
 
 _ACTUATOR_UNITS = {**LENGTHS, "rad": 1.0, "deg": 180.0 / np.pi}
+_TARGET = {"color": TARGET, "linewidth": 1.0, "linestyle": DASHED_TARGET, "label": "target"}
+_LIMITS = (0, (1.0, 5.0))  # style of their lines, which no actuator has
 _PLANES = ("xy", "xz", "yx", "yz", "zx", "zy")
 
 
@@ -150,7 +156,7 @@ class TrackingDisplay(Display):
             label = self._summary(name, scale, unit)
             ax.plot(*(scale * x[:, columns].T), label=label, **look)
         target = scale * self.target[:, columns]
-        ax.plot(*target.T, color="black", linewidth=1.0, label="target")
+        ax.plot(*target.T, **_TARGET)
         ax.set(xlabel=f"{plane[0]} [{unit}]", ylabel=f"{plane[1]} [{unit}]")
         ax.set_aspect("equal", adjustable="datalim")
         legend_below(ax)
@@ -164,7 +170,9 @@ class TrackingDisplay(Display):
         for name, x, look in self._looks():
             lines = ax.plot(steps, scale * x, **{**look, "linewidth": 1.2})
             lines[0].set_label(plot_label(name))
-        ax.plot(steps, scale * self.target, color="black", linewidth=1.0)
+        lines = ax.plot(steps, scale * self.target, **_TARGET)
+        for line in lines[1:]:
+            line.set_label("")
         for letter, values in zip("xyz", scale * self.target.T, strict=True):
             if np.isfinite(values).any():
                 top = int(np.nanargmax(values))
@@ -176,6 +184,7 @@ class TrackingDisplay(Display):
                 )
         ax.margins(y=0.08)
         ax.set(xlabel=when, ylabel=f"tip [{unit}]")
+        legend_below(ax)
         return self._drawn(ax)
 
     def plot_error(
@@ -242,6 +251,9 @@ class TrackingDisplay(Display):
 class ActuatorDisplay:
     """Actuator lengths over time, one panel per segment (Fig. 4, right).
 
+    Models differ in colour, and the actuators of a segment in line style, the first solid. With
+    names actuators differ in both, and the second model is pale and wide, the third more so.
+
     Parameters
     ----------
     paths : mapping of str to array-like of shape (T, n)
@@ -251,7 +263,7 @@ class ActuatorDisplay:
     t : array-like of shape (T,), optional
         Times [s]. Default: time steps.
     names : sequence of n str, optional
-        Names of the actuators, which then differ in colour, the models in style.
+        Names of the actuators, for the legend.
     limits : array-like of shape (2, n), optional
         Least and largest value of every actuator [m], of revolute joints [rad].
 
@@ -359,40 +371,65 @@ class ActuatorDisplay:
         for k, (ax, columns) in enumerate(zip(axes, parts, strict=True)):
             self._draw_segment(ax, steps, columns, scale)
             ax.set(ylabel=f"segment {k + 1} [{plot_label(unit)}]")
-        if self.names:
-            for ax in axes:
-                small_legend(ax, loc="center left", bbox_to_anchor=(1.0, 0.5))
-        else:
-            small_legend(
-                axes[0],
-                loc="lower center",
-                bbox_to_anchor=(0.5, 1.0),
-                ncols=len(self.paths),
-            )
+        self._add_legends(axes)
         axes[-1].set(xlabel=when)
         self.axes_ = axes
         self.figure_ = axes[0].figure
         return self
 
+    def _add_legends(self, axes: NDArray) -> None:
+        """Add a legend beside every segment where it has names, else one above all."""
+        if self.names or len(self.limits):
+            for ax in axes:
+                small_legend(ax, loc="center left", bbox_to_anchor=(1.0, 0.5))
+        else:
+            small_legend(
+                axes[0], loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=len(self.paths)
+            )
+
     def _draw_segment(
         self, ax: Any, steps: NDArray, columns: NDArray, scale: float | NDArray
     ) -> None:
         """Draw the actuators of a segment and their limits."""
-        looks = looks_of(self.paths)
-        colors = len(columns) * ["black"]
+        of_models = [look["color"] for look in looks_of(self.paths)]
+        for i, color in enumerate(of_models):
+            if color in of_models[:i]:
+                of_models[i] = pale(color)
+        styles = [style for _, style in actuator_looks([0] * len(columns))]
+        colors = len(columns) * [TARGET]
         if self.names:
-            colors = [COLORS[j % 8] for j in range(len(columns))]
-        for i, (name, q) in enumerate(self.paths.items()):
-            values = (scale * q)[:, columns]
-            lines = ax.plot(steps, values, **{**looks[i], "linewidth": 1.2})
-            lines[0].set_label(plot_label(name))
-            if self.names:
-                for line, color in zip(lines, colors, strict=True):
-                    line.set(color=color, linestyle="-:"[i % 2])
-            if self.names and i == 0:
-                for line, column in zip(lines, columns, strict=True):
-                    line.set_label(plot_label(self.names[column]))
+            colors = [NAMED[j % len(NAMED)] for j in range(len(columns))]
+        for i, (model, q) in enumerate(self.paths.items()):
+            values = (scale * q)[:, columns].T
+            for column, of_one, color, style in zip(columns, values, colors, styles, strict=True):
+                label = model
+                width = 1.2
+                if not self.names:
+                    color = of_models[i]
+                elif i == 0:
+                    label = self.names[column]
+                else:
+                    color = pale(color, 0.5**i)
+                    width += 1.8 * i
+                ax.plot(
+                    steps,
+                    of_one,
+                    color=color,
+                    linestyle=style,
+                    linewidth=width,
+                    label=plot_label(label),
+                    zorder=2.0 - 0.1 * i,
+                )
         if len(self.limits):
-            look = {"colors": 2 * colors, "linestyles": "dashed", "linewidth": 0.8}
-            values = (scale * self.limits)[:, columns].ravel()
-            ax.hlines(values, steps[0], steps[-1], label="limits", **look)
+            values = (scale * self.limits)[:, columns]
+            for color in dict.fromkeys(colors):
+                of_color = [values[:, j] for j in range(len(columns)) if colors[j] == color]
+                ax.hlines(
+                    np.ravel(of_color),
+                    steps[0],
+                    steps[-1],
+                    colors=color,
+                    linestyles=[_LIMITS],
+                    linewidth=1.2,
+                    label="limits",
+                )

@@ -65,10 +65,13 @@ def test_gains_over_radii_to_their_standard_errors():
     segments = []
     for sentence in result.unidentified:
         found = re.search(
-            r"The data identify gains\[(\d)\] / radii\[(\d)\] = (\S+) \(std. error (\S+)\)\.",
+            r"The data identify gains\[(\d)\] / radii\[(\d)\] = (\S+) per unit of q "
+            r"\(std. error (\S+)\)\.",
             sentence,
         )
         assert found, sentence
+        assert len(found[4].lstrip("0.")) == 2  # digits of the error, and as many decimals
+        assert len(found[3]) == len(found[4])
         i, k = int(found[1]), int(found[2])
         assert i // 3 == k
         assert abs(float(found[3]) - TRUE[i] / RADII[k]) < 4 * float(found[4])

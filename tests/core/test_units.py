@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from hybridkin._core.units import METRES, UNITS, motion_message
+from hybridkin._core.units import METRES, UNITS, LogUnit, motion_message
 
 
 def tips(span, n=5):
@@ -32,3 +32,10 @@ def test_tips_that_lie_further_apart_than_the_model_moves(span, moved, noticed):
     assert (message is not None) == noticed
     if noticed:
         assert message.startswith(f"`x` spans {span:.4g} m, but the robot is only 0.25 m long")
+
+
+def test_texts_name_the_unit_of_q_where_it_is_that_of_the_log():
+    text = "gain / radii[0] = 0.0019 per unit of q"
+    assert LogUnit.of("counts").named_in(text) == "gain / radii[0] = 0.0019 per counts"
+    for unit in ("mm", "deg", "m", "1"):  # the model has metres and radians, or no name is known
+        assert LogUnit.of(unit).named_in(text) == text

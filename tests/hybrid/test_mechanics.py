@@ -155,6 +155,9 @@ def test_the_first_of_nearly_equal_mechanics_is_taken():
 def test_a_handicap_is_made_good_by_smaller_errors():
     assert best(Table(1.0, 2.1), Table(1.0, 2.0), handicap=[1.0, 1.03]) == 0
     assert best(Table(1.0, 2.2), Table(1.0, 2.0), handicap=[1.0, 1.03]) == 1
+    # Of few rows only held-out errors count, and the structure holds where there are no rows.
+    few = Table(1.05, 1.0, n=25), Table(1.0, 1.0, n=25)
+    assert best(*few, handicap=[1.0, 1.03]) == 1
 
 
 def test_errors_outside_count_only_as_far_as_the_inner_rows_suffice():

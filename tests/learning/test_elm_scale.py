@@ -14,7 +14,6 @@ import pandas as pd
 import polars as pl
 import pytest
 import torch
-from dask.distributed import Client, LocalCluster
 from numpy.testing import assert_allclose
 from sklearn.model_selection import GridSearchCV, GroupKFold, cross_val_score
 
@@ -134,6 +133,7 @@ EXAMPLE = Path(__file__).parents[2] / "examples" / "plot_elm_dask.py"
 @pytest.mark.slow
 def test_the_example_with_two_workers_runs_as_a_script(tmp_path):
     """Tree and loop agree, and it says how many rows a worker learns in a second."""
+    pytest.importorskip("dask.distributed")
     source = EXAMPLE.read_text(encoding="utf-8")
     for long, short in (("range(0, 80, 5)", "range(0, 10, 5)"), ("N_ROWS = 8000", "N_ROWS = 500")):
         assert long in source
@@ -152,6 +152,7 @@ def test_the_example_with_two_workers_runs_as_a_script(tmp_path):
 
 @pytest.mark.slow
 def test_a_search_of_hybrids_in_workers_of_dask_finds_the_same():
+    distributed = pytest.importorskip("dask.distributed")
     q, x = data(120)
     q = 0.25 + 0.04 * q[:, :3]
     chain = ConstantCurvatureChain([0.06])
@@ -171,7 +172,7 @@ def test_a_search_of_hybrids_in_workers_of_dask_finds_the_same():
     )
     expected = search.fit(q, x, groups=groups).cv_results_["mean_test_r2"]
     options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None}
-    with LocalCluster(**options) as cluster, Client(cluster):
+    with distributed.LocalCluster(**options) as cluster, distributed.Client(cluster):
         with joblib.parallel_config(backend="dask"):
             found = search.fit(q, x, groups=groups).cv_results_
     assert_allclose(found["mean_test_r2"], expected, rtol=1e-9)

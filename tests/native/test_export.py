@@ -401,3 +401,34 @@ def test_wrong_arguments(tmp_path):
     with pytest.raises(TypeError, match="`model` must be"):
         export_c(3, tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def readme_of(tmp_path, **limits):
+    chain = robots.bionic_handling_assistant()
+    ik = InverseKinematics(chain, dt=0.01, **limits)
+    export_c(ik, tmp_path, name="robot", force=True)
+    return " ".join((tmp_path / "README.md").read_text().split())
+
+
+def test_limits_are_told_in_three_digits_and_absent_ones_in_words(tmp_path):
+    q_min = np.full(9, 0.1)
+    q_min[2] = 0.1234567
+    limits = {"q_min": q_min, "q_max": 0.4}
+    told = readme_of(tmp_path, **limits)
+    low = "(0.1, 0.1, 0.123, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1)"
+    assert f"keeps q between {low} and 0.4. It has no limit of its speed and of its" in told
+    assert "inf" not in told.partition("It keeps")[2].partition("If no limit")[0]
+    assert "0.1234567" in (tmp_path / "robot.c").read_text()  # the code computes with all digits
+    told = readme_of(tmp_path, **limits, dq_max=0.123456)
+    assert "and its speed below 0.123 per second. It has no limit of its acceleration." in told
+    assert "returns at that speed" in told
+    told = readme_of(tmp_path)
+    assert "It keeps q above 0. It has no limit of its speed and of its acceleration." in told
+
+
+def test_files_name_what_they_hold_in_words(tmp_path):
+    assert readme_of(tmp_path, q_min=0.1, q_max=0.4).startswith(
+        "# robot Inverse kinematics with 9 actuators"
+    )
+    header = (tmp_path / "robot.h").read_text()
+    assert header.startswith("/* Inverse kinematics: written by hybridkin")

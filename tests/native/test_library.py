@@ -130,7 +130,7 @@ def test_without_a_library_torch_computes(reopened, tmp_path):
     reopened.delenv("HYBRIDKIN_NATIVE", raising=False)
     reopened.setattr(library, "_FOLDER", tmp_path)
     assert backend(chain()).startswith("torch: hybridkin was installed without compiled kernels")
-    with pytest.raises(RuntimeError, match="reinstall it with a C compiler"):
+    with pytest.raises(RuntimeError, match=r"install a C compiler, then run `.*hatch_build.py`"):
         library.Program(None)
 
 
@@ -138,7 +138,8 @@ def test_without_a_library_torch_computes(reopened, tmp_path):
 def test_a_library_of_other_sources_is_refused(elsewhere):
     with open(elsewhere / "src" / "hk.c", "a") as source:
         source.write("\n")
-    assert "was compiled from other sources" in backend(chain())
+    with pytest.warns(UserWarning, match="compiled from other sources; compile it anew by `"):
+        assert "was compiled from other sources" in backend(chain())
 
 
 @pytest.mark.needs_core
@@ -152,7 +153,8 @@ def test_wrong_numbers_are_refused(elsewhere, monkeypatch, kind):
         return results
 
     monkeypatch.setattr(library.Program, "evaluate", wrong)
-    assert backend(chain()).endswith("computes wrong numbers")
+    with pytest.warns(UserWarning, match="computes wrong numbers; compile it anew by `"):
+        assert "computes wrong numbers" in backend(chain())
 
 
 @pytest.mark.needs_core

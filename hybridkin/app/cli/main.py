@@ -62,21 +62,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser().parse_args(argv)
     stages = Stages(arguments.quiet)
     try:
-        # Loads the libraries whose threads are limited.
-        if arguments.command in _LIGHT:
-            _ = hybridkin.robots
-        else:
-            _ = hybridkin.HybridForwardModel
-        # Several threads cost many times the CPU time: the matrices are small.
-        with (
-            contextlib.closing(stages),
-            warnings.catch_warnings(),
-            _interruptible(),
-            threadpool_limits(limits=1),
-        ):
+        with contextlib.closing(stages), warnings.catch_warnings():
             warnings.filterwarnings("default", category=UserWarning)
             warnings.showwarning = stages.warn
-            report, code = _RUN[arguments.command](arguments, stages)
+            # Loads the libraries whose threads are limited.
+            if arguments.command in _LIGHT:
+                _ = hybridkin.robots
+            else:
+                _ = hybridkin.HybridForwardModel
+            # Several threads cost many times the CPU time: the matrices are small.
+            with _interruptible(), threadpool_limits(limits=1):
+                report, code = _RUN[arguments.command](arguments, stages)
     except _Terminated:
         return failed("interrupted", 143, arguments.json)
     except (KeyboardInterrupt, EOFError):  # EOFError: no answer to a question
@@ -238,6 +234,12 @@ def _view(arguments: argparse.Namespace, stages: Stages) -> _Result:
         address = shown_robot.address
         words = f"{visible(model.description_.name)} is at {address}. Ctrl-C ends it."
         stages.note(words, important=True)
+        if shown_robot.base_is_fitted:
+            stages.note(
+                "The base is fitted to the log, as the description leaves it open: the robot "
+                "stands where its tips were measured.",
+                important=True,
+            )
         if not arguments.no_browser and "SSH_CONNECTION" not in os.environ:
             webbrowser.open(address)
         with contextlib.suppress(KeyboardInterrupt):

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from hybridkin import Commands, ForwardModel, obstacles
+from hybridkin import ForwardModel, obstacles
 from hybridkin.app.viewer.steered import SteeredRobot
 from hybridkin.app.workflow.model import is_fitted, tips_at
 from hybridkin.datasets import Log
@@ -25,7 +25,11 @@ BLUE = (40, 90, 200)
 GREY = (150, 150, 150)
 BROWN = (166, 124, 82)
 YELLOW = (250, 215, 70)
-GHOSTS = {"nominal model": (90, 90, 90), "calibrated model": (150, 90, 190)}
+GHOSTS = {
+    "nominal model": ((90, 90, 90), 30, "dotted"),
+    "calibrated model": ((150, 90, 190), 15, "dashed"),
+}
+"""Colour of the backbone of another model, number of its dashes, and both in words."""
 _POINTS = 10  # drawn along a segment
 _MOST_ROWS = 2000  # of a log, drawn as a cloud
 _LABEL = 0.03  # height of a name above its obstacle, relative to what is shown
@@ -34,12 +38,18 @@ _CLICK = 2.0  # distance of a click from a row, relative to the size of its dot
 
 
 class Body:
-    """The robot: backbone, actuators and disks."""
+    """The robot: backbone, actuators and disks.
 
-    def __init__(self, scene: Any, model: Any, robot: SteeredRobot) -> None:
-        self._model = model
+    Attributes
+    ----------
+    points : ndarray of shape (N, 3)
+        Its points at the start [m].
+    """
+
+    def __init__(self, scene: Any, robot: SteeredRobot) -> None:
         self._chain = robot.model.module_.robot
-        body = _body_of(model, robot)
+        body = _steered_body(robot)
+        self.points = _points_of(body)
         self._thick = 0.015 * robot.size
         least = robot.model.module_.tip_model.robot.least_radius
         self._thick = min(self._thick, 0.4 * least)
@@ -76,7 +86,7 @@ class Body:
 
     def move(self, robot: SteeredRobot) -> None:
         """Draw the robot where it is."""
-        body = _body_of(self._model, robot)
+        body = _steered_body(robot)
         if not np.isfinite(body.points).all():
             return
         self._backbone.points = body.points[0]
@@ -97,7 +107,8 @@ class Body:
 
     def _marked(self, robot: SteeredRobot) -> NDArray:
         """Return the markers (K, 3) as the model predicts them."""
-        return robot.model.predict(Commands(robot.q[None])).reshape(-1, 3)
+        with torch.no_grad():
+            return robot.model.module_(torch.from_numpy(robot.q)).reshape(-1, 3).numpy()
 
     def _tensions(self, robot: SteeredRobot) -> tuple[NDArray, NDArray]:
         """Return colours (n, 3) of the actuators, and which are slack (n,)."""
@@ -110,9 +121,28 @@ class Body:
         return between(BLUE, RED, pulled.numpy()), slack.numpy()
 
 
-def _body_of(model: Any, robot: SteeredRobot) -> BackboneDisplay:
-    """Return the body of a model at the configuration of a robot."""
-    return BackboneDisplay.from_estimator(model, robot.q, n_points=_POINTS)
+def _points_of(body: BackboneDisplay) -> NDArray:
+    """Return all points (N, 3) of a body [m]."""
+    parts = [body.points, *body.actuators]
+    if body.disks is not None:
+        parts.append(body.disks)
+    points = np.concatenate([part.reshape(-1, 3) for part in parts])
+    return points[np.isfinite(points).all(axis=1)]
+
+
+def _body_of(chain: ForwardModel, robot: SteeredRobot) -> BackboneDisplay:
+    """Return the body of a chain at the configuration of a robot."""
+    return BackboneDisplay.from_estimator(chain, robot.q, n_points=_POINTS)
+
+
+def _steered_body(robot: SteeredRobot) -> BackboneDisplay:
+    """Return the body of a robot, which ends at its tip if the model corrects it inside."""
+    model = robot.model
+    chain = model.module_.robot
+    if not model.fitted_module_.corrects_inside:
+        return _body_of(chain, robot)
+    tips = robot.x[None]
+    return BackboneDisplay.from_estimator(chain, robot.q, n_points=_POINTS, tips=tips)
 
 
 class DraggedObstacle:
@@ -130,6 +160,11 @@ class DraggedObstacle:
         Least and largest corner of what is shown [m]; a half-space is cut there.
     drag : callable
         Called with its new center (3,) [m] when the page drags it.
+
+    Attributes
+    ----------
+    points : ndarray of shape (N, 3)
+        Points of its surface [m]; none of an obstacle without an end.
     """
 
     def __init__(
@@ -148,6 +183,9 @@ class DraggedObstacle:
             ends = np.stack([surface.vertices.min(axis=0), surface.vertices.max(axis=0)])
             middle = ends.mean(axis=0)
             top = 0.5 * float(np.ptp(ends[:, 2]))
+        self.points = np.empty((0, 3))
+        if obstacle.low.isfinite().all() and obstacle.high.isfinite().all():
+            self.points = surface.vertices
         self._to_center = center - middle
         self._drag = drag
         size = float(np.ptp(corners, axis=0).max())
@@ -200,44 +238,76 @@ class Balls:
 
 
 class Ghost:
-    """The backbone of another model at the same command."""
+    """The backbone of another model at the same command, as a broken line.
+
+    Attributes
+    ----------
+    look : str
+        How it is drawn, in words.
+    line : viser node
+        Where it is drawn.
+    """
 
     def __init__(self, scene: Any, name: str, chain: ForwardModel, robot: SteeredRobot) -> None:
         self._chain = chain
-        self.line = scene.add_spline_catmull_rom(
+        color, self._pieces, self.look = GHOSTS[name]
+        self.line = scene.add_line_segments(
             f"/{name}",
-            _body_of(chain, robot).points[0],
+            self._dashes(robot),
+            color,
             thickness=0.008 * robot.size,
-            color=GHOSTS[name],
             visible=False,
         )
 
     def move(self, robot: SteeredRobot) -> None:
         """Draw it, if it is shown."""
         if self.line.visible:
-            points = _body_of(self._chain, robot).points[0]
-            if np.isfinite(points).all():
-                self.line.points = points
+            dashes = self._dashes(robot)
+            if np.isfinite(dashes).all():
+                self.line.points = dashes
+
+    def _dashes(self, robot: SteeredRobot) -> NDArray:
+        return broken(_body_of(self._chain, robot).points[0], self._pieces)
+
+
+def broken(points: NDArray, n: int) -> NDArray:
+    """Return n dashes (n, 2, 3) of a line through points (P, 3), with gaps as long as they are."""
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    along = np.concatenate([[0.0], np.cumsum(steps)])
+    places = np.linspace(0.0, along[-1], 2 * n)
+    marks = np.stack([np.interp(places, along, column) for column in points.T], axis=1)
+    return marks.reshape(n, 2, 3)
 
 
 class LogCloud:
-    """Rows of a log: measured tips coloured by the error of the model, which can be clicked."""
+    """Rows of a log: measured tips coloured by the error of the model, which can be clicked.
+
+    Attributes
+    ----------
+    tips : ndarray of shape (N, 3)
+        Those that are drawn [m].
+    name : str
+        What is drawn, in words.
+    dots, learned : viser nodes
+        The tips; and lines from the mechanical to the hybrid tips, None without a fit.
+    """
 
     def __init__(self, scene: Any, robot: SteeredRobot, log: Log) -> None:
         model = robot.model
         (commands, tips) = robot.measured_rows(log)
         every = 1 + len(tips) // _MOST_ROWS
         self._commands = commands[::every]
-        self._tips = tips[::every]
-        error = np.linalg.norm(tips_at(model, self._commands) - self._tips, axis=1)
+        self.tips = tips[::every]
+        error = np.linalg.norm(tips_at(model, self._commands) - self.tips, axis=1)
         largest = 1.0
         if len(error):
             largest = float(np.percentile(error, 95))
-        self._size = 0.007 * robot.size
-        self.name = f"log, red: error of {1e3 * largest:.3g} mm or more"
+        self._size = 0.005 * robot.size
+        worst = float(f"{1e3 * largest:.2g}")
+        self.name = f"measured (dots), red: error of {worst:g} mm or more"
         self.dots = scene.add_point_cloud(
             "/log",
-            self._tips,
+            self.tips,
             between(YELLOW, RED, error / max(largest, 1e-12)),
             point_size=self._size,
             point_shape="circle",
@@ -256,14 +326,14 @@ class LogCloud:
 
     def row_at(self, origin: NDArray, direction: NDArray) -> tuple[NDArray, NDArray] | None:
         """Return the command (n,) and the tip (3,) of the first row that a ray meets, or None."""
-        ways = self._tips - origin
+        ways = self.tips - origin
         along = ways @ direction
         distance = np.linalg.norm(ways - along[:, None] * direction, axis=1)
         hit = (distance < _CLICK * self._size) & (along > 0.0)
         if not hit.any():
             return None
         first = np.argmin(np.where(hit, along, np.inf))
-        return self._commands[first], self._tips[first]
+        return self._commands[first], self.tips[first]
 
 
 def tips_of(model: ForwardModel, q: NDArray) -> NDArray:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 from typing_extensions import Self
 
 from hybridkin import (
@@ -33,6 +34,7 @@ from hybridkin.app.viewer.drawing import (
     Ghost,
     LogCloud,
 )
+from hybridkin.app.viewer.first_look import FirstLook, first_camera
 from hybridkin.app.viewer.motions import (
     Loop,
     Motion,
@@ -41,16 +43,20 @@ from hybridkin.app.viewer.motions import (
     circle,
     figure_eight,
 )
+from hybridkin.app.viewer.placed import with_fitted_base
+from hybridkin.app.viewer.sliders import Scale
 from hybridkin.app.viewer.steered import RATE, SteeredRobot
 from hybridkin.app.workflow.domain import path_limits
-from hybridkin.app.workflow.model import expected_errors, has_body, is_fitted
+from hybridkin.app.workflow.model import check_columns, expected_errors, has_body, is_fitted
 from hybridkin.datasets import Log
-from hybridkin.formats import csv_table, markdown, visible
+from hybridkin.formats import METRES, csv_table, markdown, visible
 from hybridkin.plots.page_server import page_server, stop
 
 __all__ = ["LiveView", "view"]
 
-_CAMERA = np.array([0.9, -1.1, 0.4])  # from the middle, relative to the robot's size
+_ARROWS = 0.15  # length of the arrows of the target, relative to the robot's size
+_BESIDE = 0.25  # how far from robot and log obstacles are seen, relative to these
+_SHORT = 0.1  # lengths that sliders show in millimetres [m]
 _PAUSE = 0.1  # between two updates of the words [s]
 _MARGIN = 0.1  # of what is shown of half-spaces, relative to the robot's size
 
@@ -77,7 +83,8 @@ def view(
         A model with a mechanical part that can be drawn; from a file by `open_model`.
     log : Log, optional
         Measured rows to show, from `datasets.load_log` or `workflow.read_log`. A click on a row
-        moves the robot there.
+        moves the robot there. The base of a robot description is fitted to them if it is not known,
+        that is, if the description calibrates it.
     path : Trajectory, optional
         A path that a button starts, in a loop; from `trajectories`.
     q_min, q_max, dq_max, ddq_max : float or array-like of shape (n,), optional
@@ -112,7 +119,7 @@ def view(
 
     Examples
     --------
-    >>> import hybridkin
+    >>> import hybridkin.app
     >>> chain = hybridkin.robots.bionic_handling_assistant()
     >>> with hybridkin.app.view(chain, q_min=0.1, q_max=0.4) as shown:  # doctest: +SKIP
     ...     print(shown.address)
@@ -125,12 +132,16 @@ def view(
             "`model` must be a chain, or a hybrid fitted on one, so that its body can be drawn; "
             f"got a model without a mechanical part, {model.description_.name}."
         )
+    described = model
+    if log is not None:
+        check_columns(model, log.q)
+        model = with_fitted_base(model, log)
     if log is not None and not _has_range(model):
         q_min = np.where(np.isfinite(q_min), q_min, np.nanmin(log.q, axis=0))
         q_max = np.where(np.isfinite(q_max), q_max, np.nanmax(log.q, axis=0))
     limits = path_limits(model, q_min=q_min, q_max=q_max, dq_max=dq_max, ddq_max=ddq_max)
     robot = SteeredRobot(model, limits, obstacles, clearance)
-    return LiveView(robot, log, path, host, port)
+    return LiveView(robot, log, path, host, port, base_is_fitted=model is not described)
 
 
 def _has_range(model: HybridForwardModel) -> bool:
@@ -147,6 +158,8 @@ class LiveView:
         The robot that is shown.
     address : str
         Address of the page.
+    base_is_fitted : bool
+        Whether the base of a description was fitted to the log that is shown.
     ticks_per_second : float
         Rate while the robot moved, averaged over some ticks.
     """
@@ -158,22 +171,31 @@ class LiveView:
         path: trajectories.Trajectory | None,
         host: str,
         port: int,
+        *,
+        base_is_fitted: bool = False,
     ) -> None:
         try:
-            self._server = page_server(host, port, label="hybridkin")
+            self._server = page_server(
+                host, port, f"{robot.model.description_.name} - hybridkin", label="hybridkin"
+            )
         except ImportError as error:
             raise ImportError('a live view needs viser: pip install "hybridkin[view]".') from error
         self.robot = robot
-        self.ticks_per_second = 0.0
+        self.base_is_fitted = base_is_fitted
+        self.ticks_per_second = RATE
         self.address = f"http://{host}:{self._server.get_port()}"
         self._wake = Event()
         self._closed = False
         self._failure: Exception | None = None
         self._motion: Motion | None = None
         self._last_words = 0.0
-        self._draw_scene(log)
-        self._add_panel(log, path)
-        self._show()
+        try:
+            self._draw_scene(log)
+            self._add_panel(log, path)
+            self._show()
+        except BaseException:
+            stop(self._server)
+            raise
         self._thread = Thread(target=self._run, daemon=True)
         self._thread.start()
 
@@ -183,10 +205,7 @@ class LiveView:
         scene = self._server.scene
         scene.set_up_direction("+z")
         reachable = robot.domain.sample[1]
-        corners = np.vstack([reachable, np.zeros(3)])
-        middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
-        self._server.initial_camera.look_at = middle
-        self._server.initial_camera.position = middle + robot.size * _CAMERA
+        corners = np.vstack([reachable, robot.base[:3, 3]])
         margin = _MARGIN * robot.size
         ends = np.stack([corners.min(axis=0) - margin, corners.max(axis=0) + margin])
         self._obstacles = []
@@ -194,47 +213,87 @@ class LiveView:
             drag = partial(self.move_obstacle, k)
             name = f"/obstacle {k + 1}"
             self._obstacles.append(DraggedObstacle(scene, name, obstacle, ends, drag))
-        scene.add_frame("/base", axes_length=0.15 * robot.size, axes_radius=0.004 * robot.size)
-        self._body = Body(scene, robot.model, robot)
+        x, y, z, w = Rotation.from_matrix(robot.base[:3, :3]).as_quat()
+        scene.add_frame(
+            "/base",
+            axes_length=0.15 * robot.size,
+            axes_radius=0.004 * robot.size,
+            wxyz=(w, x, y, z),
+            position=robot.base[:3, 3],
+        )
+        self._body = Body(scene, robot)
         self._aim = scene.add_transform_controls(
             "/target",
-            scale=0.15 * robot.size,
+            scale=_ARROWS * robot.size,
             disable_rotations=True,
             position=robot.target,
         )
         self._aim.on_update(self._dragged)
         self._ball = scene.add_icosphere("/target/ball", 0.02 * robot.size, GREEN)
-        self._measured = scene.add_icosphere(
-            "/measured", 0.015 * robot.size, (0, 0, 0), visible=False
+        self._measured = scene.add_box(
+            "/measured", (0, 0, 0), dimensions=3 * (0.025 * robot.size,), visible=False
         )
+        above = (0.0, 0.0, 0.03 * robot.size)
+        scene.add_label("/measured/label", "measured tip", position=above)
         self._radius = scene.add_icosphere("/radius", 1.0, color=ORANGE, opacity=0.2, visible=False)
         self._switched: dict[str, Any] = {}
-        self._switched["reachable"] = scene.add_point_cloud(
+        self._switched["reachable (diamonds)"] = scene.add_point_cloud(
             "/reachable",
             reachable,
             BLUE,
-            point_size=0.007 * robot.size,
-            point_shape="circle",
+            point_size=0.005 * robot.size,
+            point_shape="diamond",
             visible=False,
         )
+        self._rows: LogCloud | None = None
         if log is not None:
             self._rows = LogCloud(scene, robot, log)
             self._switched[self._rows.name] = self._rows.dots
             if self._rows.learned is not None:
-                name = "learned error: mechanical to hybrid tip"
-                self._switched[name] = self._rows.learned
+                self._switched["learned error (lines)"] = self._rows.learned
             scene.on_click()(self._clicked)
         self._moving: list[Ghost | Balls] = []
         for name, chain in _other_models(robot.model).items():
             ghost = Ghost(scene, name, chain, robot)
             self._moving.append(ghost)
-            self._switched[name] = ghost.line
+            self._switched[f"{name} ({ghost.look})"] = ghost.line
         if robot.obstacles:
             balls = Balls(scene, robot)
             self._moving.append(balls)
             self._switched["body that keeps clear"] = balls.frame
         if self._expected() > 0.0:
-            self._switched["expected error"] = self._radius
+            self._switched["expected error (ball)"] = self._radius
+        self._seen = self._everything(reachable)
+        first_camera(self._seen).aim(self._server.initial_camera)
+        self._server.on_client_connect(self._fit)
+
+    def _everything(self, reachable: NDArray) -> NDArray:
+        """Return the points (N, 3) that the first look shows [m].
+
+        They are those of the robot with its target, and of the log, else the reachable tips; and
+        obstacles where they are near these.
+        """
+        points = [self._body.points, self._aim_ends(), reachable]
+        if self._rows is not None:
+            points[-1] = self._rows.tips
+        around = np.concatenate(points)
+        low = around.min(axis=0)
+        high = around.max(axis=0)
+        beside = _BESIDE * float((high - low).max())
+        for obstacle in self._obstacles:
+            points.append(np.clip(obstacle.points, low - beside, high + beside))
+        return np.concatenate(points)
+
+    def _aim_ends(self) -> NDArray:
+        """Return the ends (3, 3) of the arrows by which the target is dragged [m]."""
+        return self.robot.target + _ARROWS * self.robot.size * np.eye(3)
+
+    def _fit(self, client: Any) -> None:
+        """Show everything on the page of a client, until its user turns the robot."""
+        client.camera.min_orbit_distance = 1e-3 * self.robot.size
+        look = FirstLook(client, self._seen)
+        look.fit(client.camera)
+        client.camera.on_update(look.fit)
 
     def __enter__(self) -> Self:
         return self
@@ -279,6 +338,7 @@ class LiveView:
         gui = self._server.gui
         robot = self.robot
         gui.configure_theme(show_share_button=False)  # it would not be heard
+        gui.main_panel.dock_right()  # beside the robot, not over it
         self._words = gui.add_markdown("")
         self._add_sliders()
         with gui.add_folder("Show", expand_by_default=len(self._switched) > 1):
@@ -300,19 +360,30 @@ class LiveView:
         """Add a slider for every actuator, in the names and the unit of the log."""
         robot = self.robot
         log_format = robot.model.description_.log
+        unit = log_format.q_unit
         self._factor = np.broadcast_to(log_format.q_factor, robot.q.shape)
-        ends = [robot.limits.q_min / self._factor, robot.limits.q_max / self._factor]
-        low, high = np.sort(ends, axis=0)
+        limits = np.stack([robot.limits.q_min, robot.limits.q_max])
+        if unit == "m" and np.abs(limits).max() < _SHORT:
+            unit = "mm"  # three digits are short
+            self._factor = self._factor * METRES[unit]
+        low, high = np.sort(limits / self._factor, axis=0)
         start = robot.q / self._factor
         self._sliders = []
-        unit = visible(log_format.q_unit)
-        with self._server.gui.add_folder(f"Actuators [{unit}]"):
+        self._scales = []
+        with self._server.gui.add_folder(f"Actuators [{visible(unit)}]"):
             for k, name in enumerate(map(visible, log_format.q)):
-                step = max((high[k] - low[k]) / 1000.0, 1e-12)
-                end = max(high[k], low[k] + step)
-                slider = self._server.gui.add_slider(name, low[k], end, step, start[k])
-                slider.on_update(self._slid)
+                scale = Scale(float(low[k]), float(high[k]))
+                slider = self._server.gui.add_slider(
+                    name,
+                    scale.low,
+                    scale.high,
+                    scale.step,
+                    scale.shown(float(start[k])),
+                    marks=scale.marks,
+                )
+                slider.on_update(partial(self._slid, k))
                 self._sliders.append(slider)
+                self._scales.append(scale)
 
     def _button(self, name: str, motion: Callable[[], Motion | None]) -> None:
         def start(_: object) -> None:
@@ -333,8 +404,10 @@ class LiveView:
     def _clicked(self, event: Any) -> None:
         """Go to the row of the log that was clicked."""
         origin = np.array(event.ray_origin)
+        if self._rows is None or not self._rows.dots.visible:
+            return
         row = self._rows.row_at(origin, np.array(event.ray_direction))
-        if row is not None and self._rows.dots.visible:
+        if row is not None:
             q, tip = row
             self._measured.position = tip
             self._measured.visible = True
@@ -344,10 +417,11 @@ class LiveView:
         if event.client is not None:  # not one of our own
             self.follow(np.array(self._aim.position))
 
-    def _slid(self, event: Any) -> None:
+    def _slid(self, k: int, event: Any) -> None:
         if event.client is not None:
-            values = np.array([slider.value for slider in self._sliders])
-            self.go_to(values * self._factor)
+            q = self.robot.goal.copy()
+            q[k] = self._scales[k].meant(self._sliders[k].value) * self._factor[k]
+            self.go_to(q)
 
     def _download(self, event: Any) -> None:
         rows = []
@@ -427,17 +501,24 @@ class LiveView:
         at_limits = itertools.compress(names, robot.held)
         lines = [f"**{situation.words}**"]
         if np.isfinite(situation.error):
-            lines.append(f"error {1e3 * situation.error:.2f} mm")
+            lines.append(f"{1e3 * situation.error:.2f} mm from the target")
+        if self._measured.visible:
+            away = np.linalg.norm(self._measured.position - robot.x)
+            lines.append(f"measured tip (cube): {1e3 * away:.3g} mm from that of the model")
+        if robot.is_contradictory:
+            lines.append("tendons pull against each other: a real robot is compressed")
         lines += self._about_obstacles()
         lines.append("at limits: " + (", ".join(at_limits) or "none"))
-        lines.append(f"{self.ticks_per_second:.0f} ticks/s")
+        lines.append(f"{self.ticks_per_second:.0f} steps per second")
         motion = self._motion
         if motion is not None:
             lines.append(f"moving: {markdown(motion.label)}")
         self._words.content = "<br>".join(lines)
-        for slider, value in zip(self._sliders, robot.q / self._factor, strict=True):
-            if abs(slider.value - value) > 0.5 * slider.step:
-                slider.value = float(np.clip(value, slider.min, slider.max))
+        values = robot.q / self._factor
+        for slider, scale, value in zip(self._sliders, self._scales, values, strict=True):
+            shown = scale.shown(float(value))
+            if slider.value != shown:
+                slider.value = shown
 
     def _about_obstacles(self) -> list[str]:
         """Return how far the nearest obstacle is, in words; nothing without obstacles."""

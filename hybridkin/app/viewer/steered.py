@@ -9,6 +9,7 @@ from threading import Lock
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike, NDArray
 
 from hybridkin import HybridForwardModel, IKStatus, InverseKinematics, obstacles
@@ -68,8 +69,10 @@ class SteeredRobot:
         Motion of the actuators, in the unit of the model.
     x, target : ndarray of shape (3,)
         Tip and target [m].
+    base : ndarray of shape (4, 4)
+        Pose of the base, its position in metres.
     size : float
-        Largest extent of the reachable space [m].
+        Largest extent of the reachable space with the base [m].
     obstacles : tuple of Obstacle
         The obstacles where they are now.
     """
@@ -91,7 +94,8 @@ class SteeredRobot:
         self.x = tips_at(model, self.q[None])[0]
         self.target = self.x
         tips = self.domain.sample[1]
-        self.size = float(np.ptp(np.vstack([tips, np.zeros(3)]), axis=0).max())
+        self.base = model.module_.robot.base.numpy(force=True)
+        self.size = float(np.ptp(np.vstack([tips, self.base[:3, 3]]), axis=0).max())
         self._close = _CLOSE * self.size
         self._largest_step = speed / RATE
         self._ik = InverseKinematics(
@@ -171,6 +175,12 @@ class SteeredRobot:
             return True
 
     @property
+    def goal(self) -> NDArray[np.float64]:
+        """Where the actuators move (n,) [unit of q]: where they are, unless set by hand."""
+        with self._lock:
+            return self._goal if self._by_hand else self.q
+
+    @property
     def situation(self) -> Situation:
         """What there is to say about robot and target."""
         with self._lock:
@@ -196,6 +206,12 @@ class SteeredRobot:
             if not inside:
                 words += ", outside the domain of the model"
             return Situation(f"{words}.", reached, out_of_reach, inside, error)
+
+    @property
+    def is_contradictory(self) -> bool:
+        """Whether tendons pull against each other, so that the model's shape is not a robot's."""
+        q = torch.from_numpy(self.q)[None]
+        return bool(self.model.module_.robot.contradictions(q))
 
     @property
     def distances(self) -> NDArray[np.float64]:

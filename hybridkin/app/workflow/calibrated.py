@@ -190,7 +190,7 @@ class Calibration:
             entries.append(parameter.checked(others))
         return cls(
             rmse=result.rmse,
-            unidentified=result.unidentified,
+            unidentified=[q_unit.named_in(text) for text in result.unidentified],
             warnings=warnings,
             entries=entries,
         )

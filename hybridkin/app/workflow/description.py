@@ -19,11 +19,12 @@ from hybridkin.app.workflow.model import (
     widths_in_log,
 )
 from hybridkin.app.workflow.report import Report, listed
-from hybridkin.formats import visible
+from hybridkin.formats import LogUnit, visible
 
 if TYPE_CHECKING:
     from hybridkin import HybridForwardModel
 
+_RANGE = "training range of q"  # of a notebook; here it follows in the unit of the logs
 _NAMES = 24  # width of the names of rows
 _NOTES = ("log", "rows", "n_whole", "n_motions", "saved", "chosen")
 _PER_TIME = {"dq_max": "/s", "ddq_max": "/s^2"}
@@ -158,9 +159,11 @@ def _report(
     record: Description, rows: Mapping[str, object], hysteresis: str
 ) -> Report[Description]:
     """Return a record with its words; `rows` are those of a notebook."""
-    title = f"{record.name}: {record.kind}, {record.n_actuators} actuators"
+    what = "fitted model" if np.isfinite(record.domain.q_min).all() else "mechanical model"
+    title = f"{record.name}: {what}, {record.n_actuators} actuators"
     report = Report(title, record)
-    report.verbatim(_in_lines(rows))
+    shown = {name: value for name, value in rows.items() if name != _RANGE}
+    report.verbatim(_in_lines(shown, LogUnit.of(record.log_format.q_unit)))
     if hysteresis:
         report.text(hysteresis)
     log = record.log_format
@@ -185,13 +188,13 @@ def _report(
     return report
 
 
-def _in_lines(rows: Mapping[str, object]) -> str:
-    """Return names and values, one in a line; parts are indented."""
+def _in_lines(rows: Mapping[str, object], unit: LogUnit) -> str:
+    """Return names and values, one in a line; parts are indented. `unit` is that of q."""
     lines = []
     for name, value in rows.items():
-        name = visible(name)
+        name = visible(unit.named_in(name))
         if isinstance(value, Mapping):
-            lines += [f"{name}:", textwrap.indent(_in_lines(value), "  ")]
+            lines += [f"{name}:", textwrap.indent(_in_lines(value, unit), "  ")]
         elif value is not None:
             text = str(value)
             if isinstance(value, tuple):

@@ -20,6 +20,8 @@ _TITLES = {
     "fmu": "Functional mock-up unit",
     "mex": "MATLAB and Octave",
 }
+# How an entry of q is written, and the number of the first one.
+_ENTRIES = {"c": ("q[{}]", 0), "fmu": ("q[{}]", 1), "mex": ("q({})", 1)}
 
 
 def export_model(
@@ -87,7 +89,7 @@ def export_model(
             f"The body keeps {millimetres(clearance)} clear of {{names}}.",
             names=", ".join(surroundings.names),
         )
-    about_q = _about_q(model)
+    about_q = _about_q(model, _ENTRIES[kind])
     report.text("{about_q}", about_q=about_q)
     words = {"name": name, "about_q": about_q}
     if kind == "fmu":
@@ -99,13 +101,18 @@ def export_model(
     return report
 
 
-def _about_q(model: HybridForwardModel) -> str:
-    """Return unit, sign and hysteresis of q in sentences, as a controller must know them."""
+def _about_q(model: HybridForwardModel, entry: tuple[str, int]) -> str:
+    """Return unit, sign and hysteresis of q in sentences, as a controller must know them.
+
+    `entry` is how its language names an entry of q, and the number of the first one.
+    """
+    form, first = entry
     log = model.description_.log
     factors = np.broadcast_to(log.q_factor, len(log.q))
     terms = []
     for i, name in enumerate(log.q):
-        terms.append(f"q[{i}] = {factors[i]:g} * {name}")
+        factor = "" if factors[i] == 1.0 else f"{factors[i]:g} * "
+        terms.append(f"{form.format(first + i)} = {factor}{name}")
     unit = "" if log.q_unit == "1" else f" in {log.q_unit}"
     about_q = f"q from the columns of the log{unit}: {', '.join(terms)}."
     if not model.hysteresis_:

@@ -80,8 +80,10 @@ def animate_track(
         n_frames=n_frames,
         obstacles=obstacles,
     )
+    title = f"{model.description_.name}: {Path(path).name} - hybridkin"
+    options = {"unit": unit, "speed": speed, "title": title}
     try:
-        film.save(out, unit=unit, speed=speed, progress=partial(progress, "drawing frames"))
+        film.save(out, **options, progress=partial(progress, "drawing frames"))
     except RuntimeError as error:  # no program to write films with
         raise ValueError(str(error)) from error
     fps = speed * film.fps

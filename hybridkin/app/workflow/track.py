@@ -142,8 +142,8 @@ def _write(report: Report[TrackRecord], model: HybridForwardModel, better: str) 
     report.text(
         f"In the model, {record.reached} of {record.n} points are reached. Error of the solver: "
         f"mean {millimetres(errors.mean)}, 95 % quantile {millimetres(errors.p95)}, max "
-        f"{millimetres(errors.max)}. Limits: {record.limits.source}. Backend: {{backend}}.",
-        backend=record.backend,
+        f"{millimetres(errors.max)}. Limits: {record.limits.source}. Computed by {{backend}}.",
+        backend=_backend_in_words(record.backend),
     )
     rows = [[status, str(count)] for status, count in record.statuses.items()]
     report.table(["status", "points"], rows)
@@ -170,6 +170,14 @@ def _write(report: Report[TrackRecord], model: HybridForwardModel, better: str) 
     report.text(*_about_counts(record, Counts.read(model.description_.training)))
     add_distances(report, record.obstacles, record.clearance, record.blocked)
     report.text(_outcome(record, better))
+
+
+def _backend_in_words(backend: str) -> str:
+    """Return what computed the steps."""
+    name, colon, reason = backend.partition(": ")
+    if name == "compiled":
+        return "the compiled core"
+    return f"PyTorch{colon}{reason}"
 
 
 def _about_counts(record: TrackRecord, counts: Counts) -> list[str]:
@@ -684,10 +692,10 @@ def _add_commands(
     display = hybridkin.plots.ActuatorDisplay(
         commands, counts, t, names=log_format.q, limits=np.stack([low, high])
     )
-    display.plot(axes[:, 0], unit=log_format.q_unit, per_unit=log_format.q_factor)
     caption = "Commands and their limits, with the names, unit and sign of the robot's logs."
     if n_lead:
         for ax in axes[:, 0]:
-            ax.axvline(t[n_lead], color="0.6", linewidth=1.0)
+            ax.axvline(t[n_lead], color="0.6", linewidth=1.0, label="start of the path")
         caption += " The path begins at the grey line."
+    display.plot(axes[:, 0], unit=log_format.q_unit, per_unit=log_format.q_factor)
     report.figure("commands", figure, caption)

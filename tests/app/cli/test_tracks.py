@@ -332,6 +332,10 @@ def test_code_and_trackers_tell_unit_sign_and_backlash_of_q(playful, tmp_path, c
         assert f"log in mm: q[0] = -0.001 * {COLUMNS[0]}, q[1] = -0.001 * {COLUMNS[1]}" in text
         assert "have backlash of 0.4 mm: x(q)" in " ".join(text.split())
     assert "what the actuators do" in (out / "robot.h").read_text()
+    matlab = tmp_path / "matlab"
+    assert run(capsys, "export", playful, "--mex", "--out", matlab, "--name", "robot")[0] == 0
+    text = " ".join((matlab / "robot.m").read_text().replace("%", " ").split())
+    assert f"q(1) = -0.001 * {COLUMNS[0]}, q(2) = -0.001 * {COLUMNS[1]}" in text
     model = load_model(playful / "model.safetensors")
     ik = hybridkin.InverseKinematics(model, q_min=-0.005, q_max=0.005)
     tracker = ik.tracker(np.zeros(6))

@@ -2,22 +2,27 @@
 
 import builtins
 import time
+import warnings
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 
 import hybridkin
 from hybridkin import (
+    ConstantCurvatureChain,
     ELMRegressor,
     HybridForwardModel,
     datasets,
     obstacles,
+    open_model,
     robots,
     trajectories,
 )
 from hybridkin.app.cli.main import main
 from hybridkin.app.viewer.motions import Loop
+from hybridkin.plots.page_server import Camera
 
 pytest.importorskip("viser", reason='needs viser: pip install "hybridkin[view]"')
 
@@ -57,7 +62,7 @@ def test_the_tip_follows_the_target_and_the_page_says_so(shown):
     assert np.linalg.norm(shown.robot.x - target) < 1e-3
     assert shown._aim.position == pytest.approx(target)
     sliders = np.array([slider.value for slider in shown._sliders])
-    assert sliders == pytest.approx(shown.robot.q, abs=5e-4)
+    assert sliders == pytest.approx(shown.robot.q, abs=0.6 * shown._scales[0].step)
     assert shown._body._backbone.points[-1] == pytest.approx(shown.robot.x, abs=0.01)
 
 
@@ -174,3 +179,99 @@ def test_obstacles_are_drawn_moved_and_named():
         points, radii = shown.robot.balls
         until(lambda: nodes[f"/balls/{len(radii)}"].position == pytest.approx(points[-1], abs=0.01))
         assert nodes["/balls/1"].radius == pytest.approx(radii[0])
+
+
+def tendon_log():
+    """Return a tendon chain, and a log whose measuring frame is turned and far from its base."""
+    chain = ConstantCurvatureChain([0.008, 0.007], lengths=[0.08, 0.07], routing="base")
+    q = np.random.default_rng(0).uniform(-0.004, 0.004, (80, 2, 3))
+    q = (q - q.mean(axis=2, keepdims=True)).reshape(80, 6)
+    base = np.eye(4)
+    base[:3, :3] = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    base[:3, 3] = [1.2, -0.4, 0.7]
+    moved = chain.with_geometry(base=torch.from_numpy(base))
+    with torch.no_grad():
+        x = moved(torch.from_numpy(q)).numpy()
+    return chain, base, datasets.Log(q, x)
+
+
+ROBOT = """
+calibrate = {calibrate}
+[[segment]]
+radius = 0.008
+length = 0.08
+[[segment]]
+radius = 0.007
+length = 0.07
+"""
+
+
+@pytest.mark.parametrize(("calibrate", "is_fitted"), [('["base"]', True), ('["radii"]', False)])
+def test_a_base_that_is_not_known_is_fitted_before_it_is_drawn(tmp_path, calibrate, is_fitted):
+    _, base, log = tendon_log()
+    path = tmp_path / "robot.toml"
+    path.write_text('routing = "base"' + ROBOT.format(calibrate=calibrate))
+    with hybridkin.app.view(open_model(path), log, port=9360) as shown:
+        assert shown.base_is_fitted == is_fitted
+        expected = base if is_fitted else np.eye(4)
+        np.testing.assert_allclose(shown.robot.base, expected, atol=1e-6)
+        np.testing.assert_allclose(shown._body.points[0], expected[:3, 3], atol=1e-6)
+        assert shown.robot.size < 0.5 or not is_fitted  # whatever the frame of the log is
+
+
+def test_the_base_of_a_chain_is_known():
+    chain, _, log = tendon_log()
+    with hybridkin.app.view(chain, log, port=9361) as shown:
+        np.testing.assert_array_equal(shown.robot.base, np.eye(4))
+
+
+def test_tendons_that_pull_against_each_other_are_told_on_the_page_alone():
+    chain, _, log = tendon_log()
+    model = HybridForwardModel(chain, "quadratic", coupling="serial", calibrate=("base",))
+    model.fit(log.q, log.x)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        with hybridkin.app.view(model, log, q_min=-0.006, q_max=0.006, port=9362) as shown:
+            assert "against each other" not in shown._words.content
+            shown.go_to(np.array([0.005, 0.005, 0.005, 0.0, 0.0, 0.0]))
+            until(lambda: "tendons pull against each other" in shown._words.content)
+    assert caught == []
+
+
+def test_a_log_of_another_robot_is_refused_in_words_of_the_user(fitted):
+    model, log = fitted
+    few = datasets.Log(log.q[:, :2], log.x)
+    for shown in (model, robots.bionic_handling_assistant()):
+        with pytest.raises(ValueError, match="`q` must name 9 columns, one for each actuator"):
+            hybridkin.app.view(shown, few, port=9363)
+
+
+@pytest.mark.parametrize("size", [0.005, 0.3, 20.0])
+def test_the_first_look_has_every_point_whatever_the_size(size):
+    lengths = 3 * [size / 3.0]
+    chain = ConstantCurvatureChain(3 * [0.02 * size], lengths=lengths, routing="base")
+    log = datasets.Log(
+        np.random.default_rng(0).uniform(-0.01 * size, 0.01 * size, (50, 9)),
+        size * np.random.default_rng(1).uniform(-1.0, 2.0, (50, 3)),
+    )
+    with hybridkin.app.view(chain, log, port=9364) as shown:
+        eye = shown._server.initial_camera
+        camera = Camera(eye.position, eye.look_at)
+        on_page = camera.on_page(np.concatenate([log.x, shown._body.points]))
+        assert np.abs(on_page).max() == pytest.approx(0.9)
+        depths = (log.x - camera.position) @ camera.axes[2]
+        assert eye.near < depths.min()
+        assert depths.max() < eye.far
+
+
+def test_a_slider_moves_one_actuator_and_reaches_its_limits(shown):
+    shown.go_to(shown.robot.domain.preferred + 1.3e-4)
+    until(lambda: shown.robot._resting)
+    before = shown.robot.q.copy()
+    slider = shown._sliders[2]
+    slider.value = slider.max
+    shown._slid(2, SimpleNamespace(client=object()))
+    until(lambda: shown.robot._resting)
+    moved = np.flatnonzero(shown.robot.q != before)
+    np.testing.assert_array_equal(moved, [2])
+    assert shown.robot.q[2] == shown.robot.limits.q_max[2]
