@@ -198,7 +198,6 @@ class Calibration:
     def write(self, report: Report) -> None:
         """Add the calibration, and what the log does not identify, to a report."""
         report.text(
-            "## Calibration on all motions",
             f"Root mean square tip error {millimetres(self.rmse, '.2f')} (training rows). Standard "
             "errors assume independent rows and are too small for rows close in time. A parameter "
             f"is identified if the data narrow its prior at least {IDENTIFIED:.0f} times, and if "

@@ -194,15 +194,34 @@ def write_model(report: Report[FitRecord]) -> None:
     if record.tried:
         _write_tried(report, record)
     if record.calibration is not None:
+        report.text("## Calibration on all motions", whose_values(record.calibrated, record.auto))
         record.calibration.write(report)
+
+
+def whose_values(calibrated: str, auto: Mapping[str, Any] | None) -> str:
+    """Return which model has the calibrated values of the report, in words.
+
+    Parameters
+    ----------
+    calibrated : str
+        The set of parameters of the calibrated model.
+    auto : dict or None
+        The choices of "auto", see ``HybridForwardModel.cv_results_``.
+    """
+    words = f'These are the values of the row "{CALIBRATED}".'
+    chooses = auto is not None and len(auto["mechanical_model"]) > 1
+    if chooses and auto["parameters"] != calibrated:
+        words += f" The saved model has other ones: it calibrates {auto['parameters']}."
+    return words
 
 
 def _write_tried(report: Report, record: FitRecord) -> None:
     """Add the sets of parameters that were tried."""
     report.text(
         "## What is calibrated",
-        f"Calibrated: **{record.calibrated}**. The table has mean tip errors in mm: on held-out "
-        "motions, and outside, on the outer 35 % of the rows after a fit to the inner 40 %. "
+        f'Calibrated in the row "{CALIBRATED}": **{record.calibrated}**. The table has mean tip '
+        "errors in mm: on held-out motions, and outside, on the outer 35 % of the rows after a fit "
+        "to the inner 40 %. "
         "Sets with more than 1.1 times the least held-out error are excluded. The score of the "
         "others is the held-out error times the square of the error outside. Of the sets with "
         "nearly the least score, the one with the fewest parameters is calibrated.",

@@ -39,6 +39,7 @@ def test_fit_compares_models_saves_auto_and_prints_its_report(fitted):
     for sentence in record["words"]:
         assert sentence in printed
         assert sentence in text
+    assert 'These are the values of the row "mechanical, calibrated".\n' in text
     assert f"hybrid, auto | {1e3 * held_out['hybrid, auto']:.2f}" in printed
     assert str(fitted / "model" / "model.safetensors") in printed
     assert "120 rows, 8 motions, 6 actuators" in (fitted / "err").read_text()

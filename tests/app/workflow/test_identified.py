@@ -1,4 +1,4 @@
-"""Whether a report calls a value identified that other, equally good sets contradict."""
+"""Which values a report gives, and whether it calls them identified where others contradict."""
 
 import numpy as np
 import pytest
@@ -6,6 +6,7 @@ import pytest
 from hybridkin import datasets, robots
 from hybridkin.app.workflow.calibrated import calibrated_parameters
 from hybridkin.app.workflow.compare import mechanical_of
+from hybridkin.app.workflow.fit_record import whose_values
 from hybridkin.app.workflow.log import checked
 
 
@@ -37,3 +38,14 @@ def test_a_tilt_that_other_sets_contradict_is_not_identified():
     assert alone["base[rot y]"].identified
     assert not shown["base[rot y]"].identified
     assert all(shown[f"radii[{k}]"].identified for k in range(3))
+
+
+def test_a_report_says_where_the_saved_model_has_other_values():
+    auto = {"parameters": "radii + base", "mechanical_model": {"base": {}, "radii + base": {}}}
+    of_row = 'These are the values of the row "mechanical, calibrated".'
+    assert whose_values("radii + base", auto) == of_row
+    assert whose_values("radii", None) == of_row
+    one_set = auto | {"mechanical_model": {"radii + base": {}}}
+    assert whose_values("radii", one_set) == of_row
+    words = whose_values("radii + rest_bends + base", auto)
+    assert words == f"{of_row} The saved model has other ones: it calibrates radii + base."
