@@ -79,7 +79,8 @@ def write_identifiability(report: Report, data: Bunch, found: dict[str, Any]) ->
         f"moves alone, and {found['n_random']} rows are fully random. A parameter is identified if "
         f"the rows narrow its prior at least {IDENTIFIED:.0f} times. This holds for {n} of "
         f"{len(asked['entries'])} parameters; the others stay near the published geometry. The "
-        "base is given by its rotation from the start and its position.",
+        'base is given by its rotation from the start and its position. "Not alone": it takes part '
+        "in a direction below that is not identified.",
     )
     write_parameters(report, asked["entries"])
     report.text("Not identified by the data, and the measurement that would identify it:")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import NamedTuple
 
@@ -27,6 +28,13 @@ _STEPS = {"m": 1e-3, "rad": np.pi / 180.0, "-": 0.01, "q": 1.0}
 _STEP_NAMES = {"m": "mm", "rad": "deg", "-": "%", "q": "of q"}
 
 
+class Unidentified(NamedTuple):
+    """A direction that the data do not identify: a sentence, and the parameters that it names."""
+
+    sentence: str
+    labels: tuple[str, ...]
+
+
 class _Term(NamedTuple):
     """A part of a direction: one free direction, or all of a parameter that change equally."""
 
@@ -35,9 +43,12 @@ class _Term(NamedTuple):
     place: int  # of its (first) free direction
     name: str  # of the parameter
     leads: bool  # whether it is named first
+    labels: tuple[str, ...]  # of all free directions
 
 
-def sentences(fit: Fit, directions: NDArray, covariance: NDArray, n_rows: float) -> tuple[str, ...]:
+def in_sentences(
+    fit: Fit, directions: NDArray, covariance: NDArray, n_rows: float
+) -> list[Unidentified]:
     """Return a sentence for each direction that hardly moves the tips, in few parameters.
 
     `directions` (K, P) are orthonormal changes in units of the prior; `covariance` (P, P) is that
@@ -48,7 +59,7 @@ def sentences(fit: Fit, directions: NDArray, covariance: NDArray, n_rows: float)
     steps = np.array([_STEPS[kind] for kind in problem.kinds])
     to_steps = problem.prior_std * units / steps
     columns = 1e3 * fit.jacobian * problem.prior_std / np.sqrt(n_rows)  # [mm] of tip
-    texts = []
+    described = []
     for direction in few_terms(directions):
         # The first parameter with a fair part is named first and changes by one step.
         lead = leading_part(np.abs(direction))
@@ -67,8 +78,10 @@ def sentences(fit: Fit, directions: NDArray, covariance: NDArray, n_rows: float)
         for term in terms:
             n_hidden += bool(term not in shown and noticed[term.place])
         advice = _advice(fit, covariance, shown)
-        texts.append(f"{_in_words(problem, shown, n_hidden)} {effect}: {advice}")
-    return tuple(texts)
+        sentence = f"{_in_words(problem, shown, n_hidden)} {effect}: {advice}"
+        labels = itertools.chain.from_iterable(term.labels for term in shown)
+        described.append(Unidentified(sentence, tuple(labels)))
+    return described
 
 
 def _in_words(problem: Problem, terms: list[_Term], n_hidden: int) -> str:
@@ -160,9 +173,10 @@ def _terms(problem: Problem, change: NDArray, lead: int) -> list[_Term]:
         if part.size > 1 and np.ptp(sizes) < _ALIKE * np.abs(sizes).max():
             leads = first <= lead < place.stop
             label = f"all {part.name}"
-            terms.append(_Term(label, sizes[0], first, part.name, leads))
+            labels = tuple(part.labels)
+            terms.append(_Term(label, sizes[0], first, part.name, leads, labels))
             continue
         for k, label in enumerate(part.labels):
             leads = first + k == lead
-            terms.append(_Term(label, sizes[k], first + k, part.name, leads))
+            terms.append(_Term(label, sizes[k], first + k, part.name, leads, (label,)))
     return sorted(terms, key=lambda term: (not term.leads, -abs(term.size), term))

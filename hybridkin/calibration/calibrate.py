@@ -27,7 +27,7 @@ from hybridkin._core.portable import Portable
 from hybridkin.calibration._least_squares import HELD_OUT, LOSSES, REFITTED, Fit, TipRows, solve
 from hybridkin.calibration._search import NO_START, Start, search
 from hybridkin.calibration._touches import DISTANCE_STD, Touches
-from hybridkin.calibration._unidentified import sentences
+from hybridkin.calibration._unidentified import in_sentences
 from hybridkin.calibration.measured import evenly_spaced, with_missing_markers
 from hybridkin.calibration.natural_scales import GEOMETRY
 from hybridkin.chains.chain import Chain
@@ -76,6 +76,8 @@ class CalibrationResult(Portable):
         Directions below 10 are not identified by the data.
     unidentified : tuple of str
         One sentence with advice for each direction that is not identified by the data.
+    together : tuple of str
+        Those of `names` that take part in such a direction: the data identify them only together.
     unphysical : tuple of str
         Parameters, e.g. "lengths", with a value at a bound or outside the physical range. They
         compensate for effects that the model does not describe, even if they are identified.
@@ -103,6 +105,7 @@ class CalibrationResult(Portable):
     identifiable: dict[str, NDArray]
     singular_values: NDArray
     unidentified: tuple[str, ...]
+    together: tuple[str, ...]
     unphysical: tuple[str, ...]
     rmse: float
     cv_rmse: float | None
@@ -441,8 +444,9 @@ def _result(
         identifiable[part.name] = identified[place].reshape(part.shape)
         values[part.name] = value if returns_tensors else value.numpy()
         std_errors[part.name] = torch.from_numpy(errors) if returns_tensors else errors
-    unidentified = directions[narrowed * _IDENTIFIED < 1.0]
     n_rows = float(fit.rows.weights.sum())
+    unidentified = in_sentences(fit, directions[narrowed * _IDENTIFIED < 1.0], covariance, n_rows)
+    together = {label for direction in unidentified for label in direction.labels}
     size_error = float(np.linalg.norm(fit.slopes.growth @ factor))
     point_errors = fit.slopes.std_of_unknowns(factor)
     safe = np.where(std > 0, std, 1.0)
@@ -457,8 +461,9 @@ def _result(
         singular_values=narrowed,
         unidentified=(
             *touches.size_sentences(size_error),
-            *sentences(fit, unidentified, covariance, n_rows),
+            *(direction.sentence for direction in unidentified),
         ),
+        together=tuple(label for label in problem.labels if label in together),
         unphysical=unphysical,
         rmse=fit.rmse,
         cv_rmse=cv_rmse,

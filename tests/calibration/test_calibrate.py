@@ -129,6 +129,7 @@ def test_planted_geometry_is_recovered_from_exact_data(case, rng):
         assert_close(value, truth.geometry()[name], rtol=0, atol=1e-9, msg=name)
     assert all(result.identifiable[name].all() for name in names)
     assert result.unidentified == ()
+    assert result.together == ()
     for name, value in start.geometry().items():
         assert_close(value, before[name], rtol=0, atol=0)
 
@@ -145,6 +146,10 @@ def test_of_four_zeros_what_no_arc_sees_stays_with_the_prior(lengths, rng):
     assert_close(result.chain.radii, truth.radii, rtol=0, atol=1e-9)
     assert_close(result.chain.arc_offset, truth.arc_offset, rtol=0, atol=1e-9)
     assert len(result.unidentified) == (2 if lengths is None else 4)
+    assert {f"actuator_zeros[{k}]" for k in range(8)} >= {*result.together} != set()
+    for name in result.names:
+        named = any(name in sentence for sentence in result.unidentified)
+        assert (name in result.together) == named
     for sentence in result.unidentified:  # each about one segment alone, and its actuators
         indices = {int(index) for index in re.findall(r"\[(\d)\]", sentence)}
         assert indices

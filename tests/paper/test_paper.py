@@ -58,7 +58,9 @@ def test_the_command_writes_everything_or_nothing(tmp_path, capsys):
     assert re.search(r"In 1500 rows one .* moves alone, and 400 rows are fully random", plain)
     assert len(found["asked"]["entries"]) == 28
     for entry in found["asked"]["entries"]:
-        answer = "yes" if entry["identified"] else "no"
+        answer = "no"
+        if entry["identified"]:
+            answer = "yes" if entry["alone"] else "not alone"
         assert re.search(rf"{re.escape(entry['name'])} .* {answer}[ |]*\n", printed)
         assert f"| {entry['name']} [{entry['unit']}] | " in re.sub(" +", " ", report)
     for sentence in found["asked"]["unidentified"]:

@@ -49,6 +49,8 @@ class CalibratedParameter:
         Whether this parameter and the others of its kind have possible values.
     identified : bool
         Whether the data determine it.
+    alone : bool
+        Whether they do so without the value of another parameter.
     """
 
     name: str
@@ -59,6 +61,16 @@ class CalibratedParameter:
     narrowing: float
     physical: bool
     identified: bool
+    alone: bool
+
+    @property
+    def answer(self) -> str:
+        """Whether the data determine it, in words."""
+        if not self.physical:
+            return "not physical"
+        if not self.identified:
+            return "no"
+        return "yes" if self.alone else "not alone"
 
     def digits(self, number: float) -> str:
         """Return a number in the unit of the parameter, to what a ruler or a gauge resolves."""
@@ -109,6 +121,7 @@ def calibrated_parameters(
                     narrowing=narrowing,
                     physical=physical,
                     identified=physical and narrowing >= IDENTIFIED,
+                    alone=label not in result.together,
                 )
             )
     return parameters
@@ -151,7 +164,6 @@ def write_parameters(report: Report, parameters: Sequence[CalibratedParameter]) 
     """Add a table of calibrated parameters to a report."""
     rows = []
     for parameter in parameters:
-        identified = "yes" if parameter.identified else "no"
         rows.append(
             [
                 f"{parameter.name} [{parameter.unit}]",
@@ -159,7 +171,7 @@ def write_parameters(report: Report, parameters: Sequence[CalibratedParameter]) 
                 parameter.digits(parameter.value),
                 parameter.digits(parameter.std_error),
                 f"{parameter.narrowing:.3g}",
-                identified if parameter.physical else "not physical",
+                parameter.answer,
             ]
         )
     header = "parameter,start,calibrated,standard error,prior narrowed by,identified"
@@ -202,7 +214,8 @@ class Calibration:
             "errors assume independent rows and are too small for rows close in time. A parameter "
             f"is identified if the data narrow its prior at least {IDENTIFIED:.0f} times, and if "
             "sets of parameters with nearly the same errors give values that differ by less than a "
-            'tenth of the prior; other values are assumptions. "Not physical": this parameter, or '
+            'tenth of the prior; other values are assumptions. "Not alone": it takes part in a '
+            'direction below that the log does not identify. "Not physical": this parameter, or '
             "another of its kind, has an impossible value, because it compensates an effect that "
             "the model does not describe. The base is given by its rotation from the start and its "
             "position.",

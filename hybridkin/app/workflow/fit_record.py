@@ -209,8 +209,9 @@ def whose_values(calibrated: str, auto: Mapping[str, Any] | None) -> str:
         The choices of "auto", see ``HybridForwardModel.cv_results_``.
     """
     words = f'These are the values of the row "{CALIBRATED}".'
-    chooses = auto is not None and len(auto["mechanical_model"]) > 1
-    if chooses and auto["parameters"] != calibrated:
+    if auto is None or len(auto["mechanical_model"]) < 2:  # the saved model chose no set
+        return words
+    if auto["parameters"] != calibrated:
         words += f" The saved model has other ones: it calibrates {auto['parameters']}."
     return words
 

@@ -3,11 +3,13 @@
 import numpy as np
 import pytest
 
-from hybridkin import datasets, robots
-from hybridkin.app.workflow.calibrated import calibrated_parameters
+from hybridkin import calibrate, datasets, robots
+from hybridkin.app.workflow.calibrated import Calibration, calibrated_parameters
 from hybridkin.app.workflow.compare import mechanical_of
 from hybridkin.app.workflow.fit_record import whose_values
 from hybridkin.app.workflow.log import checked
+from hybridkin.app.workflow.report import Report
+from hybridkin.formats import LogUnit
 
 
 def measured(q, x, motions):
@@ -38,6 +40,24 @@ def test_a_tilt_that_other_sets_contradict_is_not_identified():
     assert alone["base[rot y]"].identified
     assert not shown["base[rot y]"].identified
     assert all(shown[f"radii[{k}]"].identified for k in range(3))
+
+
+def test_what_the_log_identifies_only_together_is_not_alone():
+    """Rest bends that cancel, with a turn of the base, hardly move the tips of the trunk."""
+    data = datasets.load_trunk()
+    rows = np.flatnonzero(data.part == 3)[:240]
+    start = robots.bionic_handling_assistant()
+    result = calibrate(start, data.q[rows], data.x[rows], ("radii", "rest_bends", "base"))
+    calibration = Calibration.of(start, result, LogUnit.of("mm"))
+    answers = {entry.name: entry.answer for entry in calibration.entries}
+    assert [answers[f"radii[{k}]"] for k in range(3)] == ["yes"] * 3
+    assert answers["base[rot z]"] == "yes"
+    named = [name for name in answers if any(name in text for text in result.unidentified)]
+    assert {"rest_bends[0, x]", "base[rot y]"} < {*named}
+    assert {answers[name] for name in named} == {"not alone"}
+    report = Report("", {})
+    calibration.write(report)
+    assert report.plain().count("|  not alone |") == len(named)
 
 
 def test_a_report_says_where_the_saved_model_has_other_values():
