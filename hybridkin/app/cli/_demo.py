@@ -52,6 +52,7 @@ def summary(out: Path, records: dict[str, Any]) -> Report[dict[str, Any]]:
     """Return what the steps have shown, from their records by the name of the command."""
     fit: FitRecord = records["fit"]
     track: TrackRecord = records["track"]
+    expected = track.expected["mean"]
     calibrated = fit.held_out[_SHOWN[1]].mean
     saved = fit.held_out[fit.saved].mean
     report = hybridkin.app.workflow.Report("From a log to a film, on SIMULATED data", records)
@@ -70,8 +71,8 @@ def summary(out: Path, records: dict[str, Any]) -> Report[dict[str, Any]]:
         "Nominal: geometry as described, pose of the base fitted. Calibrated: geometry fitted. "
         "Quadratic: a polynomial of the data, no mechanics. Hybrid: the calibrated model and a "
         f"learned correction, with {calibrated / saved:.1f} times less mean error.",
-        f"Track: by the model the tip reaches {track.reached} of {track.n} points. A robot "
-        f"misses them by about the held-out error, {1e3 * saved:.1f} mm on average.",
+        f"Track: by the model the tip reaches {track.reached} of {track.n} points. Expect "
+        f"{1e3 * expected:.2g} mm of the robot on this path.",
         f"Look at {out}/track.gif, {out}/model/report.md and {out}/robot.toml.",
         "Take the tip and pull, in the browser:\n"
         f"$ hybridkin view {shlex.quote((out / 'model').as_posix())} "

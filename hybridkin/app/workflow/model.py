@@ -145,12 +145,12 @@ def promised_errors(model: HybridForwardModel, q: NDArray) -> ExpectedErrors:
 
 
 def expected_errors(model: HybridForwardModel, q: NDArray) -> dict[str, NDArray]:
-    """Return by name the errors (N,) [m] to expect of the robot where the actuators do q."""
+    """Return by name the errors (N,) [m] to expect of the robot on a path of motions q (N, n)."""
     expected = {}
     promised = promised_errors(model, q)
     if promised.known:
-        expected["held-out motions, mean"] = promised.mean
-        expected["held-out motions, 95 %"] = promised.p95
+        expected["expected on this path"] = promised.mean
+        expected["95 % below, on this path"] = promised.p95
     radius = model.radius_
     if radius is not None:
         name = f"estimated error radius, {100 * radius.coverage:g} %"

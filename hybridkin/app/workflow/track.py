@@ -218,10 +218,10 @@ def _outcome(record: TrackRecord, better: str) -> str:
         return f"{words}. {unknown}{better}."
     mean = millimetres(record.expected["mean"], ".2g")
     p95 = millimetres(record.expected["p95"], ".2g")
-    words += f". Expect {mean} (95 % below {p95}) of the robot"
+    words += f". Expect {mean} (95 % below {p95}) of the robot on this path"
     if record.in_domain == 1.0 and not record.missed:
-        return f"{words} inside the log."
-    words += " over all points"
+        return f"{words}."
+    words += ", over all points"
     if record.expected_inside:
         inside = millimetres(record.expected_inside["mean"], ".2g")
         words += f", {inside} at those reached inside the log"

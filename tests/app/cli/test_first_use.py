@@ -229,7 +229,9 @@ def test_demo_goes_from_a_log_to_a_film(tmp_path, capsys, monkeypatch):
     assert 0.001 < training < saved < calibrated < nominal < 0.1
     words = " ".join(lines)
     assert f"with {calibrated / saved:.1f} times less mean error" in words
-    assert f"held-out error, {1e3 * saved:.1f} mm on average" in words
+    expected = json.loads((out / "track" / "report.json").read_text())["expected"]["mean"]
+    assert f"Expect {1e3 * expected:.2g} mm of the robot on this path." in words
+    assert f"Expect {1e3 * expected:.2g} mm (95 %" in (out / "track" / "report.md").read_text()
     # The commands [mm] lead the tip of the model along a figure eight of 200 by 100 mm.
     track = np.genfromtxt(out / "track" / "track.csv", delimiter=",", names=True, dtype=None)
     on_path = track["status"] == "CONVERGED"

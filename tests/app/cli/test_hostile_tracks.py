@@ -117,7 +117,9 @@ def test_a_promise_counts_the_points_that_are_missed(home, tmp_path, capsys):
     last = " ".join(printed.split("\n\n")[-2].split())
     assert last.startswith(f"Reached: {record['reached']} of 21 points; missed: {missed.sum()}, by")
     assert f"{1e3 * record['missed_by']:.2g} mm. Expect" in last
-    assert "over all points, 1 mm at those reached inside the log" in last
+    assert (
+        "of the robot on this path, over all points, 1 mm at those reached inside the log" in last
+    )
 
 
 @pytest.mark.slow

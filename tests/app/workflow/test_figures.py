@@ -46,7 +46,7 @@ def test_a_model_says_what_it_is_and_what_error_to_expect(tmp_path):
     loaded = folder(tmp_path, {"mean": 0.004, "p95": 0.009})
     assert kind_of(loaded) == "hybrid, linear"
     expected = expected_errors(loaded, np.zeros((3, 6)))
-    assert [*expected] == ["held-out motions, mean", "held-out motions, 95 %"]
+    assert [*expected] == ["expected on this path", "95 % below, on this path"]
     np.testing.assert_allclose([*expected.values()], [[0.004] * 3, [0.009] * 3])
     nominal = open_model(tmp_path / "robot.toml")
     assert kind_of(nominal) == "mechanical, nominal"
