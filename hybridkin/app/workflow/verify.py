@@ -112,21 +112,12 @@ class Verification:
             f"{millimetres(path.p95)}, max {millimetres(path.max)}."
         )
         report.errors(self.parts, _COLUMNS)
-        shares = []
-        for cause in sorted(self.causes, key=self.causes.__getitem__, reverse=True):
-            if self.causes[cause] >= _SHOWN:
-                shares.append([cause, f"{100 * self.causes[cause]:.0f}"])
-        if shares:
-            report.table(["cause", "explains [%]"], shares)
         if self.kept:
-            report.text("The promise is kept.")
-        elif self.cause is None:
-            report.text("None of the known causes explains the error; check load and friction.")
+            report.text(
+                f"The promise is kept: the mean error is within {_KEPT:g} times the promised one."
+            )
         else:
-            report.text(f"Likely cause: {self.cause}. To do: {self.remedy}.")
-            if self.amount:
-                report.text("Amount: {amount}.", amount=self.amount)
-            self._write_others(report)
+            self._write_causes(report)
         later = self.later
         if later is not None and later.is_clear:
             report.text(
@@ -142,6 +133,22 @@ class Verification:
                 "path an error of the model looks the same. Repeat a motion of the log to tell "
                 "them apart."
             )
+
+    def _write_causes(self, report: Report) -> None:
+        """Add what each cause explains, and the likely one."""
+        shares = []
+        for cause in sorted(self.causes, key=self.causes.__getitem__, reverse=True):
+            if self.causes[cause] >= _SHOWN:
+                shares.append([cause, f"{100 * self.causes[cause]:.0f}"])
+        if shares:
+            report.table(["cause", "explains [%]"], shares)
+        if self.cause is None:
+            report.text("None of the known causes explains the error; check load and friction.")
+            return
+        report.text(f"Likely cause: {self.cause}. To do: {self.remedy}.")
+        if self.amount:
+            report.text("Amount: {amount}.", amount=self.amount)
+        self._write_others(report)
 
     def _write_others(self, report: Report) -> None:
         """Add the causes that explain as much, and how to tell them apart."""

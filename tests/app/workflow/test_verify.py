@@ -93,7 +93,20 @@ def test_a_robot_as_in_the_log_keeps_the_promise(verified):
     assert record.parts["path"].promised == pytest.approx(1.6 * NOISE)
     assert max(record.causes.values()) < 0.2
     assert "Promised: mean 0.32 mm, 95 % below 0.56 mm. Robot: mean 0." in report.plain()
-    assert "The promise is kept." in report.plain()
+    kept = "The promise is kept: the mean error is within 1.5 times the promised one."
+    assert kept in report.plain()
+
+
+def test_a_kept_promise_has_no_table_of_causes(verified):
+    """A shift that is a third of the promised error, and one that is seven times as large."""
+    q = loops(0.6 * SIZE)
+    small = verified(q, truth(q) + 0.5 * NOISE * np.array([1.0, 0.0, 0.0]))
+    assert small.record.kept
+    assert max(small.record.causes.values()) > 0.05
+    assert "explains [%]" not in small.plain()
+    large = verified(q, truth(q) + 10.0 * NOISE * np.array([1.0, 0.0, 0.0]))
+    assert not large.record.kept
+    assert "explains [%]" in large.plain()
 
 
 def with_backlash(q):
