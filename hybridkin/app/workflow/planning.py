@@ -55,7 +55,8 @@ def next_rows(
 
     If rows are measured, and the description of the robot leaves open what is calibrated, the
     report names the motions that separate sets of parameters with nearly equal errors, see
-    `separating_motions`; their commands are in ``separating.csv``, each motion once.
+    `separating_motions`; their commands are in ``separating.csv``, each motion once. Without such
+    a motion there is no such file.
 
     Parameters
     ----------
@@ -141,20 +142,35 @@ def next_rows(
     # One of an earlier run is not that of these rows.
     (Path(out) / "separating.csv").unlink(missing_ok=True)
     if separating:
-        report.text(
-            "## What the measured rows leave open\n\nThese sets of parameters have nearly equal "
-            "errors on the measured rows. The motions show which one is right."
-        )
-        items = []
-        lines = []
-        for k, rivals in enumerate(_by_motion(separating)):
-            items.append(_in_words(rivals))
-            for command in log.to_log(commands_for(model, rivals[0].q)):
-                lines.append([str(k + 1), *np.char.mod("%.9g", command)])
-        report.items(items)
-        report.table_file("separating.csv", ["motion", *log.q], lines)
+        _write_separating(report, model, separating)
     report.write(out)
     return report
+
+
+def _write_separating(
+    report: Report, model: HybridForwardModel, separating: Sequence[SeparatingMotion]
+) -> None:
+    """Add which motions separate sets of parameters, and their commands if there are any."""
+    log = model.description_.log
+    items = []
+    lines = []
+    n_motions = 0
+    for rivals in _by_motion(separating):
+        items.append(_in_words(rivals))
+        motion = rivals[0]
+        if motion.separates:
+            n_motions += 1
+            for command in log.to_log(commands_for(model, motion.q)):
+                lines.append([str(n_motions), *np.char.mod("%.9g", command)])
+    meaning = "No motion shows which one is right; use any."
+    if n_motions:
+        meaning = "The motions in separating.csv show which one is right."
+        report.table_file("separating.csv", ["motion", *log.q], lines)
+    report.text(
+        "## What the measured rows leave open\n\nThese sets of parameters have nearly equal errors "
+        f"on the measured rows. {meaning}"
+    )
+    report.items(items)
 
 
 def _to_improve(model: HybridForwardModel) -> HybridForwardModel | ForwardModel:

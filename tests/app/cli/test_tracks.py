@@ -95,7 +95,8 @@ def test_next_names_the_motion_that_shows_whether_the_tool_is_wrong(robot, tmp_p
     table = np.genfromtxt(tmp_path / "plan" / "separating.csv", delimiter=",", names=True)
     assert table.dtype.names == ("motion", *COLUMNS)
     table = np.array([*map(tuple, table)])
-    motions = {motion["motion"]: motion for motion in record["separating"]}
+    kept = [entry for entry in record["separating"] if entry["remaining"] > entry["noise"]]
+    motions = {motion["motion"]: motion for motion in kept}
     assert len(np.unique(table[:, 0])) == len(motions) <= len(record["separating"])
     for k, motion in enumerate(motions.values()):
         assert motion["motion"].split(",")[0] in " ".join(out.split())
@@ -109,6 +110,22 @@ def test_next_names_the_motion_that_shows_whether_the_tool_is_wrong(robot, tmp_p
     robot.write_text(ROBOT)
     assert document(capsys, *plan, "--measured", log)[1]["separating"] == []
     assert not (tmp_path / "plan" / "separating.csv").exists()
+
+
+@pytest.mark.slow
+def test_next_writes_no_motion_where_none_separates(robot, tmp_path, capsys):
+    """Limits of 0.02 mm move the tips by less than the noise."""
+    log = write(tmp_path / "log.csv", small_log())
+    narrow = ROBOT.replace('calibrate = ["radii", "base"]', "")
+    robot.write_text(narrow.replace("0.006\n", "0.00002\n"))
+    plan = ["next", robot, "-n", 3, "--out", tmp_path / "plan", "--measured", log]
+    code, out, err = run(capsys, *plan)
+    assert (code, err.count("error")) == (0, 0)
+    words = " ".join(out.split())
+    assert "No motion shows which one is right; use any." in words
+    assert "no motion within the limits separates" in words
+    assert not (tmp_path / "plan" / "separating.csv").exists()
+    assert (tmp_path / "plan" / "next.csv").exists()
 
 
 class Enough(ValueError):
