@@ -99,6 +99,12 @@ class LogReport:
         """Whether there are no errors."""
         return not self.errors
 
+    @property
+    def of_evaluation(self) -> LogReport:
+        """The report without what the log cannot teach: an evaluation learns nothing."""
+        findings = [finding for finding in self.findings if finding.kind != "no motion"]
+        return replace(self, findings=tuple(findings))
+
     def accepting(self, kind: str) -> LogReport:
         """Return the report with findings of a kind as notes, because their rows are left out."""
         findings = []

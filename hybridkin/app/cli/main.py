@@ -215,7 +215,7 @@ def _evaluate(arguments: argparse.Namespace, stages: Stages) -> _Result:
     model = _model_of(arguments)
     nominal = None if model.description_.created else model.module_.robot
     log = _log_of(model, arguments, stages, chain=nominal)
-    _note(log.report, stages)
+    _note(log.report.of_evaluation, stages)
     report = hybridkin.app.workflow.evaluate_log(model, log, arguments.out, force=arguments.force)
     mean = 1000.0 * report.record.judged.mean
     return report, int(mean > arguments.fail_above)

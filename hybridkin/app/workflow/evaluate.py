@@ -163,7 +163,7 @@ def evaluate_log(
     record = Evaluation(
         model=str(model.description_.path),
         log=log.source,
-        log_check=measured.report,
+        log_check=measured.report.of_evaluation,
         all=errors.of(np.ones(len(log.q), dtype=bool)),
         motions=motions,
         fitted_rows=None if fitted is None else int(fitted.sum()),

@@ -183,6 +183,10 @@ def test_evaluate_tells_errors_by_motion_and_which_rows_were_fitted(fitted, tmp_
     shown = [everything[key] for key in ("mean", "median", "p95", "max")]
     np.testing.assert_allclose(shown, wanted, rtol=1e-4)
     assert len(record["motions"]) == 8
+    # The tendons are in balance; this is advice for a fit.
+    assert "no motion along" in (fitted / "err").read_text()
+    assert "no motion along" in (fitted / "model" / "report.md").read_text()
+    assert "no motion along" not in (out / "report.md").read_text()
     second = record["motions"]["2"]
     assert second["mean"] == pytest.approx(errors[table[:, 10] == 2].mean(), rel=1e-4)
     assert everything["share_in_domain"] == model.in_domain(q).mean() > 0.9
@@ -192,7 +196,9 @@ def test_evaluate_tells_errors_by_motion_and_which_rows_were_fitted(fitted, tmp_
     for name in ("workspace.png", "error_histogram.png", "report.md"):
         assert str(out / name) in record["written"]
         assert (out / name).stat().st_size > 500
-    printed = in_one_line(run(capsys, *arguments)[1])
+    _, printed, notes = run(capsys, *arguments)
+    assert "no motion along" not in notes
+    printed = in_one_line(printed)
     assert "120 of 120 rows were fitted: their errors are training errors" in printed
     assert f"held out in the fit | 120 | {1e3 * held_out['mean']:.2f} |" in printed
 
