@@ -192,7 +192,7 @@ def write_model(report: Report[FitRecord]) -> None:
     for words in record.words:
         report.text("{words}", words=words)
     if record.tried:
-        _write_tried(report, record)
+        write_tried(report, record.calibrated, record.tried)
     if record.calibration is not None:
         report.text("## Calibration on all motions", whose_values(record.calibrated, record.auto))
         record.calibration.write(report)
@@ -216,22 +216,25 @@ def whose_values(calibrated: str, auto: Mapping[str, Any] | None) -> str:
     return words
 
 
-def _write_tried(report: Report, record: FitRecord) -> None:
-    """Add the sets of parameters that were tried."""
+def write_tried(report: Report, calibrated: str, tried: Mapping[str, Mapping[str, float]]) -> None:
+    """Add the calibrated set of parameters, and all sets that were tried, to a report."""
     report.text(
         "## What is calibrated",
-        f'Calibrated in the row "{CALIBRATED}": **{record.calibrated}**. The table has mean tip '
+        f'Calibrated in the row "{CALIBRATED}": **{calibrated}**. The table has mean tip '
         "errors in mm: on held-out motions, and outside, on the outer 35 % of the rows after a fit "
-        "to the inner 40 %. "
-        "Sets with more than 1.1 times the least held-out error are excluded. The score of the "
-        "others is the held-out error times the square of the error outside. Of the sets with "
-        "nearly the least score, the one with the fewest parameters is calibrated.",
+        "to the inner 40 %. Sets with more than 1.1 times the least held-out error are excluded. "
+        "The score of the others is the held-out error times the square of the error outside. Of "
+        "the sets with nearly the least score, the one with the fewest parameters is calibrated.",
     )
     rows = []
-    for name, errors in record.tried.items():
-        in_mm = [f"{1e3 * errors.get(key, np.nan):.2f}" for key in ("cv", "io")]
+    for name, errors in tried.items():
+        in_mm = []
+        for key in ("cv", "io"):
+            in_mm.append(f"{1e3 * errors[key]:.2f}" if key in errors else "-")
         rows.append([name, *in_mm])
     report.table(["parameters", "held-out motions", "outside"], rows)
+    if not any("io" in errors for errors in tried.values()):
+        report.text("-: too few rows for an error outside; the score is the held-out error.")
 
 
 def shown_models(compared: Mapping[str, object]) -> list[str]:

@@ -6,7 +6,7 @@ import pytest
 from hybridkin import calibrate, datasets, robots
 from hybridkin.app.workflow.calibrated import Calibration, calibrated_parameters
 from hybridkin.app.workflow.compare import mechanical_of
-from hybridkin.app.workflow.fit_record import whose_values
+from hybridkin.app.workflow.fit_record import whose_values, write_tried
 from hybridkin.app.workflow.log import checked
 from hybridkin.app.workflow.report import Report
 from hybridkin.formats import LogUnit
@@ -69,3 +69,16 @@ def test_a_report_says_where_the_saved_model_has_other_values():
     assert whose_values("radii", one_set) == of_row
     words = whose_values("radii + rest_bends + base", auto)
     assert words == f"{of_row} The saved model has other ones: it calibrates radii + base."
+
+
+def test_a_report_has_no_nan_where_rows_are_too_few_for_errors_outside():
+    reason = "-: too few rows for an error outside; the score is the held-out error."
+    few = Report("", {})
+    write_tried(few, "base", {"base": {"cv": 0.00123}, "radii + base": {"cv": 0.002}})
+    assert "nan" not in few.plain()
+    assert "| base         |             1.23 |       - |" in few.plain()
+    assert reason in few.plain()
+    many = Report("", {})
+    write_tried(many, "base", {"base": {"cv": 0.00123, "io": 0.004}})
+    assert "| base       |             1.23 |    4.00 |" in many.plain()
+    assert reason not in many.plain()
