@@ -23,12 +23,12 @@ from hybridkin.app.workflow.report import (
     Progress,
     Report,
     check_out,
-    millimetres,
+    error_in_millimetres,
+    lengths_for_table,
     quiet,
 )
 from hybridkin.app.workflow.track import Attempts, best_track
 from hybridkin.arguments import whole
-from hybridkin.formats import METRES
 
 _POOL = 2000  # number of configurations to choose from
 _SHOWN = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)  # rows of the table
@@ -103,7 +103,8 @@ def next_rows(
         target = best_track(domain, path, _TOL, Attempts(progress)).effective
         candidates = np.concatenate([target, candidates])
         far = np.linalg.norm(tips_at(model, target) - path.x, axis=1).max()
-        where = f"along the path, which the model reaches to within {millimetres(far)}"
+        largest = error_in_millimetres(far)
+        where = f"along the path, where the largest error of the solver is {largest}"
     measured_q = None
     if measured is not None:
         measured_q = model.effective(measured.commands)
@@ -137,8 +138,8 @@ def next_rows(
     )
     log = model.description_.log
     sent = log.to_log(commands_for(model, candidates[rows]))
-    numbers = np.column_stack([sent, errors / METRES[log.x_unit]])
-    report.table_file("next.csv", [*log.q, "expected_error"], np.char.mod("%.9g", numbers))
+    cells = [np.char.mod("%.9g", sent), lengths_for_table(errors, log.x_unit)]
+    report.table_file("next.csv", [*log.q, "expected_error"], np.column_stack(cells))
     # One of an earlier run is not that of these rows.
     (Path(out) / "separating.csv").unlink(missing_ok=True)
     if separating:

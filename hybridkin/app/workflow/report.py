@@ -14,11 +14,13 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, NamedTuple, Protocol, TypeVar
 
+import numpy as np
 from numpy.typing import NDArray
 
 from hybridkin.app import LogReport
 from hybridkin.arguments import as_path
 from hybridkin.formats import (
+    METRES,
     check_outputs,
     csv_table,
     markdown,
@@ -42,6 +44,8 @@ Progress = Callable[[str, int, int], None]
 Record = TypeVar("Record")
 
 _WIDTH = 98
+_LEAST_ERROR = 1e-6  # [m]; cameras do not see less
+_LEAST_LENGTH = 1e-9  # in files [m]
 _COMMAND = "$ "  # how a line that is a command begins
 
 
@@ -73,6 +77,20 @@ _COLUMNS = {
 def millimetres(length: float, form: str = ".3g") -> str:
     """Return a length [m] as text."""
     return f"{1e3 * length:{form}} mm"
+
+
+def error_in_millimetres(error: float) -> str:
+    """Return an error of a solver [m] as text, no digits of it below a micrometre."""
+    if 0.0 < error < _LEAST_ERROR:
+        return f"below {millimetres(_LEAST_ERROR)}"
+    return millimetres(error)
+
+
+def lengths_for_table(lengths: NDArray, unit: str) -> NDArray:
+    """Return lengths (...) [m] as cells of a CSV file in a unit, to a nanometre."""
+    decimals = round(math.log10(METRES[unit] / _LEAST_LENGTH))
+    rounded = np.round(lengths / METRES[unit], decimals) + 0.0  # no -0
+    return np.char.rstrip(np.char.rstrip(np.char.mod(f"%.{decimals}f", rounded), "0"), ".")
 
 
 def percent(share: float) -> str:

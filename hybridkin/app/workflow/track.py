@@ -34,6 +34,8 @@ from hybridkin.app.workflow.report import (
     Progress,
     Report,
     check_out,
+    error_in_millimetres,
+    lengths_for_table,
     millimetres,
     percent,
     quiet,
@@ -46,7 +48,7 @@ from hybridkin.app.workflow.surroundings import (
     nearest_distances,
 )
 from hybridkin.datasets import Log, load_log, log_columns
-from hybridkin.formats import METRES, duration_in_words
+from hybridkin.formats import duration_in_words
 
 TARGET = ("target_x", "target_y", "target_z")
 TIME = "t"
@@ -145,8 +147,9 @@ def _write(report: Report[TrackRecord], model: HybridForwardModel, better: str) 
     errors = record.errors
     report.text(
         f"In the model, {record.reached} of {record.n} points are reached. Error of the solver: "
-        f"mean {millimetres(errors.mean)}, 95 % quantile {millimetres(errors.p95)}, max "
-        f"{millimetres(errors.max)}. Limits: {record.limits.source}. Computed by {{backend}}.",
+        f"mean {error_in_millimetres(errors.mean)}, 95 % quantile "
+        f"{error_in_millimetres(errors.p95)}, max {error_in_millimetres(errors.max)}. Limits: "
+        f"{record.limits.source}. Computed by {{backend}}.",
         backend=_backend_in_words(record.backend),
     )
     rows = [[status, str(count)] for status, count in record.statuses.items()]
@@ -187,8 +190,8 @@ def _backend_in_words(backend: str) -> str:
 def _about_counts(record: TrackRecord, counts: Counts) -> list[str]:
     """Return what rounding costs, or that it is possible."""
     if record.rounded is not None:
-        before = millimetres(record.rounded["before"])
-        after = millimetres(record.rounded["after"])
+        before = error_in_millimetres(record.rounded["before"])
+        after = error_in_millimetres(record.rounded["after"])
         words = (
             f"Commands are rounded to whole steps of the actuators. Mean error of the solver: "
             f"{before} before, {after} after."
@@ -668,12 +671,12 @@ def _add_track(
 
     With distances (T, K) of the body to obstacles also the least of them.
     """
-    lengths = np.column_stack([track.x, track.target, track.error]) / METRES[log.x_unit]
+    lengths = np.column_stack([track.x, track.target, track.error])
     head = [TIME, *log.q, *log.x, *TARGET, "error", "status"]
     columns = [
         _text(track.t),
         *_text(log.to_log(commands["command"]), digits),
-        *_text(lengths),
+        *lengths_for_table(lengths, log.x_unit).T,
         statuses,
     ]
     if "actuator" in commands:
@@ -681,7 +684,7 @@ def _add_track(
         columns += [*_text(log.to_log(commands["actuator"]))]
     if distances.size:
         head.append("distance")
-        columns.append(_text(distances.min(axis=1) / METRES[log.x_unit]))
+        columns.append(lengths_for_table(distances.min(axis=1), log.x_unit))
     report.table_file("track.csv", head, zip(*columns, strict=True))
 
 

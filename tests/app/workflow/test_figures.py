@@ -3,10 +3,12 @@
 import warnings
 
 import numpy as np
+import pytest
 import torch
 
 from hybridkin import HybridForwardModel, open_model, robots, save_model
 from hybridkin.app.workflow.model import expected_errors, kind_of
+from hybridkin.app.workflow.report import error_in_millimetres, lengths_for_table
 
 ROBOT = """name = "arm"
 routing = "base"
@@ -51,3 +53,20 @@ def test_a_model_says_what_it_is_and_what_error_to_expect(tmp_path):
     nominal = open_model(tmp_path / "robot.toml")
     assert kind_of(nominal) == "mechanical, nominal"
     assert expected_errors(nominal, np.zeros((3, 6))) == {}
+
+
+@pytest.mark.parametrize(
+    ("unit", "cells"),
+    [
+        ("mm", ["22.563168", "0", "0.000001", "nan", "100"]),
+        ("m", ["0.022563168", "0", "0.000000001", "nan", "0.1"]),
+    ],
+)
+def test_files_give_lengths_to_a_millionth_of_a_millimetre(unit, cells):
+    lengths = np.array([0.0225631683123, -1e-13, 9.93567519e-10, np.nan, 0.1])
+    assert lengths_for_table(lengths, unit).tolist() == cells
+
+
+def test_an_error_of_a_solver_below_a_micrometre_has_no_digits():
+    shown = [error_in_millimetres(error) for error in (0.0, 5.14e-10, 1.23e-6, 4.5678e-3)]
+    assert shown == ["0 mm", "below 0.001 mm", "0.00123 mm", "4.57 mm"]
