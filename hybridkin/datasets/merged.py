@@ -433,9 +433,12 @@ def _alike(motors: TimedColumns, a: _Candidate, b: _Candidate) -> bool:
     away = abs(a.lag - b.lag)
     if away <= a.width:
         return True
-    least = _ALIKE * np.square(motors.values - motors.values.mean(axis=0)).sum()
+    rows = np.linspace(0, len(motors.time) - 1, min(len(motors.time), _ROWS)).astype(int)
+    time = motors.time[rows]
+    q = motors.values[rows]
+    least = _ALIKE * np.square(q - q.mean(axis=0)).sum()
     for shift in [*np.arange(a.width, away, a.width), away]:
-        change = commands_at(motors, motors.time + shift) - motors.values
+        change = commands_at(motors, time + shift) - q
         if np.square(change).sum() >= least:
             return False
     return True
