@@ -537,13 +537,14 @@ def _verify(command: argparse.ArgumentParser) -> None:
 
 
 def _animate(command: argparse.ArgumentParser) -> None:
-    """Make a film (mp4, gif) or an interactive page (html) of a track.
+    """Make a film (gif, mp4) or an interactive page (html) of a track.
 
     It begins where the path begins, after the lead-in.
 
     Some examples:
-      hybridkin animate model track --out track.mp4
+      hybridkin animate model track --out track.gif
       hybridkin animate model track/track.csv --out track.html --frames 80
+      hybridkin animate model track --out track.mp4           # needs the program ffmpeg
       hybridkin animate robot.toml log.csv --out log.gif      # the commands of a log
       hybridkin animate model track --obstacles scene.toml --out track.html
     """
@@ -555,7 +556,7 @@ def _animate(command: argparse.ArgumentParser) -> None:
         type=Path,
         required=True,
         metavar="FILE",
-        help="file: .mp4, .gif or .html",
+        help="file: .gif, .html, or .mp4 (needs ffmpeg)",
     )
     add("--unit", choices=METRES, default="mm", help="unit of the axes (mm)")
     add(
