@@ -55,14 +55,13 @@ def test_every_page_is_in_the_table_of_contents():
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_links_lead_somewhere(page):
-    examples = DOCS.parent.glob("examples/plot_*.py")
-    made = {DOCS / "gallery" / "index.rst"} | {DOCS / f"gallery/{p.stem}.rst" for p in examples}
+    """Also for readers of the repository, where the gallery is not built."""
     for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8")):
         if link.startswith("http"):
             continue
         name, _, heading = link.partition("#")
         file = Path(os.path.normpath(page.parent / name)) if name else page
-        assert file.is_file() or file in made, link
+        assert file.exists(), link
         if heading:
             headings = re.findall(r"^#+ (.*)$", file.read_text(), re.M)
             assert heading in {h.lower().replace(" ", "-").replace("'", "") for h in headings}, link

@@ -1,5 +1,6 @@
 """What the pages need beyond Sphinx: equations without a script, names, and order."""
 
+import re
 from html import escape
 from pathlib import Path
 
@@ -62,12 +63,21 @@ def _resolve(app, env, node, contnode):
     )
 
 
+def _to_gallery(app, docname, source):
+    """Lead links to an example, which serve readers of the repository, to its page."""
+    links = r"\]\(((?:\.\./)*)\.\./examples/(?:(plot_\w+)\.py)?\)"
+    source[0] = re.sub(
+        links, lambda link: f"]({link[1]}gallery/{link[2] or 'index'}.rst)", source[0]
+    )
+
+
 def setup(app):
-    """Register the equations' renderer and the look-up of names."""
+    """Register the equations' renderer, the look-up of names and the links to the gallery."""
     app.add_html_math_renderer(
         "mathml",
         inline_renderers=(_inline_math, None),
         block_renderers=(_block_math, None),
     )
     app.connect("missing-reference", _resolve)
+    app.connect("source-read", _to_gallery)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

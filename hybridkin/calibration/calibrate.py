@@ -486,12 +486,9 @@ def check_parameters(chain: Chain, parameters: Sequence[str]) -> tuple[str, ...]
     available = chain.parameter_names
     unknown = [str(name) for name in names if name not in available]
     if unknown or not names or len(set(names)) < len(names):
-        hint = "."
-        if unknown and (near := difflib.get_close_matches(unknown[0], available, 1)):
-            hint = f"; did you mean {near[0]!r}?"
         raise ValueError(
             f"`parameters` must name different entries of {available} for this chain, got "
-            f"{names}{hint}"
+            f"{names}{_hint(unknown, available)}"
         )
     for alias, entry in chain.aliases.items():
         if alias in names and entry in names:
@@ -500,6 +497,21 @@ def check_parameters(chain: Chain, parameters: Sequence[str]) -> tuple[str, ...]
                 f"leave {alias!r} out."
             )
     return names
+
+
+def _hint(unknown: Sequence[str], available: Sequence[str]) -> str:
+    """Return the end of a message: what may have been meant by the first unknown name."""
+    if not unknown:
+        return "."
+    name = unknown[0]
+    if name in ("auto", "default"):
+        return (
+            "; 'auto' and 'default' are for `HybridForwardModel(calibrate=...)`: here leave "
+            "`parameters` out, or let `choose_geometry` choose."
+        )
+    near = difflib.get_close_matches(name, available, 1)
+    near += [entry for entry in available if name in entry]
+    return f"; did you mean {near[0]!r}?" if near else "."
 
 
 def check_data(

@@ -346,6 +346,8 @@ def test_tips_in_millimetres_are_noticed(rng):
     ("change", "message"),
     [
         ({"parameters": ("radius",)}, "mean 'radii'"),
+        ({"parameters": ("radii", "zeros")}, "mean 'actuator_zeros'"),
+        ({"parameters": "auto"}, "let `choose_geometry` choose"),
         ({"parameters": ("lengths",)}, "`parameters`"),
         ({"parameters": ("offsets", "tool")}, "leave 'tool' out"),
         ({"loss": "l1"}, "`loss`"),

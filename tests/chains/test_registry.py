@@ -23,7 +23,7 @@ def tensor(*values):
 
 
 def test_the_table_lists_every_robot():
-    table = (FOLDER / "README.md").read_text(encoding="utf-8")
+    table = (FOLDER / "robots.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| \[(\w+)\]\((.*?)\) \| (\d+) \| (\d+) ", table, re.MULTILINE)
     assert sorted(name for name, *_ in rows) == NAMES
     for name, link, n_segments, n_actuators in rows:
