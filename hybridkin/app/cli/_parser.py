@@ -177,7 +177,8 @@ def _merge(command: argparse.ArgumentParser) -> None:
 
     Gives each tip of the camera the command of its time. The clocks of the two files may differ:
     the lag between them is that at which the commands explain the tips best, and is printed. A
-    motion that repeats has several such lags: give --lag, 0 if both files share a clock.
+    motion that repeats, or motions of equal duration, can have several such lags: give --lag, 0 if
+    both files share a clock.
 
     Some examples:
       hybridkin merge motors.csv camera.csv --q m1,m2,m3 --x X,Y,Z --time t --out log.csv
