@@ -48,7 +48,7 @@ _EXACT = 1e-3  # what a right lag can leave unexplained; a wrong one only where 
 _RIDGE = 1e-9  # relative to the mean square of a feature
 _PARTS = 3  # of a log, each explained by the others; short ones agree with anything smooth
 _EXPLAINED = 0.8  # least share of the motion that the commands explain at the lag
-_RIVAL = 1.5  # least ratio of what the second best lag leaves to what the best leaves
+_RIVAL = 2.0  # least ratio of what the second best lag leaves to what the best leaves
 
 
 @dataclass(frozen=True, eq=False)
