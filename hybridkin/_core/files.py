@@ -91,8 +91,8 @@ def check_outputs(
     if present:
         names = ", ".join(path.name for path in present)
         raise FileExistsError(
-            f"`out` {present[0].parent} has {names}, not written by `hybridkin {command}`; name "
-            "another place, or replace them with --force (force=True)."
+            f"{present[0].absolute().parent} has {names} already, which `hybridkin {command}` "
+            "replaces only with --force (in Python: force=True); or name another place."
         )
 
 

@@ -34,8 +34,11 @@ _AS_WRITTEN = "as written"
 _GAP = 5.0  # usual periods of the motor rows: longer ones are gaps
 _CELLS = 2**14  # of the coarse search, at most
 _OVERLAP = 0.5  # of the shorter recording, at least
-_CANDIDATES = 6  # lags of the coarse search that are compared
-_SURE = 0.7  # least score of a candidate, relative to the best
+_CANDIDATES = 16  # lags of the coarse search that are compared
+_SURE = 0.6  # least score of a candidate, relative to the best
+_VALLEY = 0.5  # largest score between two candidates, relative to the lesser one
+_ALIKE = 0.05  # of the variance of the commands: those of two lags that differ by less are alike
+_NAMED = 6  # candidates in a message, at most
 _ROWS = 2000  # camera rows that are compared, at most
 _FEATURES = 250  # of the rough model, at most
 _ROWS_PER_FEATURE = 5  # at least, of polynomials
@@ -45,7 +48,7 @@ _EXACT = 1e-3  # what a right lag can leave unexplained; a wrong one only where 
 _RIDGE = 1e-9  # relative to the mean square of a feature
 _PARTS = 3  # of a log, each explained by the others; short ones agree with anything smooth
 _EXPLAINED = 0.8  # least share of the motion that the commands explain at the lag
-_RIVAL = 1.5  # least ratio of what the second best lag leaves to what the best leaves
+_RIVAL = 2.0  # least ratio of what the second best lag leaves to what the best leaves
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,7 +204,7 @@ class Merged(NamedTuple):
         How much later than the clock of the motors that of the camera is [s].
     explained : float
         Share of the variance of the tips that a rough model of the commands explains at this lag,
-        in parts of the log that it was not fitted to.
+        in thirds of the log that it was not fitted to.
     is_estimated : bool
         Whether the lag was estimated.
     n_left_out : int
@@ -220,7 +223,8 @@ class Merged(NamedTuple):
         n_rows = len(self.log.q)
         return (
             f"The camera's clock is {self.lag:.4f} s later than that of the motors ({how}); the "
-            f"commands then explain {self.explained:.1%} of the motion of the tip. {n_rows} of "
+            f"commands then explain {self.explained:.1%} of the motion of the tip in one third of "
+            f"the rows by a rough model of the other two thirds. {n_rows} of "
             f"{n_rows + self.n_left_out} camera rows have a tip and commands around them."
         )
 
@@ -298,8 +302,13 @@ def merge_logs(
             f"{len(commands.time)} and {len(tips.time)}."
         )
     is_estimated = lag is None
+    candidates = []
     if lag is None:
-        lag = _estimated_lag(commands, tips, hold)
+        candidates = _candidates(commands, tips, hold)
+        if len(candidates) > 1 and candidates[1].unexplained < candidates[0].as_good:
+            raise ValueError(_unclear(motors, camera, candidates))
+        best = candidates[0]
+        lag = _polished(commands, tips, best.lag, best.width, hold)
     else:
         lag = number(lag, "lag")
     time = tips.time - lag
@@ -330,11 +339,7 @@ def merge_logs(
     )
     explained, _ = _explained(q, x)
     if is_estimated and explained < _EXPLAINED:
-        raise ValueError(
-            f"The lag between {motors.source} and {camera.source} is not clear: the commands "
-            f"explain at most {100.0 * explained:.0f} % of the motion of the tip, at {lag:.3g} s. "
-            "Check that both record the same motion, or give `lag` (0 if they share a clock)."
-        )
+        raise ValueError(_unclear(motors, camera, candidates))
     n_left_out = len(camera.time) - int(is_covered.sum())
     return Merged(log, lag, explained, is_estimated, n_left_out)
 
@@ -395,22 +400,64 @@ def _si_unit(unit: str) -> str:
     return unit if unit == "1" else "rad"
 
 
-def _estimated_lag(motors: TimedColumns, camera: TimedColumns, hold: bool) -> float:
-    """Return the lag [s] at which the commands explain the tips best."""
+class _Candidate(NamedTuple):
+    """A lag [s] with the share of the motion that it leaves, and the width of its search [s]."""
+
+    unexplained: float
+    lag: float
+    width: float
+
+    @property
+    def as_good(self) -> float:
+        """Return up to which share another lag is as good."""
+        return max(_RIVAL * self.unexplained, _EXACT)
+
+
+def _candidates(motors: TimedColumns, camera: TimedColumns, hold: bool) -> list[_Candidate]:
+    """Return lags at which the commands can explain the tips, the best first.
+
+    Of lags so near to each other that the commands hardly change in between, only the best.
+    """
     fits = []
     for lag, width in _coarse_lags(motors, camera):
         fits.append(_refined(motors, camera, lag, width, hold))
-    unexplained, lag, width = min(fits)
-    as_good = max(_RIVAL * unexplained, _EXACT)
-    for other, other_lag, _ in fits:
-        if abs(other_lag - lag) > width and other < as_good:
-            raise ValueError(
-                f"The lag between {motors.source} and {camera.source} is not clear: lags of "
-                f"{lag:.4f} and {other_lag:.4f} s explain {1.0 - unexplained:.1%} and "
-                f"{1.0 - other:.1%} of the motion of the tip, as where a motion repeats. Give "
-                "`lag` (0 if they share a clock), or record a motion that does not repeat."
-            )
-    return _polished(motors, camera, lag, width, hold)
+    candidates = []
+    for fit in sorted(fits, key=lambda fit: fit.unexplained):
+        if all(not _alike(motors, fit, better) for better in candidates):
+            candidates.append(fit)
+    return candidates
+
+
+def _alike(motors: TimedColumns, a: _Candidate, b: _Candidate) -> bool:
+    """Return whether the commands hardly change while the lag goes from one to another."""
+    away = abs(a.lag - b.lag)
+    if away <= a.width:
+        return True
+    rows = np.linspace(0, len(motors.time) - 1, min(len(motors.time), _ROWS)).astype(int)
+    time = motors.time[rows]
+    q = motors.values[rows]
+    least = _ALIKE * np.square(q - q.mean(axis=0)).sum()
+    for shift in [*np.arange(a.width, away, a.width), away]:
+        change = commands_at(motors, time + shift) - q
+        if np.square(change).sum() >= least:
+            return False
+    return True
+
+
+def _unclear(motors: TimedColumns, camera: TimedColumns, candidates: Sequence[_Candidate]) -> str:
+    """Return the message that no lag is clearly the best, with the lags to try."""
+    lags = []
+    for candidate in candidates[:_NAMED]:
+        lags.append(f"{candidate.lag:.3f} s ({1.0 - candidate.unexplained:.1%})")
+    return (
+        f"The lag between {motors.source} and {camera.source} is not clear: {', '.join(lags)}. In "
+        "brackets: how much of the motion of the tip the commands explain in a third of the rows, "
+        "by a rough model of the other two thirds. One lag must explain "
+        f"{100.0 * _EXPLAINED:.0f} %, and others clearly less. Several lags fit where a motion "
+        "repeats, or where all motions last equally long. If both files record the same motion, "
+        "try these lags as `lag` (--lag), or 0 if both share a clock; or record motions that "
+        "differ in duration."
+    )
 
 
 def _coarse_lags(motors: TimedColumns, camera: TimedColumns) -> list[tuple[float, float]]:
@@ -427,7 +474,12 @@ def _coarse_lags(motors: TimedColumns, camera: TimedColumns) -> list[tuple[float
         (score >= np.append(score[1:], -np.inf)) & (score > np.append(-np.inf, score[:-1]))
     )
     peaks = peaks[score[peaks] >= _SURE * score[peaks].max()]
-    best = peaks[np.argsort(-score[peaks])[:_CANDIDATES]]
+    best = []
+    for peak in peaks[np.argsort(-score[peaks])]:
+        between = [score[min(peak, other) : max(peak, other)].min() for other in best]
+        if max(between, default=-np.inf) < _VALLEY * score[peak]:
+            best.append(peak)
+    best = best[:_CANDIDATES]
     start = camera.time[0] - motors.time[0]
     return [(float(start - shift[k] * step), float(2.0 * step)) for k in best]
 
@@ -486,13 +538,13 @@ def _correlation(a: NDArray, b: NDArray) -> tuple[NDArray, NDArray]:
 
 def _refined(
     motors: TimedColumns, camera: TimedColumns, lag: float, width: float, hold: bool
-) -> tuple[float, float, float]:
-    """Return what the best lag nearby leaves unexplained, that lag, and the width of the search."""
+) -> _Candidate:
+    """Return the best lag nearby."""
     tips = _surely_covered(motors, camera, lag, width)
     shifts = np.linspace(-width, width, 17)
     for _ in range(_WINDOWS):
         if not len(tips.time):
-            return np.inf, lag, width
+            return _Candidate(1.0, lag, width)
         errors = [_left_at(shift, lag, motors, tips, hold, 2) for shift in shifts]
         best = int(np.argmin(errors))
         lag += float(shifts[best])
@@ -500,7 +552,7 @@ def _refined(
             break
         tips = _surely_covered(motors, camera, lag, width)
     q = commands_at(motors, tips.time - lag, hold)
-    return 1.0 - _explained(q, tips.values)[0], lag, width
+    return _Candidate(1.0 - _explained(q, tips.values)[0], lag, width)
 
 
 def _polished(

@@ -32,6 +32,31 @@ def compiling_command() -> str:
     return shlex.join([*command, "--force-reinstall", "--no-deps", "--no-cache-dir", origin])
 
 
+def _hides_another() -> bool:
+    """Return whether this is a clone that was imported in place of an installed package."""
+    if not (_SOURCES / "hatch_build.py").is_file():
+        return False
+    for installed in metadata.distributions(name="hybridkin"):
+        folder = Path(str(installed.locate_file("hybridkin")))
+        if folder.is_dir() and folder.parent.resolve() != _SOURCES:
+            return True
+    return False
+
+
+def without_kernels() -> str:
+    """Return the reason where nothing was compiled, and what to do."""
+    command = compiling_command()
+    if _hides_another():
+        return (
+            f"it was imported from the source folder {_SOURCES}, which has no compiled kernels; "
+            f"run `{command}`, or work in another folder to use the installed package"
+        )
+    return (
+        "hybridkin was installed without compiled kernels; install a C compiler, then run "
+        f"`{command}`"
+    )
+
+
 def _origin(direct_url: dict[str, Any]) -> str:
     """Return what to install again, from the record of where a package came from (PEP 610)."""
     url = direct_url.get("url", "hybridkin")

@@ -27,7 +27,7 @@ from hybridkin._core.kernel_numbers import (
 from hybridkin._core.model import ForwardModel
 from hybridkin._core.plan import NoKernel, Plan
 from hybridkin._core.portable import PortableModule
-from hybridkin.native._installation import compiling_command, warn_of_slow_models
+from hybridkin.native._installation import compiling_command, warn_of_slow_models, without_kernels
 
 _FOLDER = Path(__file__).parent
 _SUFFIX = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
@@ -77,7 +77,7 @@ def _opened() -> tuple[ctypes.CDLL | None, str]:
         return None, "HYBRIDKIN_NATIVE=off"
     paths = _compiled_files()
     if not paths:
-        return None, _without_files()
+        return None, without_kernels()
     reason = "no variant of the compiled library is for this processor"
     try:
         level = ctypes.CDLL(str(paths[0])).hk_level()
@@ -106,14 +106,6 @@ def _compiled_files() -> list[Path]:
     """Return the compiled libraries, the fastest last; HYBRIDKIN_NATIVE can name a variant."""
     variant = os.environ.get("HYBRIDKIN_NATIVE") or "*"
     return sorted((_FOLDER / "lib").glob(f"hk_{variant}{_SUFFIX}"))
-
-
-def _without_files() -> str:
-    """Return the reason where nothing was compiled, and what to do."""
-    return (
-        "hybridkin was installed without compiled kernels; install a C compiler, then run "
-        f"`{compiling_command()}`"
-    )
 
 
 def _fault(opened: ctypes.CDLL) -> str:
@@ -576,4 +568,4 @@ def evaluate(
 
 
 if not (_is_off() or _compiled_files()):  # said as soon as the core is imported
-    warn_of_slow_models(_without_files())
+    warn_of_slow_models(without_kernels())

@@ -413,8 +413,8 @@ def _writer(kind: str, fps: float) -> animation.AbstractMovieWriter:
         return animation.PillowWriter(fps=fps)  # pyright: ignore[reportArgumentType]
     if not animation.writers.is_available("ffmpeg"):
         raise RuntimeError(
-            "`path` ends in .mp4, which needs the program ffmpeg, and none was found; install it "
-            "(apt, brew or conda install ffmpeg), or save as .gif or .html."
+            "`path` (--out) ends in .mp4, which needs the program ffmpeg, and none was found; "
+            "install it (apt, brew or conda install ffmpeg), or save as .gif or .html."
         )
     about = {"comment": MARK.decode()}
     return animation.FFMpegWriter(fps=fps, bitrate=2000, metadata=about)  # pyright: ignore[reportArgumentType]

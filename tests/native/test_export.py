@@ -380,7 +380,7 @@ def test_only_files_of_an_export_are_replaced(tmp_path):
     export_c(rigid, tmp_path, name="arm_3")
     assert readme.read_text() == text
     readme.write_text("mine")
-    with pytest.raises(FileExistsError, match=r"has README\.md, not written by `hybridkin export`"):
+    with pytest.raises(FileExistsError, match=r"has README\.md already, which `hybridkin export`"):
         export_c(rigid, tmp_path, name="arm_3")
 
 

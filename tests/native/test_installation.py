@@ -99,3 +99,20 @@ def test_a_clone_compiles_in_place(monkeypatch, tmp_path):
     monkeypatch.setattr(_installation, "_SOURCES", tmp_path)
     (tmp_path / "hatch_build.py").touch()
     assert _installation.compiling_command().endswith(str(tmp_path / "hatch_build.py"))
+
+
+def test_a_clone_that_hides_the_installed_package_is_named(monkeypatch, tmp_path):
+    clone = tmp_path / "clone"
+    clone.mkdir()
+    (clone / "hatch_build.py").touch()
+    monkeypatch.setattr(_installation, "_SOURCES", clone)
+    record = tmp_path / "site" / "hybridkin-1.0.dist-info"
+    record.mkdir(parents=True)
+    (record / "METADATA").write_text("Metadata-Version: 2.1\nName: hybridkin\nVersion: 1.0\n")
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    monkeypatch.setattr(sys, "path", [str(tmp_path / "site")])
+    assert "installed without compiled kernels" in _installation.without_kernels()  # editable
+    (tmp_path / "site" / "hybridkin").mkdir()
+    text = _installation.without_kernels()
+    assert f"imported from the source folder {clone}, which has no compiled kernels; run" in text
+    assert "or work in another folder to use the installed package" in text

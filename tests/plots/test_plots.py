@@ -199,6 +199,12 @@ def test_a_frame_shows_body_tip_and_target(track, film):
     figure.draw_without_rendering()
 
 
+def test_a_film_without_its_program_names_the_way_out(film, tmp_path, monkeypatch):
+    monkeypatch.setattr("matplotlib.animation.writers.is_available", lambda name: False)
+    with pytest.raises(RuntimeError, match=r"`path` \(--out\) ends in .mp4.*save as .gif or .html"):
+        film.save(tmp_path / "a.mp4")
+
+
 @pytest.mark.slow
 def test_gif_has_every_frame_and_reports_progress(film, tmp_path):
     calls = []

@@ -27,6 +27,8 @@ from hybridkin.app.cli._values import (
 from hybridkin.formats import METRES, UNITS, toml_value, visible
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from hybridkin.app.workflow.log import MeasuredLog
 
 _NEEDED = object()  # the default of what must be given
@@ -199,14 +201,7 @@ def _proposed(answers: _Answers, given: _Answers) -> _Answers:
     n = answers["segments"] * answers["actuators"]
     if answers["log"] is None:
         return {"q": [f"q{i + 1}" for i in range(n)], "x": ["x", "y", "z"]}
-    from hybridkin.datasets import log_columns  # loads torch
-
-    units = log_columns(
-        answers["log"],
-        given["delimiter"],
-        header_line=given["header_line"],
-        decimal=given["decimal"] or ".",
-    )
+    units = _units_of_columns(answers["log"], given)
     header = [*units]
     proposed: _Answers = {}
     tips = [*filter(_is_tip, zip(header, header[1:], header[2:], strict=False))]
@@ -225,6 +220,24 @@ def _proposed(answers: _Answers, given: _Answers) -> _Answers:
             if re.match(rf"({words})(?![a-z\d])", name.lower()):
                 proposed.setdefault(key, name)
     return proposed
+
+
+def _units_of_columns(log: Path, given: _Answers) -> dict[str, str]:
+    """Return the columns of a log with the units in their names."""
+    from hybridkin.datasets import log_columns  # loads torch
+
+    return log_columns(
+        log,
+        given["delimiter"],
+        header_line=given["header_line"],
+        decimal=given["decimal"] or ".",
+    )
+
+
+def unused_columns(answers: _Answers, given: _Answers) -> list[str]:
+    """Return the columns of the log that no answer names."""
+    used = {*answers["q"], *answers["x"], answers["groups"], answers["time"]}
+    return [name for name in _units_of_columns(answers["log"], given) if name not in used]
 
 
 def _likeness_to_tip(three: Sequence[str]) -> tuple[bool, bool]:

@@ -177,7 +177,8 @@ def _merge(command: argparse.ArgumentParser) -> None:
 
     Gives each tip of the camera the command of its time. The clocks of the two files may differ:
     the lag between them is that at which the commands explain the tips best, and is printed. A
-    motion that repeats has several such lags: give --lag, 0 if both files share a clock.
+    motion that repeats, or motions of equal duration, can have several such lags: give --lag, 0 if
+    both files share a clock.
 
     Some examples:
       hybridkin merge motors.csv camera.csv --q m1,m2,m3 --x X,Y,Z --time t --out log.csv
@@ -537,13 +538,14 @@ def _verify(command: argparse.ArgumentParser) -> None:
 
 
 def _animate(command: argparse.ArgumentParser) -> None:
-    """Make a film (mp4, gif) or an interactive page (html) of a track.
+    """Make a film (gif, mp4) or an interactive page (html) of a track.
 
     It begins where the path begins, after the lead-in.
 
     Some examples:
-      hybridkin animate model track --out track.mp4
+      hybridkin animate model track --out track.gif
       hybridkin animate model track/track.csv --out track.html --frames 80
+      hybridkin animate model track --out track.mp4           # needs the program ffmpeg
       hybridkin animate robot.toml log.csv --out log.gif      # the commands of a log
       hybridkin animate model track --obstacles scene.toml --out track.html
     """
@@ -555,7 +557,7 @@ def _animate(command: argparse.ArgumentParser) -> None:
         type=Path,
         required=True,
         metavar="FILE",
-        help="file: .mp4, .gif or .html",
+        help="file: .gif, .html, or .mp4 (needs ffmpeg)",
     )
     add("--unit", choices=METRES, default="mm", help="unit of the axes (mm)")
     add(

@@ -24,7 +24,7 @@ from threadpoolctl import threadpool_limits
 
 import hybridkin  # its folders are opened when used: help comes at once
 from hybridkin.app.cli import _demo as demo
-from hybridkin.app.cli._init import answered, description, with_zeros
+from hybridkin.app.cli._init import answered, description, unused_columns, with_zeros
 from hybridkin.app.cli._parser import check_files, failed, parser
 from hybridkin.app.cli._terminal import Stages, write
 from hybridkin.formats import FRAMES, METRES, check_outputs, visible, write_file
@@ -55,6 +55,7 @@ _OF_INPUT = (ValueError, TypeError, OSError, ImportError, MemoryError)
 
 _Result = tuple["Report[Any]", int]
 """The report of a command, and its exit code."""
+_LISTED = 12  # columns that a log has and `init` does not use
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -419,6 +420,7 @@ def _init(arguments: argparse.Namespace, stages: Stages) -> _Result:
     robot = _robot_of(text)
     log_format: robots.LogFormat = robot.log
     check = None
+    unused = []
     about_zeros = ""
     log = answers["log"]
     if log is not None:
@@ -430,6 +432,7 @@ def _init(arguments: argparse.Namespace, stages: Stages) -> _Result:
             measured = _log_of_init(arguments, log, robot)
         check = measured.report
         _note(check, stages)
+        unused = unused_columns(answers, options)
     record = {"columns": log_format, "log_check": check}
     report = workflow.Report(f"{robot.name}: {robot.n_actuators} actuators", record)
     look = ["hybridkin", "view", str(out)]
@@ -448,6 +451,12 @@ def _init(arguments: argparse.Namespace, stages: Stages) -> _Result:
         look=shlex.join(look),
         fit=shlex.join(fit),
     )
+    if unused:
+        report.text(
+            "Columns not used: {unused}. If one names the motion of a row, or its time, run this "
+            "again with --groups COLUMN, --time COLUMN and --force.",
+            unused=", ".join(unused[:_LISTED]) + ", ..." * (len(unused) > _LISTED),
+        )
     if about_zeros:
         report.text(about_zeros)
     check_outputs([out], "init", lambda _: False, force=arguments.force)

@@ -115,7 +115,7 @@ def check_reach(
         way_out = f"{scale:.2g} of its size, about its centre, can be reached: --scale {scale:.2g}"
     worst = point_in_millimetres(path.x[rows[missed.argmax()]])
     raise ValueError(
-        "`path` leaves the reach of the robot within its limits "
+        "`path` (of the file or --shape) leaves the reach of the robot within its limits "
         f"({domain.limits.source}): {len(far_out)} of {len(rows)} checked points are out of reach, "
         f"{worst} by {millimetres(missed.max())}; {way_out}. To track as closely as possible: "
         "--out-of-reach."

@@ -123,6 +123,10 @@ def test_init_reads_the_header_of_a_log_and_checks_it(log, tmp_path, capsys):
     assert (found.groups, found.time) == ("run", "timestamp [s]")
     assert "60 rows, 6 motions, 6 actuators" in err
     assert "motion run" in out
+    assert "not used" not in out
+    options = ["--groups", "none", "--time", "none", "--force"]
+    _, out, _ = run(capsys, "init", path, *TENDONS, "--q-sign", "-1", "--log", log, *options)
+    assert "Columns not used: timestamp [s], run. If one names the motion" in out
     options = ["--q-unit", "m", "--x-unit", "m", "--force", "--json"]
     code, out, err = run(capsys, "init", path, *TENDONS, "--q-sign", "-1", "--log", log, *options)
     assert code == 1  # as of `describe`, whose check this is

@@ -121,7 +121,7 @@ def test_a_file_of_another_is_refused_at_once_and_kept(place, capsys, command, n
     assert run(command, place) == 2
     word = command.partition(" ")[0]
     err = capsys.readouterr().err
-    assert f"has {name}, not written by `hybridkin {word}`; name another place, or replace" in err
+    assert f"has {name} already, which `hybridkin {word}` replaces only with --force" in err
     assert [path.name for path in place.iterdir()] == [name]
     assert (place / name).read_bytes() == MINE
 

@@ -41,7 +41,7 @@ def test_the_log_has_the_columns_of_both_files(tmp_path, monkeypatch, capsys):
         assert row["m"] == ("first" if float(row["t"]) < 8 else "second")
     code, _, error = run(capsys, *command)
     assert code == 2
-    assert "log.csv" in error
+    assert f"{tmp_path} has log.csv already, which `hybridkin merge` replaces only" in error
     assert run(capsys, *command, "--force", "--lag", "5")[0] == 0
     assert (tmp_path / "log.csv").read_text().splitlines()[0].endswith(",Z,run")
 

@@ -67,7 +67,9 @@ def test_fit_keeps_the_description_of_another_robot(home, capsys):
     out.mkdir()
     (out / "robot.toml").write_text("mine")
     assert main(["fit", *COMMANDS["fit"], "--out", "arm"]) == 2
-    assert "arm has robot.toml, not written by `hybridkin fit`" in capsys.readouterr().err
+    assert (
+        "arm has robot.toml already, which `hybridkin fit` replaces only" in capsys.readouterr().err
+    )
     assert content(out) == {"robot.toml": b"mine"}
 
 

@@ -257,7 +257,10 @@ def test_track_says_how_much_of_a_path_is_within_reach(robot, tmp_path, capsys):
     arguments += ["--center", "0,0,190"]  # else it is placed where it fits
     code, _, errors = run(capsys, *arguments, "--size", "800,400")
     assert code == 2
-    assert "leaves the reach of the robot within its limits (robot description)" in errors
+    assert (
+        "`path` (of the file or --shape) leaves the reach of the robot within its limits (robot "
+        "description)" in errors
+    )
     scale = float(re.search(r"--scale ([\d.]+\d)", errors)[1])
     assert document(capsys, *arguments, "--size", "800,400", "--scale", scale)[0] == 0
     _, _, errors = run(capsys, *arguments, "--size", f"{960 * scale},{480 * scale}")
