@@ -16,13 +16,9 @@ if TYPE_CHECKING:
     )
     from hybridkin.datasets._repeatability import repeatability
     from hybridkin.datasets._shipped import load_trunk, paper_split
-    from hybridkin.datasets.merged import (
-        Merged,
-        TimedColumns,
-        merge_logs,
-        read_columns,
-    )
+    from hybridkin.datasets.merged import Merged, merge_logs
     from hybridkin.datasets.table_files import LOG_SUFFIXES
+    from hybridkin.datasets.timed_columns import TimedColumns, read_columns
 
 __all__ = [
     "LOG_SUFFIXES",
@@ -47,7 +43,8 @@ __all__ = [
 # Some results are Bunches of scikit-learn; a merge needs scipy.
 _NAMES_OF = {
     "table_files": ("LOG_SUFFIXES",),
-    "merged": ("Merged", "TimedColumns", "merge_logs", "read_columns"),
+    "merged": ("Merged", "merge_logs"),
+    "timed_columns": ("TimedColumns", "read_columns"),
     "_recordings": (
         "load_armlab",
         "load_asl_trunk",
