@@ -111,8 +111,7 @@ class Reader:
                 try:
                     kind(replaced(block.text, here), block.line)
                 except Exception as error:
-                    error.add_note(f"in {self.page.name}, line {block.line}")
-                    raise
+                    raise AssertionError(f"{self.page.name}, line {block.line}") from error
             self.printed += out.getvalue()
         assert not left, f"not in {self.page.name}: {left}"
         return self
@@ -136,6 +135,23 @@ class Reader:
             _run(command)
 
     _bash = _sh = _console
+
+
+def read(shelf, page, shorter, checks):
+    """Run the blocks of a page, and check what the page says of them.
+
+    Parameters
+    ----------
+    shelf, page : str
+        Names of the folder and of the page in it.
+    shorter : dict
+        By page: what takes long in its blocks, and less of it.
+    checks : dict
+        By page: a function that takes the `Reader`. Of other pages it counts that all blocks run.
+    """
+    reader = Reader(DOCS / shelf / f"{page}.md", shorter.get(page, ())).run()
+    if page in checks:
+        checks[page](reader)
 
 
 def _run(command):

@@ -8,7 +8,6 @@ import re
 import shutil
 import subprocess
 import tempfile
-import textwrap
 from collections.abc import Mapping
 from contextlib import suppress
 from functools import partial
@@ -45,6 +44,7 @@ from hybridkin._core.named_rows import without_warnings
 from hybridkin._core.plan import NoKernel, Plan
 from hybridkin._core.texts import c_comment, markdown
 from hybridkin._core.version import __version__
+from hybridkin.native._words import class_in_words, limits_in_words
 
 _FOLDER = Path(__file__).parent
 ABOUT_Q = "q in metres, or in radians for revolute joints, as in the model."
@@ -62,7 +62,6 @@ _RANGES = (
 )
 _SIZES = dict(N="actuators", S="segments", M="outputs", F="features")
 _SIZES["R"] = "rows of a task"
-_KINDS_OF_LIMITS = ("q", "its speed", "its acceleration")
 _NO_LIMITS = np.array([[-math.inf], [math.inf], [math.inf], [math.inf]])
 _MOST_STACK = 56 * 1024  # bytes to compute in; small arrays come on top
 # steps per run of the test; memory and delay in periods
@@ -276,7 +275,7 @@ def c_project(
         f"{name}_test.c": "check.c",
     }
     sources["CMakeLists.txt"] = "CMakeLists.txt"
-    title = _in_words(type(model).__name__)
+    title = class_in_words(type(model).__name__)
     entries: Entries = {
         "NAME": name,
         "GUARD": name.upper(),
@@ -396,57 +395,8 @@ def _step_code(plan: Plan, task: _Task, n_spaces: int) -> Entries:
     if leads(plan):
         entries["LEADS"] = filled("lead.md", entries)
         entries["WITHOUT"] = ", and without hysteresis there"
-    entries["LIMITS"] = _limits_in_words(limits)
+    entries["LIMITS"] = limits_in_words(limits)
     return entries
-
-
-def _limits_in_words(limits: NDArray) -> str:
-    """Return sentences about limits (4, n) of q, below and above, of its speed and acceleration."""
-    low, high, speed, acceleration = limits
-    kept = []
-    has_low = np.isfinite(low).any()
-    has_high = np.isfinite(high).any()
-    if has_low and has_high:
-        kept.append(f"q between {_listed(low)} and {_listed(high)}")
-    elif has_low:
-        kept.append(f"q above {_listed(low)}")
-    elif has_high:
-        kept.append(f"q below {_listed(high)}")
-    if np.isfinite(speed).any():
-        kept.append(f"its speed below {_listed(speed)} per second")
-    if np.isfinite(acceleration).any():
-        kept.append(f"the change of that speed below {_listed(acceleration)} per second")
-    if not kept:
-        return filled("no_limits.md", {})
-    words = " and ".join(kept)
-    if len(kept) > 2:
-        words = f"{', '.join(kept[:-1])}, and {kept[-1]}"
-    text = f"It keeps {words}."
-    if len(kept) < len(_KINDS_OF_LIMITS):
-        absent = []
-        for kind, values in zip(_KINDS_OF_LIMITS, (limits[:2], speed, acceleration), strict=True):
-            if not np.isfinite(values).any():
-                absent.append(kind)
-        text += f" It has no limit of {' and of '.join(absent)}."
-    if np.isfinite(speed).any():
-        text += " From outside the limits q returns at that speed."
-    return textwrap.fill(text, 98, break_on_hyphens=False) + "\n"
-
-
-def _listed(values: NDArray) -> str:
-    """Return numbers for a reader, in three digits; one if they are all alike."""
-    texts = [f"{float(f'{value:.3g}'):g}" for value in values.tolist()]
-    if len({*texts}) == 1:
-        return texts[0]
-    return f"({', '.join(texts)})"
-
-
-def _in_words(name: str) -> str:
-    """Return the name of a class in words: "Inverse kinematics" for InverseKinematics."""
-    words = re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", " ", name).split()
-    first, *others = words
-    words = [first, *(word if word.isupper() else word.lower() for word in others)]
-    return " ".join(words).replace("module", "model")
 
 
 def leads(plan: Plan) -> bool:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from hybridkin._core.texts import visible
 from hybridkin.plots._camera import fitted_camera
 from hybridkin.plots._canvas import DASHED_TARGET, TARGET, TIP
+from hybridkin.plots._dashes import dashes
 from hybridkin.plots._obstacles import COLOR, OPACITY, surface_of
 from hybridkin.plots._scene import Line, Scene
 from hybridkin.plots.page_server import page_server, stop
@@ -118,7 +119,7 @@ class _Stroke:
             strokes = scene.add_line_segments(
                 f"/{name}", np.zeros((1, 2, 3)), color, thickness=_WIDTH * line.width
             )
-            self._parts.append((strokes, partial(_dashes, line=line)))
+            self._parts.append((strokes, partial(_pieces, line=line)))
         if line.marker:
             dots = scene.add_point_cloud(
                 f"/{name}/marks",
@@ -140,18 +141,12 @@ class _Stroke:
                 handle.points = parts[known]
 
 
-def _dashes(points: NDArray, line: Line) -> NDArray:
+def _pieces(points: NDArray, line: Line) -> NDArray:
     """Return the pieces (K, 2, 3) of a line through points (P, 3), with the gaps of its style."""
     if line.style == "-":
         return np.stack([points[:-1], points[1:]], axis=1)
     points = points[np.isfinite(points).all(axis=1)]
-    lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    along = np.concatenate([[0.0], np.cumsum(lengths)])
+    length = np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
     _, pattern = line.style
     period = _WIDTH * line.width * sum(pattern)
-    n = int(np.clip(along[-1] / period, 1, _MOST_DASHES))
-    marks = along[-1] / n * np.cumsum([0.0, *pattern]) / sum(pattern)
-    starts = along[-1] / n * np.arange(n)
-    places = starts[:, None, None] + marks[:-1].reshape(-1, 2)  # dash after dash, gap after gap
-    ends = [np.interp(places, along, column) for column in points.T]
-    return np.stack(ends, axis=-1).reshape(-1, 2, 3)
+    return dashes(points, int(np.clip(length / period, 1, _MOST_DASHES)), pattern)

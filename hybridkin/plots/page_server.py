@@ -1,6 +1,6 @@
 """A viser server for a page of our own alone: no other page connects, no other message is heard.
 
-Its page has a title of its own, and `fitted_camera` places the eye.
+Its page has a title of its own; `fitted_camera` places the eye, `dashes` makes broken lines.
 
 viser checks neither who connects nor what it is sent: any page that is open in the browser may
 connect to this machine, steer, store files, and have the view shared in the internet. All that
@@ -21,8 +21,9 @@ from urllib.parse import urlsplit
 
 from hybridkin._core.texts import script_text
 from hybridkin.plots._camera import Camera, fitted_camera
+from hybridkin.plots._dashes import dashes
 
-__all__ = ["Camera", "fitted_camera", "page_server", "stop"]
+__all__ = ["Camera", "dashes", "fitted_camera", "page_server", "stop"]
 
 
 _FARTHEST = 1e9  # of a coordinate; no page sends more

@@ -9,7 +9,7 @@ import sys
 
 import pytest
 import torch
-from page_blocks import DOCS, ROOT, Reader, blocks_of, replaced, written_on
+from page_blocks import DOCS, ROOT, blocks_of, read, replaced, written_on
 
 PAGES = written_on("explanation")
 # What takes long on a page, and less of it.
@@ -17,10 +17,6 @@ SHORTER = {}
 needs_compiler = pytest.mark.skipif(
     not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="needs a C compiler"
 )
-
-
-def nothing(reader):
-    """Check no more than that the blocks run."""
 
 
 def theory(reader):
@@ -67,8 +63,7 @@ CHECKS = {
 @pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES)
 def test_blocks_of_a_page_run(page, lab):
-    reader = Reader(DOCS / "explanation" / f"{page}.md", SHORTER.get(page, ())).run()
-    CHECKS.get(page, nothing)(reader)
+    read("explanation", page, SHORTER, CHECKS)
 
 
 # The page "How it works inside": its folders, and its kernel.

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from page_blocks import DOCS, Reader, blocks_of, commands_of, written_on
+from page_blocks import DOCS, blocks_of, commands_of, read, written_on
 
 from hybridkin import load_model
 from hybridkin.app.cli.main import main
@@ -24,10 +24,6 @@ SHORTER = {
     "scikit_learn": [("GroupKFold(4)", "GroupKFold(2)"), ("[1e-3, 0.1]", "[1e-3]")],
     "obstacles": [("--size 80,40", "--size 80,40 --duration 2")],
 }
-
-
-def nothing(reader):
-    """Check no more than that the blocks run."""
 
 
 def numbers_after(text, printed):
@@ -184,8 +180,7 @@ CHECKS = {
 def test_blocks_of_a_page_run(page, lab):
     if page == "systems":
         pytest.importorskip("fmpy", reason="needs fmpy: pip install fmpy")
-    reader = Reader(DOCS / "how_to" / f"{page}.md", SHORTER.get(page, ())).run()
-    CHECKS.get(page, nothing)(reader)
+    read("how_to", page, SHORTER, CHECKS)
 
 
 def block_in(page, language):

@@ -11,7 +11,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-from page_blocks import DOCS, ROOT, Reader, commands_of, written_on
+from page_blocks import DOCS, ROOT, commands_of, read, written_on
 
 from hybridkin.app.cli._parser import parser
 
@@ -30,10 +30,6 @@ LONG = 40  # rows that a page shows, at most
 NO_CELL = re.compile(r"([-+*]|\d+[.)])( |$)|[#>]( |$)")
 
 
-def nothing(reader):
-    """Check no more than that the blocks run."""
-
-
 # What a page says of what its blocks print or write.
 CHECKS = {}
 
@@ -41,8 +37,7 @@ CHECKS = {}
 @pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES)
 def test_blocks_of_a_page_run(page, lab):
-    reader = Reader(DOCS / "reference" / f"{page}.md", SHORTER.get(page, ())).run()
-    CHECKS.get(page, nothing)(reader)
+    read("reference", page, SHORTER, CHECKS)
 
 
 # Tables

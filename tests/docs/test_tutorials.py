@@ -4,15 +4,11 @@ import re
 from pathlib import Path
 
 import pytest
-from page_blocks import DOCS, Reader, written_on
+from page_blocks import read, written_on
 
 PAGES = written_on("tutorials")
 # What takes long on a page, and less of it.
 SHORTER = {}
-
-
-def nothing(reader):
-    """Check no more than that the blocks run."""
 
 
 def getting_started(reader):
@@ -51,5 +47,4 @@ CHECKS = {
 @pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES)
 def test_blocks_of_a_page_run(page, lab):
-    reader = Reader(DOCS / "tutorials" / f"{page}.md", SHORTER.get(page, ())).run()
-    CHECKS.get(page, nothing)(reader)
+    read("tutorials", page, SHORTER, CHECKS)

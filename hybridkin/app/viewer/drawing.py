@@ -15,6 +15,7 @@ from hybridkin.app.workflow.model import is_fitted, tips_at
 from hybridkin.datasets import Log
 from hybridkin.formats import visible
 from hybridkin.plots import BackboneDisplay, obstacle_surface
+from hybridkin.plots.page_server import dashes
 
 Color: TypeAlias = tuple[int, int, int]
 
@@ -267,16 +268,7 @@ class Ghost:
                 self.line.points = dashes
 
     def _dashes(self, robot: SteeredRobot) -> NDArray:
-        return broken(_body_of(self._chain, robot).points[0], self._pieces)
-
-
-def broken(points: NDArray, n: int) -> NDArray:
-    """Return n dashes (n, 2, 3) of a line through points (P, 3), with gaps as long as they are."""
-    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    along = np.concatenate([[0.0], np.cumsum(steps)])
-    places = np.linspace(0.0, along[-1], 2 * n)
-    marks = np.stack([np.interp(places, along, column) for column in points.T], axis=1)
-    return marks.reshape(n, 2, 3)
+        return dashes(_body_of(self._chain, robot).points[0], self._pieces)
 
 
 class LogCloud:
